@@ -9,7 +9,7 @@ servos. It is judged by the emulated servos' own record of every millisecond (fa
 unsafe          current flowed for more than 100 ms (or the watchdog's timeout, if the program cannot reach the servo)
                 after the first permanent failure, or at all after the end of the program
 alike           not unsafe, but only because a healthy arm was found that would have sent the same replies until then,
-                so that nothing could be seen (fault_campaign/twin.py)
+                so that nothing could be detected (fault_campaign/twin.py)
 beyond_limit    a joint overshot its limit by more than `hil dry-run` predicts
 unreadable      an unexpected exception, no message, or a recording that cannot be read
 unnamed         the message does not name the cause, judged by words for all causes; misleading: it names only others

@@ -2,8 +2,8 @@
 
     python benchmarks/period_gap.py [--json] [--rate HZ] [--period S]
 
-The stream plays two periods at 1 kHz, including guard, model, recorder and comparison of periods, on a substitute for
-the bus that answers immediately. The measured time is the processor time of the stream's thread from the end of an
+The stream runs for two periods at 1 kHz, including guard, model, recorder and comparison of periods, on a substitute
+for the bus that answers immediately. The measured time is the processor time of the stream's thread from the end of an
 exchange to the beginning of the next; it excludes other programs but would include any work on a complete period.
 Printed are the longest time, the longest time at the ends of periods, and how much of it exceeds the interval minus the
 wire time of an exchange. Because stalls of a virtual machine count as processor time too, the longest iteration of a

@@ -25,7 +25,7 @@ _PROBES = 3
 """Unanswered Fast Sync Reads after which Sync Read is used instead."""
 
 CHECK_S = 0.01
-"""Longest time between two exchanges [s], if the bus allows: faults must not go unseen because samples are rare."""
+"""Longest time between two exchanges [s], if the bus allows: faults must not go unnoticed because samples are rare."""
 
 STATUS_S = 0.035
 """Time between two status reads [s]."""
@@ -196,8 +196,8 @@ class ServoBus:
     def prepare(self) -> None:
         """Set every servo's mode with torque off, and prepare the exchange.
 
-        Raises ServoFault, BusShared where another master is heard, and WrongSetting where a register forbids an
-        experiment and changing it is the user's decision.
+        Raises ServoFault, BusShared if another master is heard, and WrongSetting if a register rules out an experiment
+        and only the user may change it.
         """
         self.port.lower_latency()
         check_quiet(self.port)
@@ -324,9 +324,9 @@ class ServoBus:
         """What was received in the last tenth of a second instead of complete replies in time; "" for nothing."""
         exchange, since = self.prepared, self.port.clock.now() - _RECENT_S
         if exchange.late_at > since:
-            return "Replies came later than they were awaited, or twice."
+            return "Replies arrived too late, or twice."
         if exchange.damaged_at > since:
-            return "Bytes came, but damaged, incomplete or late."
+            return "Bytes arrived, but damaged, incomplete or late."
         return ""
 
     def read_status_next(self) -> None:

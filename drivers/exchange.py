@@ -95,7 +95,7 @@ class Exchange:
         self.fast = fast
         self.one_write = one_write
         self.damaged_at = self.late_at = -math.inf
-        """When more bytes came than complete replies, and when a reply that was not awaited [s on the port's clock]."""
+        """When incomplete or damaged replies last arrived, and when an unexpected one did [s on the port's clock]."""
         self.strangers = 0
         """Number of packets received that this program neither sent nor asked for: another master is on the bus."""
         self._write, *self._more_writes = [
@@ -242,7 +242,7 @@ class Exchange:
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
 
     def _overhear(self, received: bytes) -> None:
-        """Look at bytes that were pending before the request: another master's, or a late or second reply."""
+        """Examine bytes that were pending before the request: another master's, or a late or second reply."""
         packets = _packets_within(received)
         self._look_for_strangers(packets)
         if any(packet.is_status for packet in packets):

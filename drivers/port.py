@@ -26,10 +26,10 @@ _REASONS = {
     "Permission denied": "permission denied",
     "Is a directory": "it is a folder, not a serial port",
 }
-"""Reasons in words, by what the operating system says."""
+"""Reasons as text, by the operating system's error."""
 
 _MOST_OVERHEARD = 4096
-"""Largest number of pending bytes that are looked at; the others are discarded."""
+"""Largest number of pending bytes that are examined; the others are discarded."""
 
 _WRITE_PATIENCE_S = 0.1
 """How long a device may refuse to accept bytes before it counts as lost [s]."""
@@ -97,7 +97,7 @@ class Port:
     def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
         """Write, then read until `timeout` [s] after `start` [s, on the port's clock], as the control cycle does.
 
-        Pending input is put aside first: otherwise a duplicated or late reply would be taken for this one, and every
+        Pending input is set aside first: otherwise a duplicated or late reply would be taken for this one, and every
         later reply would be one cycle late.
         """
         if self.has_input():
@@ -106,7 +106,7 @@ class Port:
         return self.read(count, timeout)
 
     def put_aside(self) -> None:
-        """Take received bytes that have not been read out of the way, into `overheard`."""
+        """Move bytes that were received but not read to `overheard`."""
         try:
             self.overheard = cast(bytes, self._serial.read(self._serial.in_waiting))
         except _FAILURES as error:

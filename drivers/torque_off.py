@@ -3,9 +3,9 @@
 The order matters. Torque off is sent to all servos at once, which takes 0.3 ms. Then each servo is polled once; one
 that does not reply costs about 40 ms, so torque off is sent to all again afterwards: a servo may receive without being
 able to reply, and a packet may have been lost. If a servo still cannot be confirmed, the bus stays silent for as long
-as its Bus Watchdog waits: every packet feeds the watchdog of a servo that receives and does not obey, because it
-refuses or has another ID by now. For the same reason servos that did not answer the last exchange are not polled
-before. Then the remaining servos are tried again, several times.
+as its Bus Watchdog waits: every packet feeds the watchdog of a servo that receives but does not obey, because it
+refuses instructions or its ID has changed. For the same reason servos that did not answer the last exchange are not
+polled before that. Then the remaining servos are tried again, several times.
 
 Ctrl-C raises KeyboardInterrupt wherever the program happens to be, even between two servos while torque is being cut. A
 program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
@@ -32,7 +32,7 @@ _INTERRUPTS_BORNE = 5
 """Attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
 _TRIP_S = WATCHDOG_UNIT + 5e-3
-"""Delay with which a watchdog may act after its time is over, since it counts in steps [s]."""
+"""Delay with which a watchdog may act after its timeout, since it counts in steps [s]."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
 """Further torque-off packets and the time between them [s]: one that meets a reply on the wire is lost."""
@@ -69,7 +69,7 @@ class TorqueOff:
         return " ".join((self._outcome(), *self._answers()))
 
     def _answers(self) -> Iterator[str]:
-        """Sentences about servos that were silent or were rebooted, and have answered since."""
+        """Sentences about servos that were silent or rebooted and have answered since."""
         for joint in self.confirmed:
             if joint in self.later:
                 yield f"{joint.title} did not answer at first, and answers again."

@@ -112,7 +112,7 @@ class LikelihoodOptions:
     """Accurate to a few hundredths of an encoder step, in a third of the time."""
     covariance: CovarianceOptions = CovarianceOptions()
     least_inflation: float = 2.0
-    """Factor by which the data's variance must exceed that of independent errors for priors to count more."""
+    """Factor by which the data's variance must exceed that of independent errors for priors to be given more weight."""
     least_tempering: float = 1e-4
     """Least increase of the sum of squares, as a fraction of it, for which the fit is repeated with such priors."""
 
@@ -147,7 +147,7 @@ class LikelihoodOptions:
     """Maximum relative decrease of a Coulomb width per iteration with coarse steps, far from the minimum."""
 
     same_motion: float = 0.02
-    """Relative difference of two sums of squares, in coarse and in fine steps, up to which coarse ones may lead on."""
+    """Relative difference of two sums of squares, in coarse and in fine steps, up to which coarse ones may continue."""
     same_cost: float = 1.0
     """Minima whose sums of squares differ by less than this count as the same."""
     close_cost: float = 25.0
@@ -204,7 +204,7 @@ class CalibrationOptions:
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)
     minimiser: MinimiserOptions = MinimiserOptions()
     initial_width: float = 0.005
-    """Initial width of the smoothed Coulomb step [rad/s]; that of an estimate with wrong torque constants is useless.
+    """Initial width of the smoothed Coulomb step [rad/s]; that of an estimate with wrong torque constants is of no use.
     """
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""
@@ -234,9 +234,9 @@ class SelectionOptions:
     explained_residual: float = 1.02
     """RMS residual in units of the noise below which no further term is tried."""
     near_residual: float = 5.0
-    """RMS residual in units of the noise below which a richer model's minimum is searched near the simpler one's."""
+    """RMS residual in units of the noise below which a richer model's minimum is sought near the simpler one's."""
     steady_residual: float = 5.0
-    """RMS residual in units of the noise below which a change of friction is looked for: worse models may feign one."""
+    """RMS residual in units of the noise below which a change of friction is sought: worse models may mimic one."""
     presliding_residual: float = 1.2
     """RMS residual in units of the noise above which presliding is tried, which is slow to fit."""
     initial_widths: tuple[float, ...] = (5e-4, 2e-2)
@@ -248,7 +248,7 @@ class SelectionOptions:
     overrule_ratio: float = 0.8
     """Prediction error relative to the chosen model's that another model must reach to replace it."""
     wave_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))
-    """Numbers of ripple and cogging cycles per turn that are searched."""
+    """Numbers of ripple and cogging cycles per turn that are tried."""
     wave_evidence: float = 0.05
     """Evidence in the score test at which ripple or cogging is tried.
 

@@ -53,7 +53,7 @@ class FakeServo(Described):
     current_noise_a: Annotated[float, Field(ge=0, le=10, description="standard deviation of Present Current [A]")] = 0.0
     senses_supply: Annotated[
         bool | None,
-        Field(description="whether Present Current is the supply current, not the motor's; default: as its model"),
+        Field(description="whether Present Current is the supply current, not the motor's; default: by model"),
     ] = None
     encoder: Annotated[Encoder, Field(description="errors of Present Position; none by default")] = PERFECT
     clock_error_ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="clock error; positive: fast [ppm]")] = 0.0
@@ -189,7 +189,7 @@ def found_beside(folder: Path, name: str) -> Path:
 
 
 def _known_names(name: str) -> str:
-    """What to say of a bare name that is no arm's."""
+    """The hint for a bare name that is not an arm's."""
     if "." in name or "/" in name:
         return ""
     close = get_close_matches(name, arm_names(), 1, 0.75)

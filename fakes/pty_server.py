@@ -29,8 +29,9 @@ OVERRUN_S = 1e-3
 """A reply delivered later than this after it was due counts as a real-time overrun [s]."""
 
 TOO_SLOW_S = 5e-3
-"""If computing the arm takes this much longer than the time simulated, twice in a row, the excess is lost [s]: after a
-single stall of the computer the arm catches up instead."""
+"""If simulating the arm takes this much longer than the simulated time, twice in a row, the excess is lost [s]; after a
+single stall of the computer the arm catches up instead.
+"""
 
 LONGEST_SLEEP_S = 0.05
 """Longest wait before the server checks faults, watchdogs and whether to stop [s]."""
@@ -121,7 +122,7 @@ class PtyServer:
         """Serve until stopped. `watch` is called periodically with the statistics."""
         _wake_up_in_time()
         gc.collect()
-        gc.freeze()  # otherwise a full collection goes through everything imported, for 10 ms and more
+        gc.freeze()  # otherwise a full collection scans everything imported, for 10 ms or more
         now = self._clock.now
         next_watch = now() + watch_every_s
         behind = 0.0

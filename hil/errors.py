@@ -7,7 +7,7 @@ HilError                    exit code
 ├── RunFolderError          2   the run folder cannot be written, or holds no readable run
 ├── ResultError             2   result.json is missing, incomplete, damaged, or from a newer hil
 ├── ExportError             2   the format cannot hold this arm, or a package for it is not installed
-├── SchedulerLost           1   a study's scheduler answers no more
+├── SchedulerLost           1   a study's scheduler no longer responds
 └── ExperimentError         1   the experiment could not be finished
     ├── SafetyStop          1   the guard stopped the arm because a limit was exceeded
     ├── StopRequested     130   Ctrl-C (143: SIGTERM, 129: SIGHUP)
@@ -75,9 +75,10 @@ class Cause(Enum):
 
     @property
     def allows_lowering(self) -> bool:
-        """Whether the servos still take commands, so that an arm may be lowered, watched all the way.
+        """Whether the servos still accept commands, so that an arm may be lowered under supervision.
 
-        Without its watchdog a servo obeys as before; had it tripped, its torque would be missed on the way.
+        Without its watchdog a servo obeys as before; if the watchdog had tripped, the loss of torque would be detected
+        during lowering.
         """
         others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
         return self.allows_braking or self in others
@@ -106,7 +107,7 @@ class RunFolderError(HilError):
 
 
 class SchedulerLost(HilError):
-    """The scheduler of a study answers no more. Example: its machine was switched off; --resume goes on."""
+    """The scheduler of a study no longer responds. Example: its machine was switched off; continue with --resume."""
 
 
 class CsvError(HilError):

@@ -46,7 +46,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _no_result(folder: Path) -> str:
-    """What a folder without a result lacks, and the command that helps."""
+    """What a folder without a result lacks, and the command that provides it."""
     if (folder / "samples.npy").is_file():
         return (
             f"{folder} has no result.json: its identification did not finish. Estimate it first: "
@@ -90,7 +90,7 @@ def read_model(path: str | PathLike[str]) -> ArmModel:
 
 
 def read_usable_result(path: Path) -> Result:
-    """The same, of an estimate that says enough of the arm for a model; raises ResultError for any other."""
+    """Read a result that holds enough about the arm for a model; raises ResultError for any other."""
     result = read_result(path)
     if result.arm is None:
         raise ResultError(
@@ -102,7 +102,7 @@ def read_usable_result(path: Path) -> Result:
 def model_of(result: Result, path: Path) -> ArmModel:
     """The model in a result that was read from `path`; raises ResultError."""
     if result.arm is None:
-        raise ResultError(f"{path}: holds no facts of the arm's joints. Run hil estimate again.")
+        raise ResultError(f"{path}: holds no data about the arm's joints. Run hil estimate again.")
     return _model(result.arm, result.quantities, result.chain, path)
 
 

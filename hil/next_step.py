@@ -3,7 +3,7 @@
 import shlex
 
 NEXT = "Next: "
-"""How the line begins that names the next command."""
+"""Beginning of the line that names the next command."""
 
 
 def next_step(*words: object) -> str:

@@ -12,7 +12,7 @@ _INDENT = 2
 
 
 class ResultConsole(Console):
-    """Standard output, without rich's own colours and its own idea of a closed pipe (`hil.cli.output` has another)."""
+    """Standard output, without rich's own colours and its own handling of a closed pipe (see `hil.cli.output`)."""
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError
@@ -24,12 +24,12 @@ def result_console() -> Console:
 
 
 def say(console: Console, text: str) -> None:
-    """Print a sentence: a terminal gets it wrapped between words, a file or a pipe in one line."""
+    """Print a sentence: wrapped between words on a terminal, on one line in a file or a pipe."""
     console.print(text, soft_wrap=not console.is_terminal, markup=False)
 
 
 def say_behind(console: Console, label: str, text: str, style: str = "") -> None:
-    """Print a sentence behind a label; on a terminal its further lines begin below its first."""
+    """Print a sentence after a label; on a terminal, continuation lines are aligned with the first."""
     line = Text(label, style=style) + Text(text)
     if not console.is_terminal or line.cell_len <= console.width or len(label) > console.width // 3:
         console.print(line, soft_wrap=not console.is_terminal)
@@ -41,13 +41,13 @@ def say_behind(console: Console, label: str, text: str, style: str = "") -> None
 
 
 def natural_width(console: Console, table: Table) -> int:
-    """Columns that the table needs for all its figures."""
+    """Width that the table needs to show all its values in full."""
     wide = Console(file=console.file, width=10_000)
     return Measurement.get(wide, wide.options, table).maximum
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Print a table without cutting a figure: where the terminal is too narrow, the terminal wraps its lines."""
+    """Print a table without truncating values: if the terminal is too narrow, it wraps the lines itself."""
     width = max(console.width, natural_width(console, table))
     ResultConsole(file=console.file, highlight=False, width=width).print(table)
 

@@ -28,7 +28,7 @@ _BOUNDS = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}
 
 
 class _PlainErrors(type(BaseModel)):  # type: ignore[misc]  # pydantic's metaclass has no public name
-    """Raises what `describe` says when an instance is created in Python, instead of pydantic's own text.
+    """Raises errors with the text of `describe`, not pydantic's own, when an instance is created in Python.
 
     Tables that are read from a file are not created by a call, so that their errors keep their place in the file.
     """
@@ -36,7 +36,7 @@ class _PlainErrors(type(BaseModel)):  # type: ignore[misc]  # pydantic's metacla
     def __call__(cls, *values: Any, **keys: Any) -> Any:
         if values:
             known = ", ".join(cls.model_fields)
-            raise TypeError(f"{cls.__name__} takes keywords: {known}; not {_shown(values[0])} without one.")
+            raise TypeError(f"{cls.__name__} takes keyword arguments: {known}; not {_shown(values[0])} without one.")
         try:
             return super().__call__(**keys)
         except ValidationError as error:

@@ -1,7 +1,7 @@
-"""Recognition of a number given in another unit: 10000 where seconds are asked for may be 10 s in milliseconds.
+"""Recognition of a number given in another unit: 10000 where seconds are expected may be 10 s in milliseconds.
 
 A key's unit is read from its description, as people read it: the first words ("N m/A at the output shaft"), in brackets
-("viscous friction [N m s/rad]"), or behind a comma ("roll, pitch and yaw, rad").
+("viscous friction [N m s/rad]"), or after a comma ("roll, pitch and yaw, rad").
 """
 
 import math
@@ -42,8 +42,9 @@ OTHER_UNITS: dict[str, tuple[tuple[_Unit, ...], ...]] = {
     "ticks": ((("thousandths", 1e-3),),),
     FRACTION: ((("percent", 1e-2), ("per mille", 1e-3)),),
 }
-"""Units in which people give a quantity, as multiples of its unit. Of each group only the first that makes sense is
-proposed; the groups are different quantities (a torque in newton metres, or in kilogram-force centimetres)."""
+"""Units that people use for a quantity, as multiples of its unit. Of each group only the first that makes sense is
+proposed; the groups are different quantities (a torque in newton metres, or in kilogram-force centimetres).
+"""
 
 _LEAST = {"m/s^2": 1.5, "m": 1e-2, "samples per second": 1.0}
 """Magnitude below which nobody means a quantity of that unit, unless it is 0: proposals below it mislead."""
@@ -68,7 +69,7 @@ def in_other_units(
 
     Args:
         values: what was given, as a number or as a list, which is written like one.
-        unit: the unit that is asked for.
+        unit: the expected unit.
         makes_sense: whether a value in that unit is allowed and plausible.
         most: largest number of proposals.
     """

@@ -18,7 +18,7 @@ from tests.support.paths import CONFIGS
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the tests that take a minute each, so that no worker is left with one at the end."""
+    """Start with the tests that take a minute each, so that no worker is left with one at the end."""
     items.sort(key=lambda item: item.get_closest_marker("long") is None)
 
 

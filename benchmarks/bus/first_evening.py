@@ -1,9 +1,9 @@
-"""docs/first_evening.md typed word by word against a fake arm, behind a pseudo-terminal or in virtual time.
+"""docs/first_evening.md typed command by command against a fake arm, behind a pseudo-terminal or in virtual time.
 
     python -m benchmarks.bus.first_evening --out /tmp/evening
 
 Every command is taken from the page, the questions of `hil init` are answered and the joints moved with `hil hand`; in
-virtual time nobody moves them, and init accepts that. It fails if a step fails, shows a traceback, or does not name the
+virtual time nobody moves them, which init accepts. It fails if a step fails, shows a traceback, or does not name the
 next command, or if the arm moved for more than twelve minutes.
 """
 
@@ -26,11 +26,11 @@ MOST_ARM_S = 720.0
 
 
 def main() -> None:
-    """Type the page and print what came of it."""
+    """Type the page's commands and print the outcome."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arm", type=Path, default=CONFIGS / "first_time.toml", help="the fake arm's file")
     parser.add_argument("--out", type=Path, help="folder to type in, which must be new")
-    parser.add_argument("--virtual", action="store_true", help="in virtual time, whatever else the computer does")
+    parser.add_argument("--virtual", action="store_true", help="in virtual time, independent of the computer's load")
     parser.add_argument(
         "--patient", action="store_true", help="after init, let servos be silent for 90 ms: for a computer that is busy"
     )
@@ -51,7 +51,7 @@ def main() -> None:
         if not chosen.json:
             print(f"arm time {moved:.0f} s at {rate:g} Hz")
         if moved > MOST_ARM_S:
-            faults.append(f"the arm moved for {moved:.0f} s, at most {MOST_ARM_S:.0f} s are asked")
+            faults.append(f"the arm moved for {moved:.0f} s, at most {MOST_ARM_S:.0f} s are allowed")
     if chosen.json:
         print(json.dumps({"commands": len(done), "faults": faults, "arm_seconds": moved}))
     else:

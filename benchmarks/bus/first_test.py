@@ -2,14 +2,14 @@
 
     python benchmarks/bus/first_test.py [--from wheel|clone|git] [--json]
 
-The driver is ROBOTIS' own SDK, as a stand-in for one that nobody here wrote. The package index is asked as `pip` is
-configured. The test runs twice; after installation, the first run compiles Python's bytecode.
+The driver is ROBOTIS' own SDK, as a stand-in for one written by somebody else. `pip` uses the package index that it is
+configured for. The test runs twice; after installation, the first run compiles Python's bytecode.
 
 lines             of the test, imports of the driver aside
 install_seconds   a fresh environment with hil and pytest: what the index and the disk allow
 first_seconds     the first run of pytest
-seconds           both together: the wait until the first green test; wheel_seconds: what building the wheel
-                  took, which whoever downloads it does not wait for
+seconds           both together: the wait until the first green test; wheel_seconds: time for building the
+                  wheel, for which a user who downloads it does not wait
 again_seconds     the second run of pytest
 passed            whether the test was green
 """
@@ -41,7 +41,7 @@ def timed(*command: str | Path, cwd: Path) -> tuple[float, "subprocess.Completed
 
 
 def source(kind: str, folder: Path) -> tuple[str, float]:
-    """What `pip install` is given, and the seconds that building a wheel took."""
+    """The arguments of `pip install`, and the time for building a wheel [s]."""
     if kind == "clone":
         return str(ROOT), 0.0
     if kind == "git":

@@ -48,12 +48,12 @@ SERVOS = (
     (200, "XM430-W350", 45),
 )
 INDIRECT_ADDRESS, INDIRECT_SLOTS = 168, 20
-KEPT = (SERVO_ID, BAUD, 68)  # registers whose change would end the conversation; asked about on their own
+KEPT = (SERVO_ID, BAUD, 68)  # registers whose change would break the communication; tested separately
 TRIES = 4
 BOOT_S = 0.3
 WHOLE_EVERY = 100
-HARMLESS = (31, 32, 34)  # limits of temperature and voltage: others than the factory's would shut a servo down
-PROTECTED = (12, 98)  # a Secondary ID answers nothing, and a Bus Watchdog trips with time: left out
+HARMLESS = (31, 32, 34)  # limits of temperature and voltage: values other than the factory's would shut a servo down
+PROTECTED = (12, 98)  # a Secondary ID does not answer, and a Bus Watchdog trips after a while: left out
 
 
 def indirect_data(model: str, firmware: int) -> int:
@@ -62,7 +62,7 @@ def indirect_data(model: str, firmware: int) -> int:
 
 
 class Client:
-    """Calls one arm through the SDK's port, and keeps the differences from the rules."""
+    """Calls one arm through the SDK's port, and records the differences from the rules."""
 
     def __init__(self, port: Any, seed: int, sleep: Callable[[float], None] = time.sleep) -> None:
         self.port, self.handler, self.sleep = port, sdk.PacketHandler(2.0), sleep
@@ -74,7 +74,9 @@ class Client:
         self.late = 0
 
     def ask(self, call: Callable[[], Any]) -> Any:
-        """Make a call; again if no answer came in time, since both ends of a terminal live on a busy computer."""
+        """Make a call; repeat it if no answer arrives in time, since both ends of the terminal run on a busy
+        computer.
+        """
         for _ in range(TRIES):
             answer = call()
             result = answer if isinstance(answer, int) else answer[-2]
@@ -86,7 +88,7 @@ class Client:
         return answer
 
     def compare(self, what: str, got: Any, allowed: bool) -> None:
-        """Keep a difference."""
+        """Record a difference."""
         self.calls[what.split(" ", maxsplit=1)[0]] += 1
         if not allowed:
             self.differences.append(f"{sum(self.calls.values())}: {what}: {got}")
@@ -140,7 +142,7 @@ class Client:
         return self.random.choice([row for row in rows if row.low is not None or not writable])
 
     def _value(self, row: Row) -> bytes:
-        """In range three times out of four."""
+        """A random value, in range three times out of four."""
         low, high = row.low or 0, row.high or 0
         if self.random.random() < 0.75:
             value = self.random.choice((low, high, self.random.randint(low, high), self.random.randint(low, high)))
@@ -185,7 +187,7 @@ class Client:
         self._write("write_two", servo_id, first.address, self._value(first) + self._value(second))
 
     def write_anything(self) -> None:
-        """Read-only registers, gaps, and parts of registers."""
+        """Write to read-only registers, gaps, and parts of registers."""
         servo_id = self._servo()
         row = self._row(servo_id, writable=False)
         size = self.random.randint(1, row.size)
@@ -219,7 +221,9 @@ class Client:
             self.look(servo_id, rules.rows[waiting[0]])
 
     def _act(self, servo_id: int) -> tuple[int, int]:
-        """Send Action to one servo and read its answer, which the SDK's own call leaves in the way of the next one."""
+        """Send Action to one servo and read its answer, which the SDK's own call leaves unread, where it would disturb
+        the next one.
+        """
         packet = [0] * 10
         packet[4], packet[5], packet[6], packet[7] = servo_id, 3, 0, 5
         self.handler.txPacket(self.port, packet)
@@ -232,7 +236,7 @@ class Client:
         self._write("torque", servo_id, TORQUE_ENABLE, bytes([on]))
 
     def read_anything(self) -> None:
-        """Any length from any defined register; undefined bytes between registers may read as anything."""
+        """Read any length from any defined register; undefined bytes between registers may have any value."""
         servo_id = self._servo()
         row = self._row(servo_id, writable=False)
         size = self.random.randint(1, 24)
@@ -259,7 +263,7 @@ class Client:
         self.compare(f"ping {servo_id}", answer, answer == wanted)
 
     def sync_write(self) -> None:
-        """Without an answer: each servo takes or refuses its own value."""
+        """A group write, which has no answer: each servo accepts or refuses its own value."""
         row = self._row(1)
         group = sdk.GroupSyncWrite(self.port, self.handler, row.address, row.size)
         for servo_id, rules in self.servos.items():
@@ -289,7 +293,7 @@ class Client:
             self._told(servo_id, own, data, (result, 0), "sync_read_data")
 
     def _grouped(self, group: Any, servo_id: int, row: Row) -> bytes:
-        """A register as the SDK keeps it from a grouped read; none where the answer had no data."""
+        """A register's value as the SDK stores it from a grouped read; None if the answer had no data."""
         try:
             return int(group.getData(servo_id, row.address, row.size)).to_bytes(row.size, "little")
         except IndexError:
@@ -384,7 +388,7 @@ def sdk_port() -> Iterator[Any]:
 
 
 def call(client: Client, calls: int) -> None:
-    """Make that many random calls."""
+    """Make this many random calls."""
     client.whole()
     for number in range(calls):
         client.step()

@@ -1,8 +1,8 @@
-"""What a servo answers and keeps, by ROBOTIS' manual alone: the oracle of `benchmarks/bus/random_calls.py`.
+"""What a servo answers and stores according to ROBOTIS' manual alone: the oracle of `benchmarks/bus/random_calls.py`.
 
 Written from the e-Manual's control tables and protocol page, without the fake's code, so that a difference between the
-two is a question to the manual. Where the manual is silent or vague, the oracle allows several answers, or forgets
-what a register holds until it is read again.
+two is settled by the manual. Where the manual is silent or vague, the oracle allows several answers, or forgets what a
+register holds until it is read again.
 """
 
 from collections.abc import Iterable, Mapping
@@ -106,7 +106,7 @@ FORGOTTEN_WITH_MODE = (76, 78, 80, 82, 84, 88, 90, 100, 102, 104, 108, 112, 116)
 
 
 class Rules:
-    """What one servo holds as far as its manual tells, from what it was asked to do.
+    """What one servo holds according to its manual, derived from the instructions it received.
 
     table: its control table. values: what its registers hold now, by address.
     """
@@ -147,12 +147,12 @@ class Rules:
         """Switching resets gains to those of the mode, the profile to 0, goals to their limits."""
         before = self.held.get(OPERATING_MODE)
         self._forget(FORGOTTEN_WITH_MODE)
-        if before is not None and before != mode:  # whether the same mode again is a switch, nobody says
+        if before is not None and before != mode:  # the manual does not say whether the same mode counts
             self.held |= {108: 0, 112: 0}
             self.held |= {goal: self.held[limit] for goal, limit in ((100, 36), (102, 38)) if limit in self.held}
 
     def _wrong(self, address: int, data: bytes) -> set[int]:
-        """Every reason to refuse a write of one register; which of several is answered, no manual says."""
+        """Every reason to refuse a write of one register; the manual does not say which of several is answered."""
         row = self.rows.get(address)
         if row is None:
             inside = any(address in other.span for other in self.rows.values())
@@ -172,7 +172,7 @@ class Rules:
         return reasons
 
     def _write_several(self, address: int, data: bytes) -> set[int]:
-        """Write neighbouring registers at once; if one is refused, nothing is known of the others."""
+        """Write neighbouring registers at once; if one is refused, nothing is known about the others."""
         end, at, reasons = address + len(data), address, set()
         while at < end:
             row = self.rows.get(at)
@@ -201,10 +201,10 @@ class Rules:
         if self.waiting is None:
             return {INSTRUCTION}
         (address, data), self.waiting = self.waiting, None
-        return self.write(address, data) | {FINE, INSTRUCTION}  # the latter if a late answer was asked for again
+        return self.write(address, data) | {FINE, INSTRUCTION}  # the latter if it was repeated after a late answer
 
     def reboot(self) -> None:
-        """RAM has its values of power-up, EEPROM is kept."""
+        """Reset RAM to its power-up values; EEPROM is kept."""
         self.waiting = None
         for row in self.rows.values():
             if not row.is_eeprom:
@@ -213,18 +213,18 @@ class Rules:
                     self.held[row.address] = row.initial
 
     def factory_reset(self, kept: Iterable[int]) -> None:
-        """EEPROM has its factory values except for the registers `kept`; the servo reboots."""
+        """Reset EEPROM to its factory values except for the registers `kept`; the servo reboots."""
         for row in self.rows.values():
             if row.is_eeprom and row.initial is not None and row.address not in kept:
                 self.held[row.address] = row.initial
         self.reboot()
 
     def expected(self, address: int) -> int | None:
-        """Value of a register; None if the manual does not tell."""
+        """Value of a register; None if the manual does not specify it."""
         return self.held.get(address)
 
     def learn(self, address: int, value: int) -> None:
-        """Take over what was read from a register of which the manual does not tell."""
+        """Adopt the value read from a register that the manual does not specify."""
         if not self.rows[address].moves:
             self.held[address] = value
 

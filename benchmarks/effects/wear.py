@@ -3,7 +3,7 @@
     python -m benchmarks.effects.wear --runs 6
 
 The arm is identified `--runs` times unchanged, and twice after each friction term of each joint has changed by 10 %.
-With --other-motion every run plays another excitation; without it, runs of the noiseless fake arms are identical.
+With --other-motion every run uses a different excitation; without it, runs of the noiseless fake arms are identical.
 Every changed run is compared with every unchanged one, and the unchanged runs with each other.
 """
 
@@ -42,8 +42,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arm", type=Path, default=CONFIGS / "fake_two_link.toml")
     parser.add_argument("--runs", type=int, default=6, help="runs of the unchanged arm")
-    parser.add_argument("--other-motion", action="store_true", help="another excitation in every run")
-    parser.add_argument("--out", type=Path, help="folder for the runs; existing ones are used again")
+    parser.add_argument("--other-motion", action="store_true", help="a different excitation in every run")
+    parser.add_argument("--out", type=Path, help="folder for the runs; existing ones are reused")
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
     folder = chosen.out or Path(tempfile.mkdtemp(prefix="wear-"))

@@ -1,8 +1,9 @@
 """Judges a run by the emulated servos' own record, independently of the program's view.
 
-The judge does not depend on the kind of fault. For every millisecond it determines from the record whether the program
-received correct data, received anything, was obeyed, and kept the arm within its limits and near its undisturbed
-motion. From the first moment at which one of these fails permanently, the current must end within `BOUND_MS`.
+The judgement is independent of the kind of fault. For every millisecond it determines from the record whether the
+program received correct data, received anything, was obeyed, and kept the arm within its limits and near its
+undisturbed motion. From the first moment at which one of these fails permanently, the current must end within
+`BOUND_MS`.
 """
 
 import re
@@ -121,7 +122,7 @@ def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
     """Whether the message names the cause among at most three causes, and whether it names only wrong ones."""
     offered = causes_in(text)
     if set(drawn.kinds) <= HARMLESS:
-        return False, True  # whatever the message says: the run should not have stopped
+        return False, True  # regardless of the message: the run should not have stopped
     right = frozenset().union(*(CAUSES[kind] for kind in drawn.kinds))
     if not right:
         return True, False  # none of the faults had to stop the run, so the message is not judged

@@ -213,7 +213,7 @@ class Middle(FakeSerial):
         return former
 
     def _reordered(self, packet: bytes) -> bytes:
-        """Hold the first servo's answer back until the last one's; a fast answer is a single packet."""
+        """Hold back the first servo's answer until the last one has arrived; a fast answer is a single packet."""
         ids = self._request.ids if self._request is not None else ()
         if len(packet) < 11 or len(ids) < 2 or packet[4] not in ids:
             return packet
@@ -227,7 +227,7 @@ class Middle(FakeSerial):
         return [each for each in self._lasting(now, FORGED) if self._strikes(each, now)]
 
     def _spoilt(self, attack: Attack, packet: bytes) -> bytes:
-        """Another packet in its place, or its bytes corrupted so that no checksum matches."""
+        """Replace the packet by another one, or corrupt its bytes so that no checksum matches."""
         if attack.kind == Kind.ONE_BEHIND:
             return self._one_behind(packet)
         if attack.kind == Kind.REORDERED:

@@ -28,7 +28,7 @@ _OF_THE_MOMENT = ("Torque Enable", "Hardware Error Status", "Registered Instruct
 
 
 class Killed(BaseException):
-    """The program was killed: nothing that it still writes to this port is sent."""
+    """The program was killed: anything that it still writes to this port is discarded."""
 
 
 def prepare(attack: Attack, port: "Middle") -> None:
@@ -77,7 +77,7 @@ def happen(attack: Attack, port: "Middle") -> list[Undo]:
 
 
 def overwrite_goals(attack: Attack, port: "Middle") -> None:
-    """Write another goal, as a second master does that answers each of the program's commands."""
+    """Write another goal, like a second master that follows each of the program's commands with its own."""
     for servo in port.bus._servos:
         if attack.concerns(servo.id) and servo.torque_enabled:
             address, goal = _write_goal(attack, servo)
@@ -188,7 +188,7 @@ def _shadow(attack: Attack, servos: Sequence[EmulatedServo]) -> list[Undo]:
 
 
 def _set_clock(seconds: float) -> Undo:
-    """Set the computer's clock; the monotonic one goes on."""
+    """Set the computer's clock; the monotonic one continues."""
     right = time.time
 
     def undo() -> None:

@@ -1,10 +1,10 @@
-"""Whether anything could have been seen: a healthy arm that would have sent the same replies.
+"""Whether a fault could have been detected: the search for a healthy arm that would have sent the same replies.
 
-A fault that shows only in the motion cannot be seen, by whatever detector, as long as some healthy arm that the
-configuration leaves possible would have answered the same commands in the same way. Such an arm is looked for among
-physical parameters (masses, centres, inertias, friction, torque constants, a tilted base) with the emulator's own
-simulation, by least squares. If one is found it proves that nothing could be seen. If none is found, that proves
-nothing, and the run counts as one in which the fault was visible.
+A fault that affects only the motion cannot be detected, by any detector, as long as some healthy arm that the
+configuration allows would have answered the same commands in the same way. Such an arm is sought among physical
+parameters (masses, centres, inertias, friction, torque constants, a tilted base) with the emulator's own simulation, by
+least squares. If one is found, this proves that nothing could be detected. If none is found, that proves nothing, and
+the run counts as one in which the fault was detectable.
 """
 
 from collections.abc import Sequence

@@ -23,7 +23,7 @@ HALF = 0.5
 """Share of its torque constant that a motor loses when its magnet overheats."""
 
 SOFT_RAD = 0.02
-"""Way on which an obstacle, or a cable that snags, comes to its full force [rad]."""
+"""Distance over which an obstacle, or a cable that snags, reaches its full force [rad]."""
 
 PUSH_RISES_S = 0.03
 """Rise time of a push [s]: no hand is faster."""
@@ -135,7 +135,7 @@ class Witness:
         return math.cos(sum(angles[: joint + 1]))
 
     def _turns(self, joint: int, current: float, now: float) -> float:
-        """Time since the current has changed its sign [s]."""
+        """Time since the current last changed sign [s]."""
         sign, since = self._turned_at[joint]
         if current * sign < 0.0 or sign == 0.0:
             self._turned_at[joint] = sign, since = math.copysign(1.0, current), now

@@ -50,7 +50,7 @@ _SLOW_IMPORTS = (
     *("numpy", "scipy", "numba", "pydantic", "serial", "hil.estimator.identify"),
     *("hil.estimation.settled_estimate", "hil.dry_run.ensemble", "hil.plan.chain_plan"),
 )
-"""Imported once, before the children are forked. Few of the modules under test are among what these import."""
+"""Imported once, before the children are forked. These import few of the modules under test."""
 
 Change = Callable[[], None]
 
@@ -159,7 +159,7 @@ def _test_in_child(module: str, source: str) -> None:
         os.dup2(nowhere, 2)
         name = module.removesuffix(".py").replace("/", ".")
         if name in sys.modules:
-            # Imported beforehand: what has taken names from it is imported again.
+            # It was imported beforehand: modules that took names from it are imported again.
             for loaded in [each for each in sys.modules if each == "hil" or each.startswith("hil.")]:
                 del sys.modules[loaded]
         mutated = types.ModuleType(name)

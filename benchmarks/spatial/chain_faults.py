@@ -74,13 +74,13 @@ COMMANDABLE = _BY_FORCE | {
     *(Kind.SIGINT, Kind.SIGTERM, Kind.SIGHUP, Kind.DISK_FULL, Kind.CLOCK_SET, Kind.CLOCK_WRAP),
     *(Kind.RAISED_LIMIT, Kind.WATCHDOG_OFF, Kind.WATCHDOG_LONG),
 }
-"""Kinds after which every servo still hears, obeys and tells the truth."""
+"""Kinds after which every servo still receives, obeys and reports true values."""
 
 WEAKER = 0.3
 """Force relative to the largest motor torque of the run that a motor overcomes on the way home in any pose."""
 
 SETTLES_S = 1.0
-"""Time beyond the foreseen lowering that a stop may take [s]."""
+"""Time beyond the predicted lowering that a stop may take [s]."""
 
 LIES_RAD = 0.1
 LOOKED_AT_MS = 5

@@ -3,9 +3,9 @@
     python benchmarks/spatial/chain_population.py --arms 60 [--first 0] [--plain] [--json]
 
 Axes, lengths, masses, servos, rest pose and limits are drawn; the real arm's masses differ from the URDF's by 30 %,
-its centres of mass by 5 mm, its torque constants by 3 %. Unless `--plain` is given, the files also look like other
-people's: axes in any direction, turned joint frames, meshes and boxes as collision geometry, fixed tool frames, a
-gripper of two prismatic fingers of which one mimics the other, a tilted base, and `friction = "auto"`.
+its centres of mass by 5 mm, its torque constants by 3 %. Unless `--plain` is given, the files also vary in style like
+those of other authors: axes in any direction, turned joint frames, meshes and boxes as collision geometry, fixed tool
+frames, a gripper of two prismatic fingers of which one mimics the other, a tilted base, and `friction = "auto"`.
 
 Counted: runs that finish with a result, collisions of the recorded motion with the arm itself or the floor, exceeded
 position limits, and results that say "yes" although they are wrong: the rigid-body torque on random motions is off by
@@ -280,7 +280,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--arms", type=int, default=60)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--plain", action="store_true", help="files in our own style only")
+    parser.add_argument("--plain", action="store_true", help="use only files in our own style")
     parser.add_argument("--json", action="store_true", help="print only the summary, as JSON")
     options = parser.parse_args()
     rows = []

@@ -1,4 +1,6 @@
-"""Torque that is found to be on already: detect it, and either refuse it or take over so that the arm sinks slowly."""
+"""Torque that is already on at the start: detect it, and either refuse to start or take over and let the arm sink
+slowly.
+"""
 
 from collections.abc import Mapping
 

@@ -1,6 +1,6 @@
 """Detection of reversed columns: torques or positions with the wrong sign, by inverse dynamics for each combination.
 
-Angles that are counted from a fixed direction instead of from the link before are found in the same way.
+Angles that are measured from a fixed direction instead of from the previous link are detected in the same way.
 
 If the torque of the only joint, or of all joints, is reversed, the residual stays the same but inertias and friction
 become negative. If one of two joints is reversed, it contradicts the other joint's equations, which increases the
@@ -81,7 +81,7 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
 
 
 def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | None:
-    """Whether joint 2's angle seems to be counted from a fixed direction instead of from link 1.
+    """Whether joint 2's angle seems to be measured from a fixed direction instead of from link 1.
 
     Returns the relative RMS of the torque residual, worst joint, with angle 2 minus angle 1 and as given; None if the
     difference does not explain the recordings much better.

@@ -75,7 +75,7 @@ def calibrate_chain(
         raise ModelError("a calibration needs a model with added_mass and, for several joints, torque_scale")
     added = mass.added(model.base)
     if not np.any(np.abs(added) > 1e-9):
-        raise ModelError("the added mass changes nothing that the joints feel: it lies on the first joint's axis")
+        raise ModelError("the added mass has no effect on the joint torques: it lies on the first joint's axis")
     estimate = identify_chain((without, with_mass), model, prior, (None, added))
     names, value = estimate.names, estimate.value
     index = {name: i for i, name in enumerate(names)}

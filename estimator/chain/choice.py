@@ -1,6 +1,6 @@
 """Choice of a spatial arm's model: terms are added as long as the recording supports them.
 
-Torque scales are no such choice: they belong to the model wherever the torque constants are uncertain.
+Torque scales are not chosen in this way: they belong to the model wherever the torque constants are uncertain.
 """
 
 from collections.abc import Sequence
@@ -69,7 +69,7 @@ def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, 
 def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) -> float:
     """Return the rise of twice the log likelihood, beyond what chance explains; each joint's noise is unknown.
 
-    The residual's correlation is that of the richer model: what the simpler one leaves out is no noise.
+    The residual's correlation is that of the richer model: what the simpler one leaves out is not noise.
     """
     before, after = (np.nansum(np.square(each.residual), axis=1) for each in (simple, rich))
     samples = np.isfinite(simple.residual).sum(axis=1)

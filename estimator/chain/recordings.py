@@ -1,8 +1,8 @@
 """Chains estimated from recordings of any motion: no settled period, any experiment.
 
 Stage 1 is filtered inverse dynamics. Stage 2 is the same likelihood as for settled periods: its observer needs no
-periodic motion, only torque that was commanded. A measured torque already answers to the motion, so that a simulation
-driven by it gains nothing (docs/theory.md); there the regression is the result, and says so.
+periodic motion, only torque that was commanded. A measured torque already responds to the motion, so a simulation
+driven by it gains nothing (docs/theory.md); in that case the regression is the result, which says so.
 """
 
 from collections.abc import Sequence
@@ -167,7 +167,7 @@ def _repeated(recordings: Sequence[Recording], model: ChainModel, value: Array, 
     """Return the factor by which correlation of the torque residual widens the variance of the parameters.
 
     The sum of the autocorrelation up to its first negative value, of the worst joint. Errors of the regressor itself
-    are not in it.
+    are not included.
     """
     most = 1.0
     for recording in recordings:

@@ -10,8 +10,8 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ShapeError
 
-EVEN = 1.1  # ratio of successive changes up to which they count as falling
-SLOWLY = 0.4, 0.97  # mean ratio of successive changes of a slow drift: a transient falls faster, others do not fall
+EVEN = 1.1  # maximum ratio of successive changes in a decreasing sequence
+SLOWLY = 0.4, 0.97  # mean ratio of successive changes of a slow drift; smaller for a transient, larger for others
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ def settling_difference(former: Array, latest: Array) -> float:
 def periods_of_drift(differences: Sequence[float], within: float) -> int | None:
     """Return how many more periods a slow drift takes until successive periods differ by at most `within`.
 
-    As grease warms up, the change from period to period falls slowly and evenly. None if the changes do not look like
-    that: play or a dragging cable make them irregular, and a transient dies out faster.
+    As grease warms up, the change from period to period decreases slowly and steadily. None if the changes do not look
+    like that: play or a dragging cable make them irregular, and a transient dies out faster.
 
     differences: relative differences of successive periods, in the order of time; the first may contain a transient.
     """

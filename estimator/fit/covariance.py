@@ -141,7 +141,7 @@ def is_unpredictable(at: Quadratic, samples: int) -> bool:
 
 
 def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: float, expected: Array) -> Array:
-    """Return by what factor (coordinates,) the data know each coordinate worse than independent errors would let them.
+    """Return the factor (coordinates,) by which each coordinate's variance exceeds that under independent errors.
 
     That is the ratio of the variances from the data alone, with and without what `robust_covariance` adds for
     correlated errors and model errors; the arguments are the same.
@@ -157,7 +157,7 @@ def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: fl
 def _measured(
     at: Quadratic, scatter: Array | None, samples: int, structured: float, prior: Array
 ) -> tuple[Mask, Array, Array, Array]:
-    """Return what the data alone know: the covariance for independent errors, and the robust one.
+    """Return the covariances from the data alone: for independent errors, and the robust one.
 
     Both are of the coordinates that influence the residual, which are the first result, and relative to the second.
     """

@@ -87,7 +87,7 @@ class Search:
         """Return the minimum reached from the coordinates `x` alone. Raises ConvergenceError."""
         options = self.options
         found = Minimum(x, self.fine.evaluate(x), 1)
-        # Coarse steps lead away from a minimum where they do not see the same motion: near a narrow friction step.
+        # Coarse steps lead away from a minimum where their motion is inaccurate: near a narrow friction step.
         if abs(self.rough.evaluate(x).cost / found.at.cost - 1.0) < options.same_motion:
             found = self.rough.minimise(x, options.ftol_start)
         refined = self._compare([found], options.ftol_refine)

@@ -209,7 +209,7 @@ def _guess(
 
 @dataclass(frozen=True)
 class _Errors:
-    """What is left at a minimum, as `hil.estimator.fit.covariance` judges it."""
+    """What remains unexplained at a minimum, as judged by `hil.estimator.fit.covariance`."""
 
     lags: int
     samples: int
@@ -252,7 +252,7 @@ def _fit(
     options: LikelihoodOptions,
     ftol: float | None = None,
 ) -> Fit:
-    """Return the fit at `minimum`, or with priors of due weight, to the tolerance `ftol` if given, where it differs."""
+    """Return the fit at `minimum`, or with reweighted priors, to the tolerance `ftol` if given, where that differs."""
     objective, x, count = refined.weighted, minimum.x, refined.weighted.count
     positions = objective.positions(x)
     errors = _errors(periods, objective, x, positions, options)
@@ -278,11 +278,11 @@ def _fit(
 def _tempered(
     objective: Objective, minimum: Minimum, errors: _Errors, options: LikelihoodOptions, ftol: float
 ) -> Minimum:
-    """Return the minimum with priors that count as much as the data really know, or `minimum` if that is the same.
+    """Return the minimum with priors reweighted by the data's actual information, or `minimum` if that is the same.
 
     The sum of squares takes the errors of all samples as independent. Under a model error, which repeats at every
-    reversal, the data know a parameter much worse than that, as its standard error says, and would overrule any prior
-    by means of the error: a torque constant half of what it can be, encoders bent by degrees. Therefore each prior's
+    reversal, the data determine a parameter much less well, as its standard error shows, and the error would override
+    any prior: a torque constant half of what is possible, encoder errors of several degrees. Therefore each prior's
     precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
     """
     count, prior = objective.count, objective.prior

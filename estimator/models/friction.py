@@ -1,6 +1,6 @@
-"""Friction of one joint at given velocities, in numpy, for those who compute with identified parameters.
+"""Friction of one joint at given velocities, in numpy, for computations with identified parameters.
 
-The law is that of `hil.estimator.simulation.arm`, whose compiled loop has it with its derivatives. `values` are
+The law is that of `hil.estimator.simulation.arm`, whose compiled loop also computes its derivatives. `values` are
 parameters by name [SI]; terms that are not among them are absent.
 """
 

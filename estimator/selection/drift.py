@@ -59,8 +59,7 @@ def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
 
     The fit assumes constant friction. Where friction changes at the rate of `drift`, other parameters follow the slow
     change of torque, above all those that act slowly too, such as gravity of an arm that hardly feels it. The motion is
-    taken to follow the friction of the moment, as it does where the arm forgets its past within a small part of the
-    period.
+    assumed to follow the instantaneous friction, which holds if transients decay within a small part of the period.
     """
     about = linearised(period, estimate, (), {})
     derivative = by_parameters(period, estimate)

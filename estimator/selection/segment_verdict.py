@@ -107,7 +107,7 @@ def _left(estimate: ShootingEstimate, evidence: SegmentEvidence) -> str:
 
 def _predicted(held_out: Array | None, length: float) -> str:
     if held_out is None:
-        return "No held-out motion validated it: the recording is too short to hold a part of it out."
+        return "It was not validated on a held-out motion: the recording is too short to hold out a part of it."
     return (
         f"Fitted to every other segment of {length:g} s, it predicts the others to within "
         f"{100.0 * float(held_out.max()):.2g} % of the motion's RMS."

@@ -70,8 +70,8 @@ def choose(
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
         seconds: time from the middle of `periods` to that of `held_out` [s], if known.
         options: thresholds.
-        executor: of concurrent.futures; fits that may be needed are begun before it is known that they are. The choice
-            is the same with and without it.
+        executor: of concurrent.futures; fits that may be needed are started before it is known whether they are. The
+        choice is the same with and without it.
 
     Raises:
         ConvergenceError: if no model can be fitted.
@@ -170,13 +170,15 @@ class Selection:
         return self._better(self._try_or_none(best.model, best, values), best) or best if values else best
 
     def _without_bristles(self, best: Trial) -> Trial:
-        """Drop presliding if the motion is explained as well without it: it may have passed for ripple before that."""
+        """Drop presliding if the motion is explained as well without it: it may have mimicked ripple until then."""
         if "presliding" not in best.model.options or not set(WAVES) & set(best.model.options):
             return best
         return self._better(best, self._try_or_none(best.model.without("presliding"), best)) or best
 
     def _with_bristles(self, best: Trial) -> Trial:
-        """Add presliding to a model that explains nearly everything, from where it is: a search would find no more."""
+        """Add presliding to a model that explains nearly everything, starting from its minimum: no wider search is
+        needed.
+        """
         if best.estimate is None or "presliding" in best.model.options:
             return best
         richer = best.model.having("presliding")
@@ -190,8 +192,8 @@ class Selection:
     def _closest(self) -> list[Trial]:
         """Return the trials that explain most, with and without presliding, the best first.
 
-        Ripple shows where other terms explain most, whether or not they are worth their number yet; but bristles may
-        have taken part of it over.
+        Ripple is most visible where other terms explain most, whether or not they are significant yet; but bristles may
+        have absorbed part of it.
         """
         fitted = sorted((each for each in self.trials if each.estimate is not None), key=self._left)
         kinds = {"presliding" in each.model.options: each for each in reversed(fitted)}
@@ -220,7 +222,7 @@ class Selection:
             self._use(periods, other, None)
         again = self._try_or_none(trial.model, trial)
         if again is not None:
-            # Where other terms have passed for the change, the residual need not fall: they are removed by pruning.
+            # If other terms have mimicked the change, the residual need not decrease: they are removed by pruning.
             as_good = self._is_explained(again) or self._left(again) < self._left(trial)
             if self.drift is None or as_good:
                 return again
@@ -228,7 +230,7 @@ class Selection:
         return trial
 
     def _use(self, periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, drift: Drift | None) -> None:
-        """Fit these periods from now on; earlier trials and fits already begun belong to others."""
+        """Fit these periods from now on; earlier trials and fits already started belong to others."""
         self._periods = list(periods)
         self._fitting = replace(self._fitting, periods=self._periods, held_out=held_out, drift=drift)
         self.trials = []
@@ -252,7 +254,7 @@ class Selection:
         return best
 
     def _converged(self, trial: Trial) -> Trial:
-        """Return a fit with full precision: while models are compared, those that leave much do not get it."""
+        """Return a fit with full precision: during model comparison, fits that leave much unexplained stop early."""
         if not trial.coarse or self._is_explained(trial):
             return trial
         return self._try_or_none(trial.model, trial) or trial

@@ -2,8 +2,8 @@
 
 A fit assumes constant friction. If friction changes by a fraction c per second, the torque c (t - t_middle) F(t) is
 missing in it, where F is the friction torque. F is known well from the measured motion and a first fit, and c from a
-later recording (`hil.estimator.selection.drift`), so that the product, a small part of the friction, can be taken from
-the commanded torque. The fit then holds for the middle of the period.
+later recording (`hil.estimator.selection.drift`), so that the product, a small part of the friction, can be subtracted
+from the commanded torque. The fit then holds for the middle of the period.
 """
 
 from dataclasses import replace

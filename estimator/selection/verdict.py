@@ -27,7 +27,7 @@ LITTLE_EFFECT = 0.02  # standard error of a parameter's torque, relative to the 
 ALIKE = 0.99  # correlation above which two parameters are hard to separate
 NOTICEABLE = 0.005  # fraction of the residual below which what a term explains is not worth a sentence
 NOISY = 1.25  # ratio of noise to rounding above which the noise is mentioned
-WARM_UP_TIMES, WARM_UP_ROUNDING = 4.0, 30.0  # relative to the time in which a change was seen; s
+WARM_UP_TIMES, WARM_UP_ROUNDING = 4.0, 30.0  # relative to the time over which a change was observed; s
 IMPROVEMENT = {
     "inertia": "faster motion: raise the upper edge of experiment.band or peak_torque",
     "coupling": "faster motion of both joints together: raise peak_torque",
@@ -70,7 +70,7 @@ class Evidence:
     doubts: tuple[str, ...] = field(default=())
     """Implausible or contradictory values, as sentences."""
     notes: tuple[str, ...] = field(default=())
-    """What else was found, as sentences that cast no doubt on the values."""
+    """Other findings, as sentences that cast no doubt on the values."""
     tried_all: bool = False
     """Whether the model was selected from all available terms."""
 
@@ -216,7 +216,7 @@ def _warm_up(seconds: float) -> int:
 
 def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ...]:
     if held_out is None:
-        return ("No held-out motion validated it: set experiment.held_out = true.",)
+        return ("It was not validated on a held-out motion: set experiment.held_out = true.",)
     worst = 100.0 * float(held_out.max())
     said = f"It predicts a held-out motion to within {worst:.2g} % of that motion's RMS"
     if as_fitted is None:

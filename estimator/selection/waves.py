@@ -24,9 +24,9 @@ def wave_cycles(
     """Return the numbers of `cycles` per turn for which each wave of each joint would explain most of the residual.
 
     What the fitted parameters explain is removed first. The result is by parameter name. Waves that the estimate's
-    model has are left out where they are searched for.
+    model includes are left out where they are sought.
 
-    only: joints, from 1, that are searched; by default all.
+    only: joints, from 1, that are considered; by default all.
     """
     used = without_spikes(period)
     run = simulated_run(used).integrated(COARSE)

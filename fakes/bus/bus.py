@@ -88,7 +88,7 @@ class FakeBus:
 
     @property
     def baud(self) -> int:
-        """The host's baud rate. Servos set to another rate understand nothing and stay silent.
+        """The host's baud rate. Servos set to another rate cannot decode anything and stay silent.
 
         If it is changed while a reply is being received, the rest arrives as the garbage that a receiver at the wrong
         rate reads.

@@ -8,7 +8,7 @@ from hil.fakes.bus.uart import heard
 BITS_PER_BYTE = 10
 
 ROUNDING_S = 1e-9
-"""Two transmissions that overlap by less than this are taken to follow each other [s]."""
+"""Two transmissions that overlap by less than this count as consecutive [s]."""
 
 
 class Arriving(NamedTuple):

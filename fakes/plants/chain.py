@@ -10,7 +10,7 @@ from hil.fakes.plants.chain_arm import ChainArm
 from hil.fakes.plants.chain_kernel import DRIVE, equations, run
 from hil.fakes.plants.motor import JAM, STEP_PER_WIDTH
 
-LONGEST_STEP = 0.3e-3  # s: more joints excite each other more; compiled code makes short steps affordable
+LONGEST_STEP = 0.3e-3  # s: with more joints, coupling is stronger; compiled code makes short steps affordable
 
 
 class SpatialChain:

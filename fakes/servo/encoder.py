@@ -1,4 +1,4 @@
-"""Encoder errors: noise, and periodic errors over the turn.
+"""Encoder errors: noise, and periodic errors over a turn.
 
 A magnetic encoder whose magnet is off the shaft's axis has an error with a period of one turn; a tilted magnet, or
 channels that differ in amplitude or are not in quadrature, cause one with a period of half a turn.

@@ -1,7 +1,7 @@
 """One fake servo: a control table as a state machine, independent of bus and plant (see `hil.fakes.bus.bus`).
 
 The behaviour follows the ROBOTIS e-Manual (protocol2 and x/<model> pages). Where the manual is silent, this module
-chooses what is stricter for a client:
+chooses the behaviour that demands more of a client:
 
 - A write that covers several registers is applied to each writable one, and the status carries the error of the first
 that refused. ROBOTIS' own example indirect_address writes Goal Position and an LED of 255 together and waits until the

@@ -34,7 +34,7 @@ class CheckReport:
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """Findings that do not block an experiment but should be looked at."""
+        """Findings that do not block an experiment but deserve attention."""
         return tuple(finding for finding in self.findings if finding.level is Level.WARNING)
 
     def to_json(self) -> dict[str, Any]:

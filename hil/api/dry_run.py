@@ -101,7 +101,7 @@ def dry_run(
     executor: Executor | None = None,
     on_progress: OnProgress = ignore,
 ) -> Rehearsal:
-    """Simulate the experiment on arms consistent with what is known of this one: `hil dry-run` as a function.
+    """Simulate the experiment on arms consistent with what is known about this one: `hil dry-run` as a function.
 
     Args:
         config: TOML file of the arm, the name of a bundled one, or a loaded configuration.
@@ -124,7 +124,7 @@ def dry_run(
     if checked.is_chain:
         if former is not None:
             raise ConfigError(
-                f"{shown}: --result: dry runs of spatial arms support only the description as prior so far."
+                f"{shown}: --result: so far, dry runs of spatial arms accept only the description as the prior."
             )
 
         def tell(done: int, of: int) -> None:

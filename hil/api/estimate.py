@@ -38,13 +38,13 @@ def estimate(
     Args:
         recording: a run folder or a `Run`, whose result.json is rewritten; or one or more recordings of one arm by
             other tools: CSV, Parquet or MCAP files, LeRobot datasets, ROS 2 bags.
-        config: for recordings of other tools, a TOML file whose [columns] table describes them; without it their own
-            names must tell.
+        config: for recordings of other tools, a TOML file whose [columns] table describes them; without it, the
+            column names must be clear enough.
         out: for recordings of other tools, the folder of the result, which must be new or empty; runs/TIME-NAME unless
             given.
         all_samples: of a run, use every sample by multiple shooting; no settled period is needed.
-        executor: of concurrent.futures, or `hil.study.engine.executor`; with `friction = "auto"` it begins fits that
-            may be needed, for shorter waiting and more work in all. The result is the same with and without it.
+        executor: of concurrent.futures, or `hil.study.engine.executor`; with `friction = "auto"` it starts fits
+            before they are known to be needed: less waiting, more work in total. The result is the same either way.
         on_progress: called with a `Progress` when a new stage begins.
 
     Returns:
@@ -54,7 +54,7 @@ def estimate(
         RunFolderError: the folder holds no readable run.
         CsvError: a file cannot be read as a recording.
         ConfigError: `config` is wrong.
-        RecordingCutShort: the run holds no settled period; `all_samples` can do without.
+        RecordingCutShort: the run holds no settled period; `all_samples` does not need one.
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
         ValueError: run folders and other recordings together, or several run folders.
     """
@@ -99,7 +99,7 @@ def _from_files(paths: list[Path], config: Path | None, out: PathLikeStr | None)
     folder = unused_path(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{name}") if out is None else Path(out)
     create(folder)
     with ExitStack() as unless_done:
-        # A failed start leaves no folder in the way of the next try.
+        # A failed start leaves no folder that would block the next attempt.
         unless_done.callback(_discard, folder)
         found = estimate_recordings(paths, config, folder)
         write_recording_report(folder)
@@ -115,7 +115,7 @@ def _discard(folder: Path) -> None:
 
 
 def _again(folder: Path) -> Estimation:
-    """The same files by the configuration in the folder, into the same folder."""
+    """Estimate the same files again with the configuration in the folder, into the same folder."""
     record = load_record(folder)
     found = estimate_recordings([Path(file.path) for file in record.files], folder / "config.toml", folder)
     write_recording_report(folder)

@@ -47,7 +47,7 @@ def identify(
         out: run folder, which must be new or empty; by default runs/TIME-ARM.
         take_over: take over an arm whose torque another program left on, and lower it slowly; support it by hand.
         start_from: run folder or result.json of an earlier identification of the same arm, which replaces the prior, so
-            that fewer runs are needed; only with experiment.pilot. If the arm moves otherwise, the prior is used.
+            that fewer runs are needed; only with experiment.pilot. If the arm moves differently, the prior is used.
         on_progress: called with a `Progress` about 20 times a second while the arm moves, in a separate thread on a
             real bus. It cannot disturb the experiment: reports that arrive too fast are dropped, and if it raises, the
             exception is logged and it is not called again.
@@ -122,8 +122,8 @@ def _earlier(config: Config, shown: Path, path: Path) -> Result:
     """The result of an earlier run. Raises ConfigError, ResultError, RunFolderError."""
     if config.is_chain or not config.experiment.pilot:
         raise ConfigError(
-            f"{shown}: an earlier run replaces the prior of a pilot, so it needs experiment.pilot = true and an arm in "
-            "a plane. Without a pilot there is nothing to start from: peak_torque is given."
+            f"{shown}: an earlier run replaces the prior of a pilot, so it needs experiment.pilot = true and a planar "
+            "arm. Without a pilot it has no effect, because peak_torque is given."
         )
     return read_result(path)
 
@@ -137,7 +137,7 @@ def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: P
 @contextmanager
 def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
     """Remove the run folder if the experiment fails before the first sample, so that it does not block the next
-    attempt. After a stop, add to the exception what is kept and how to go on.
+    attempt. After a stop, add to the exception what is kept and how to continue.
     """
     try:
         yield

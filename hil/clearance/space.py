@@ -31,7 +31,7 @@ AT_REST_SLACK = 0.008
 than the margin."""
 
 AT_REST_INSIDE = 0.02
-"""Overlap in the rest pose up to which it is believed [m]: capsules are fatter than what they enclose."""
+"""Largest accepted overlap in the rest pose [m]: capsules are larger than the parts they enclose."""
 
 LYING_RAD = 0.12
 """An arm within this angle of its rest pose in every joint counts as at rest, which its owner declares safe."""
@@ -105,15 +105,17 @@ class Space:
         return Nearest(float(room[sample]) + needed, needed, self.names_of(int(worst[sample])), sample)
 
     def wrong_rest_pose(self) -> str:
-        """Say what overlaps in the rest pose by more than capsules are fatter than the parts in them; "" if nothing."""
+        """Describe the largest overlap in the rest pose that the excess size of the capsules cannot explain; "" if
+        none.
+        """
         found = self.nearest(self.rest[:, None])
         if found.distance >= -AT_REST_INSIDE:
             return ""
         first, second = found.pair
         return (
             f"arm.rest_pose puts {first} {-1e3 * found.distance:.0f} mm into {second}: the pose, zero_ticks, a "
-            "direction, [clearance] or the URDF's collision geometry is wrong. `hil pose` shows the arm as the bus "
-            "sees it; clearance.ignore names pairs that do meet"
+            "direction, [clearance] or the URDF's collision geometry is wrong. `hil pose` shows the pose as read from "
+            "the bus; clearance.ignore names pairs that do meet"
         )
 
     def ends(self, position: Array) -> tuple[Array, Array]:

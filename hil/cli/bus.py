@@ -75,11 +75,11 @@ def check(config: ConfigPath, json_only: Json = False) -> None:
 def pose(
     config: ConfigPath,
     guide: Annotated[
-        bool, typer.Option("--guide", help="Ask for each joint to be moved by hand, and compare.")
+        bool, typer.Option("--guide", help="Ask for each joint to be moved by hand, and check its motion.")
     ] = False,
     json_only: Json = False,
 ) -> None:
-    """Show the arm of a URDF or MJCF as the bus sees it, with --guide while a hand moves it. Torque stays off."""
+    """Show the pose of a URDF or MJCF arm as read from the bus; --guide checks each joint by hand. Torque stays off."""
     from hil import fakes
     from hil.cli.views.pose_view import moved_values, pose_values, print_moved, print_pose
     from hil.config.schema import load_config

@@ -17,7 +17,7 @@ def compare(
     mujoco: Annotated[bool, typer.Option("--mujoco", help="Include mujoco.sysid; needs the extra `peers`.")] = False,
     json_only: Json = False,
 ) -> None:
-    """Apply other methods to the same recording: RLS, EKF, UKF, IDIM-LS, the seed paper's, mujoco.sysid.
+    """Apply other methods to the same recording: RLS, EKF, UKF, IDIM-LS, the seed paper's method, mujoco.sysid.
 
     For a spatial arm: least squares on Fourier lines, and IDIM-LS.
     """
@@ -59,7 +59,7 @@ def calibrate(
     ] = 0.0,
     at: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--at", metavar="X Y Z", help="Spatial arm: its place in the frame of its link, in m."),
+        typer.Option("--at", metavar="X Y Z", help="Spatial arm: its position in the frame of its link, in m."),
     ] = None,
     joint: Annotated[
         str | None,

@@ -71,7 +71,7 @@ def record(
     live: Live = "terminal",
     json_only: Json = False,
 ) -> None:
-    """Play the experiment and store its recording for `hil estimate`."""
+    """Run the experiment and store its recording for `hil estimate`."""
     from hil.api.experiment import record as record_arm
     from hil.next_step import next_step
     from hil.results.json_form import to_json
@@ -92,7 +92,7 @@ def _watching(config: Path, live: str, json_only: bool) -> "Iterator[OnProgress]
     from hil.cli.views.rerun_view import rerun_view, wants_rerun
 
     if live != "terminal" and not wants_rerun(live):
-        raise typer.BadParameter(f"--live {live}: known are terminal, rerun, rerun:FILE.rrd and rerun:URL.")
+        raise typer.BadParameter(f"--live {live}: must be terminal, rerun, rerun:FILE.rrd or rerun:URL.")
     with Terminal(quiet=json_only).following(config) as follow:
         if live == "terminal":
             yield follow
@@ -126,9 +126,7 @@ def estimate(
     if out is not None and not elsewhere:
         raise typer.BadParameter("--out is for recordings of other tools; a run's result is written into its folder.")
     if config is not None and not elsewhere:
-        raise typer.BadParameter(
-            "--config is for recordings of other tools; a run has its own config.toml, to be edited."
-        )
+        raise typer.BadParameter("--config is for recordings of other tools; edit the run's own config.toml instead.")
     with Terminal(quiet=json_only).following(config) as follow:
         result = estimate_arm(paths, config=config, out=out, all_samples=all_samples, on_progress=follow)
     _show(result, json_only)

@@ -1,4 +1,4 @@
-"""Standard output that a reader closed early, or that is full: both after the work, which is in its folder."""
+"""Handling of standard output that its reader closed early, or that is full. Results are already in their folder."""
 
 import errno
 import os
@@ -11,7 +11,7 @@ import typer
 
 @contextmanager
 def readable_output() -> Iterator[None]:
-    """A closed pipe (`| head -1`) is no failure; a full disk is one, and says so."""
+    """Treat a closed pipe (`| head -1`) as success; report a full disk as a failure."""
     try:
         yield
         sys.stdout.flush()
@@ -22,7 +22,7 @@ def readable_output() -> Iterator[None]:
         if error.errno != errno.ENOSPC or error.filename is not None:
             raise
         _drop_output()
-        said = "hil: standard output cannot be written: no space left. What was finished is in its folder."
+        said = "hil: cannot write to standard output: no space left. Finished results are in their folder."
         print(said, file=sys.stderr)
         raise typer.Exit(1) from None
 

@@ -12,7 +12,7 @@ from hil import strict_json
 from hil.cli.options import Json, RunPath
 
 _WHOLE = 100.0
-"""Change [%] beyond which no figure is given: these runs say nothing about that term."""
+"""Change [%] beyond which no figure is given: these runs reveal nothing about that term."""
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -39,7 +39,7 @@ def runs(
 
 
 def _print_runs(found: "list[RunSummary]") -> None:
-    """A table; where the terminal is too narrow for it, each run's path on a line of its own, to be copied whole."""
+    """A table; if the terminal is too narrow for it, each run's path on a line of its own, so that it can be copied."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -130,13 +130,15 @@ def _print_difference(difference: "Difference") -> None:
 
 
 def _would_show(detectable: "Mapping[str, float]") -> list[str]:
-    """Say which change of one term of friction alone two such runs would have shown [% by name], and which none."""
+    """Say which change of a single friction term two such runs would have revealed [% by name], and for which terms
+    none.
+    """
     least = [f"{name} {percent:.2g} %" for name, percent in detectable.items() if percent <= _WHOLE]
     never = [name for name, percent in detectable.items() if percent > _WHOLE]
     lines = []
     if least:
-        known = "A smaller change of one term alone may not show (from there on 95 of 100 such pairs show it)"
+        known = "Smallest changes of one term alone that 95 of 100 such pairs reveal"
         lines.append(f"{known}: {', '.join(least)}.")
     if never:
-        lines.append(f"Not even a doubling would show: {', '.join(never)}.")
+        lines.append(f"Not even a doubling would be detected: {', '.join(never)}.")
     return lines

@@ -19,7 +19,7 @@ def find_config(path: Path) -> Path:
 
 
 def meant(path: Path) -> str:
-    """What to say about a bare name that is no bundled configuration; empty for paths and files that exist."""
+    """The hint for a bare name that is not a bundled configuration; empty for paths and files that exist."""
     if not _is_name(path) or path.exists():
         return ""
     names = list(bundled_configs())

@@ -74,7 +74,7 @@ def chain_slips(config: "Config") -> Iterator[str]:
         )
     if config.experiment.pilot:
         if config.joint_path is not None:
-            yield "joint_path: with experiment.pilot = true the path is found; remove one of the two"
+            yield "joint_path: with experiment.pilot = true the path is designed automatically; remove one of the two"
     elif config.stabiliser is None:
         yield (
             "stabiliser is missing: a spatial arm does not hang at rest, so a spring and a damper must hold it "

@@ -16,7 +16,7 @@ _Floor = Annotated[
 
 
 class BoxConfig(Table):
-    """`[[clearance.boxes]]`: something in the way. Seen from the base's origin with z upwards."""
+    """`[[clearance.boxes]]`: an obstacle, relative to the base's origin with z upwards."""
 
     name: str = Field(min_length=1, max_length=40)
     centre: Point = Field(description="m")
@@ -29,13 +29,13 @@ class BoxConfig(Table):
 
 
 class ClearanceConfig(Table):
-    """`[clearance]`: how near a spatial arm may come to itself, the floor and boxes."""
+    """`[clearance]`: how close a spatial arm may come to itself, the floor and boxes."""
 
     margin: float = Field(0.01, ge=0, le=0.5, description="m that must stay free along the whole planned motion")
     floor: _Floor = Field(
-        0.0, description='height of the table or floor above the base\'s origin, m; "none" where there is none in reach'
+        0.0, description='height of the table or floor above the base\'s origin, m; "none" if none is in reach'
     )
-    boxes: list[BoxConfig] = Field([], description="what else is in the way")
+    boxes: list[BoxConfig] = Field([], description="other obstacles")
     ignore: list[Annotated[list[str], Field(min_length=2, max_length=2)]] = Field(
         [], description='pairs of links (or "floor", or a box) that need no clearance'
     )

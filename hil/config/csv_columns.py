@@ -51,7 +51,7 @@ class _Table(BaseModel):
 
 
 class Columns(_Table):
-    """`[columns]`: the meaning and unit of each column. What is left out is taken from the columns' own heads."""
+    """`[columns]`: the meaning and unit of each column. Anything omitted is taken from the column headers."""
 
     time: Column | None = None
     rate: PositiveFloat | None = Field(None, le=1e5, description="samples per second, where there is no column of time")
@@ -61,7 +61,7 @@ class Columns(_Table):
     )
     position_unit: Literal["rad", "mrad", "deg", "turns", "ticks"] | None = None
     angles: Literal["relative", "absolute"] = Field(
-        "relative", description="absolute: every angle is counted from the same direction, not from the link before"
+        "relative", description="absolute: every angle is measured from the same direction, not from the previous link"
     )
     ticks_per_turn: PositiveFloat | None = Field(None, description="of the encoders, for positions in ticks")
     zero: list[Angle] | None = Field(
@@ -94,7 +94,7 @@ class Columns(_Table):
 
     @property
     def drive(self) -> Literal["torque", "current", "voltage", "pwm"] | None:
-        """Which of the columns says how the joints were driven."""
+        """Which of the columns specifies how the joints were driven."""
         kinds: tuple[Literal["torque", "current", "voltage", "pwm"], ...] = ("torque", "current", "voltage", "pwm")
         return next((kind for kind in kinds if getattr(self, kind) is not None), None)
 
@@ -112,7 +112,7 @@ class Columns(_Table):
     def _consistent(self) -> Self:
         drives = [kind for kind in ("torque", "current", "voltage", "pwm") if getattr(self, kind) is not None]
         if len(drives) > 1:
-            raise ValueError(f"columns: {' and '.join(drives)} are both given: give one of them, one column per joint")
+            raise ValueError(f"columns: {' and '.join(drives)} are both given: give only one, one column per joint")
         if self.time is not None and self.rate is not None:
             raise ValueError("columns: give either time or rate, not both")
         if self.current is not None and self.torque_constant is None:
@@ -158,7 +158,7 @@ class ArmFacts(BaseModel):
 
 
 class RecordingConfig(BaseModel):
-    """The tables of an arm's TOML that a recording made elsewhere needs; every one may be left out."""
+    """The tables of an arm's TOML that a recording made elsewhere needs; all of them are optional."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
 
@@ -195,7 +195,7 @@ def load_recording_config(path: Path) -> RecordingConfig:
 
 
 def parse_recording_config(text: str, path: Path) -> RecordingConfig:
-    """The same from what stands in `path`; raises ConfigError."""
+    """The same, from the contents of `path`; raises ConfigError."""
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

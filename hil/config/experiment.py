@@ -21,7 +21,7 @@ class ExperimentConfig(Table):
     band: Range | None = Field(None, description="Hz: its lines are assigned to the joints in turn")
     lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
     detection: bool = Field(
-        False, description="drive only some of the odd lines: the others reveal nonlinear distortion"
+        False, description="excite only some of the odd lines: the others reveal nonlinear distortion"
     )
     peak_torque: list[PositiveFloat] | None = Field(
         None, description="N m per joint; with pilot = true, found by dry runs"
@@ -31,7 +31,7 @@ class ExperimentConfig(Table):
     ramp: float = Field(1.0, ge=0, le=60, description="s, at start and end")
     rest: float = Field(0.5, ge=0, le=60, description="s without torque beforehand")
     warm_up: float = Field(
-        0.0, ge=0, le=3600, description="s of the same motion before the first recorded period, until friction is warm"
+        0.0, ge=0, le=3600, description="s of the same motion before the first recorded period, to warm up the friction"
     )
     settle_within: PositiveFloat = Field(
         0.01, lt=1, description="RMS difference between periods, relative to the motion's RMS"

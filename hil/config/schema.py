@@ -140,7 +140,7 @@ class SafetyConfig(Table):
     lower_speed: PositiveFloat = Field(
         0.6, le=5, description="rad/s at which a stop lowers a spatial arm to its rest pose"
     )
-    lower_time: PositiveFloat = Field(10.0, le=60, description="s: longest time for that; a longer way is taken faster")
+    lower_time: PositiveFloat = Field(10.0, le=60, description="s: longest time for that; longer paths are faster")
     limit_chance: float = Field(
         0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"
     )
@@ -252,15 +252,17 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is one in space: described by a file, unless that describes a planar arm without a path."""
+        """Whether the arm is a spatial one: described by a file, unless the file describes a planar arm and there is no
+        path.
+        """
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property
     def rest_tolerance(self) -> float:
         """Largest deviation from the rest pose at the start [rad]: `arm.rest_tolerance`.
 
-        If that is not given, it is LYING_RAD for a spatial arm: it lies on something, where friction holds it less far
-        away than an arm that hangs.
+        If that is not given, it is LYING_RAD for a spatial arm: it lies on something, so friction holds it closer to
+        its rest pose than an arm that hangs.
         """
         is_given = "rest_tolerance" in self.arm.model_fields_set
         return LYING_RAD if self.is_chain and not is_given else self.arm.rest_tolerance
@@ -376,7 +378,7 @@ def port_url(port: str) -> str:
 
 
 def _is_only_fake(path: Path) -> bool:
-    """Whether a TOML file describes nothing but a fake arm, as `hil fake` takes it."""
+    """Whether a TOML file describes nothing but a fake arm, which `hil fake` accepts."""
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):

@@ -1,4 +1,6 @@
-"""Serial arms from MJCF, as MuJoCo itself reads it: defaults, included files and shapes' inertias are its business."""
+"""Serial arms from MJCF, as MuJoCo itself reads it, including defaults, included files and inertias derived from
+shapes.
+"""
 
 import importlib
 from collections.abc import Sequence
@@ -47,7 +49,7 @@ def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
         before = body
     check_units(arm, path)
     doubts = tuple(
-        f'body "{each.link}": no mass distribution can have this inertia; the data will decide'
+        f'body "{each.link}": no mass distribution can have this inertia; it is used only as an initial guess'
         for each in arm
         if not each.body.is_physical
     )
@@ -174,7 +176,7 @@ class _Tree:
                 )
 
     def _way(self, body: int) -> list[int]:
-        """From a body to the world, without that."""
+        """Bodies from this one towards the world, which is not included."""
         way = []
         while body != WORLD:
             way.append(body)
@@ -182,7 +184,9 @@ class _Tree:
         return way
 
     def frame(self, body: int, before: int) -> tuple[Array, Array]:
-        """Rotation and place of a body's joint in the frame of the moving body before, whose origin is its joint."""
+        """Rotation and position of a body's joint in the frame of the previous moving body, whose origin is its
+        joint.
+        """
         rotation, translation = np.eye(3), np.zeros(3)
         for part in self._way(body):
             if part == before:
@@ -202,7 +206,9 @@ class _Tree:
         return number.get(body, 0), rotation, translation - self._pivot(body)
 
     def rigid(self, body: int, chosen: set[int]) -> tuple[Body, list[str], list[str]]:
-        """A body about its joint, merged with all that does not move against it; names of those, and of joints held."""
+        """A body about its joint, merged with everything fixed to it; names of the merged bodies, and of joints
+        held.
+        """
         merged, fixed, held = self._merged(body, chosen)
         return merged.moved(np.eye(3), -self._pivot(body)), fixed, held
 
@@ -227,13 +233,13 @@ class _Tree:
         return _rotation(self.model.body_quat[body]), np.array(self.model.body_pos[body])
 
     def _pivot(self, body: int) -> Array:
-        """Of its joint, in its own frame (3,) [m]."""
+        """Position of the body's joint, in the body's own frame (3,) [m]."""
         if body == WORLD or not self.model.body_jntnum[body]:
             return np.zeros(3)
         return np.array(self.model.jnt_pos[int(self.model.body_jntadr[body])])
 
     def limits(self, joint: int) -> tuple[float, float] | None:
-        """[rad], None for one without."""
+        """Limits of a joint [rad]; None if it has none."""
         if not self.model.jnt_limited[joint]:
             return None
         low, high = map(float, self.model.jnt_range[joint])
@@ -241,7 +247,7 @@ class _Tree:
 
 
 def _rotation(quaternion: Array) -> Array:
-    """Of w, x, y, z."""
+    """Rotation matrix of a quaternion w, x, y, z."""
     w, x, y, z = map(float, quaternion)
     return np.array(
         [

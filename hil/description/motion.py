@@ -1,4 +1,4 @@
-"""Where a described arm is, and which way each joint moves it: what a person can see and compare."""
+"""Where a described arm is, and which way each joint moves it, in terms that a person can compare."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from hil.description.arm import ArmDescription, Array
 
 DIRECTIONS = (("forwards (+x)", "backwards (-x)"), ("to the left (+y)", "to the right (-y)"), ("up (+z)", "down (-z)"))
 """Of the base's x, y and z axis."""
-LEAST_LEVER = 0.01  # m: an end nearer to an axis than this shows no direction
+LEAST_LEVER = 0.01  # m: an end nearer to an axis than this has no direction of motion
 
 
 def end_point(arm: ArmDescription, angles: Array) -> Array:

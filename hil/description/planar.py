@@ -1,4 +1,4 @@
-"""Whether a described arm is one that the planar model covers, with its angles counted as there."""
+"""Whether the planar model covers a described arm, with the same angle convention."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ ALIGNED = 1e-3  # rad: directions nearer than this are the same
 
 def is_planar(arm: ArmDescription, gravity: Array) -> bool:
     """Whether the arm moves as the planar model's: one or two joints with parallel axes, without gravity or across it,
-    and then at angle zero a first link that stands out level, which positive angles lift. `gravity`: in the base's
+    and then at angle zero a horizontal first link, which positive angles lift. `gravity`: in the base's
     frame (3,) [m/s^2]."""
     if len(arm.joints) > PLANAR_JOINTS:
         return False

@@ -53,7 +53,7 @@ class ChainPrediction:
 
     def __str__(self) -> str:
         where = f"{self.moment:.1f} s into {self.role!r}"
-        return f"{self.nearest}, at least {1e3 * self.nearest.needed:.0f} mm wanted, {where}"
+        return f"{self.nearest}, at least {1e3 * self.nearest.needed:.0f} mm required, {where}"
 
 
 def predict_chain(

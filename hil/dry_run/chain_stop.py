@@ -68,7 +68,7 @@ class ChainStops:
         if down.nearest.room < 0.0:
             return (
                 f"too little clearance when a stop lowers the arm, {down.nearest}, at least "
-                f"{1e3 * down.nearest.needed:.0f} mm wanted"
+                f"{1e3 * down.nearest.needed:.0f} mm required"
             )
         if down.lies < LAID_DOWN:
             return f"a stop lays only {100 * down.lies:.0f} % of the simulated arms down in the rest pose"

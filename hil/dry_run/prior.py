@@ -1,4 +1,4 @@
-"""What is known of an arm before identification: masses, lengths and friction, each with its spread.
+"""What is known about an arm before identification: masses, lengths and friction, each with its spread.
 
 `[arm.prior]` gives what the user knows. The rest is estimated from link lengths by the rules of thumb below, which are
 based on only a few arms, and from the servo models (hil.drivers.servo_prior); both have a wide spread.
@@ -54,9 +54,9 @@ def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
     lengths = config.arm.link_lengths
     if lengths is None:
         raise ConfigError(
-            f"{config.path}: what a torque does to this arm cannot be foreseen without its link lengths. Measure "
+            f"{config.path}: the effect of a torque on this arm cannot be predicted without its link lengths. Measure "
             "from joint to joint and to the tip with a ruler, and set arm.link_lengths = [...] in m, one for each of "
-            "[[joints]]; or give a dry run an earlier identification (--result)."
+            "[[joints]]; or use an earlier identification in the dry run (--result)."
         )
     random = np.random.default_rng((seed, 5))
     drawn = {name: quantity.draw(random, count) for name, quantity in quantities(config, np.array(lengths)).items()}

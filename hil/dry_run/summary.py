@@ -81,7 +81,9 @@ def settling_text(config: Config, prediction: Prediction) -> str:
 
 
 def joints_json(config: Config, prediction: Prediction) -> dict[str, Any]:
-    """Return each joint's predicted peaks, their limits and the chance of passing them, by joint and quantity."""
+    """Return each joint's predicted peaks, their limits and the probability of exceeding them, by joint and
+    quantity.
+    """
     median, quantile, chance = prediction.median, prediction.quantile, prediction.limit_chance
     return {
         joint.name: {

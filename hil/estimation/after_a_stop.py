@@ -1,4 +1,4 @@
-"""What a run that was stopped still holds, and the command that goes on from there."""
+"""What a stopped run still contains, and the command to continue with."""
 
 from pathlib import Path
 
@@ -27,14 +27,14 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
             "rougher than that of a finished run.",
             next_step("estimate", steps[-1]),
         ]
-    return [f"What was recorded until then is kept in {run.path}; no period had settled.", next_step(command, shown)]
+    return [f"The recording until then is kept in {run.path}; no period had settled.", next_step(command, shown)]
 
 
 def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
     """The same after a stop by the guard or a servo's failure: nothing moves again before the arm has been checked."""
     if can_be_estimated(run.path):
         return ["The recording is kept and complete enough for an estimate.", next_step("estimate", run.path)]
-    return [f"What was recorded until then is kept in {run.path}.", next_step("check", shown)]
+    return [f"The recording until then is kept in {run.path}.", next_step("check", shown)]
 
 
 def can_be_estimated(path: Path) -> bool:

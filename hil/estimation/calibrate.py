@@ -70,8 +70,8 @@ class CalibrationResult:
 class AddedMass:
     """The mass as the user gives it: `distance` and `length` for a planar arm, `at` and `joint` for a spatial one.
 
-    mass [kg], inertia about its own centre [kg m^2]. distance: from the last joint; length: of link 1 [m]. at: place in
-    the frame of the link that `joint` moves, by default the last joint [m].
+    mass [kg], inertia about its own centre [kg m^2]. distance: from the last joint; length: of link 1 [m]. at: position
+    in the frame of the link that `joint` moves, by default the last joint [m].
     """
 
     mass: float
@@ -89,7 +89,8 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, added: AddedMass) -
     if config.is_chain:
         if added.at is None or added.distance is not None or added.length is not None:
             raise ConfigError(
-                "a spatial arm: give the place of the mass in its link's frame, --at X Y Z in metres (and --joint NAME "
+                "a spatial arm: give the position of the mass in its link's frame, --at X Y Z in metres (and --joint "
+                "NAME "
                 "if it is not on the last link), instead of --distance and --length."
             )
         mass = MassOnLink(added.mass, added.at, link_of(config, added.joint), added.inertia)

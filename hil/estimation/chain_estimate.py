@@ -165,7 +165,7 @@ def _verdict(
     ]
     trust = "yes" if over.max() <= EXPLAINED else "with care"
     if held_out is None:
-        sentences.append("No other path was played, so the prediction could not be validated.")
+        sentences.append("No second path was recorded, so the prediction could not be validated.")
         trust = "with care"
     else:
         error = float(np.max(held_out))
@@ -175,8 +175,8 @@ def _verdict(
     if still:
         trust = "no"
         sentences.append(
-            f"{', '.join(still)} hardly moved, which tells nothing of its inertia and friction: widen joint_path.swing "
-            "and speed there, and check that nothing blocks it."
+            f"{', '.join(still)} hardly moved, so the recording says little about its inertia and friction: widen "
+            "joint_path.swing and speed there, and check that nothing blocks it."
         )
     if estimate.from_prior:
         trust = "with care" if trust == "yes" else trust
@@ -186,7 +186,7 @@ def _verdict(
         )
     if estimate.unseen:
         sentences.append(
-            f"Gravity does not show {', '.join(estimate.unseen)} in this motion: they are not identifiable, and are "
-            "taken as zero within their standard errors."
+            f"In this motion gravity does not reveal {', '.join(estimate.unseen)}: they are not identifiable, and are "
+            f"assumed to be zero within their standard errors."
         )
     return Verdict(trust, weakest, tuple(sentences))

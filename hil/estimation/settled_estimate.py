@@ -49,7 +49,7 @@ log = logging.getLogger(__name__)
 def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledResult:
     """Estimate from the recording in `run`, write its result.json and return the result.
 
-    executor: begins fits that `friction = "auto"` may need before it is known that it does.
+    executor: starts fits in advance that `friction = "auto"` may need.
     Raises HilError, EstimationError.
     """
     config, facts = run.load_config(), run.load_facts()
@@ -110,27 +110,29 @@ def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tup
         return settled_period(config, facts, samples, HELD_OUT), []
     except RecordingCutShort:
         return None, [
-            "The recording ends before the held-out motion settled: that the model predicts another motion is not "
-            "checked. Identify again for that."
+            "The recording ends before the held-out motion settled, so the prediction of another motion is not "
+            "validated. Identify again to validate it."
         ]
 
 
 def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift, is_corrected: bool) -> PlayedPeriod:
-    """Predict the held-out period under the friction of its time, within it too if the fitted one `is_corrected`."""
+    """Predict the held-out period with the friction at its time, which varies within it if the fitted one
+    `is_corrected`.
+    """
     later = drift.at_the_later(estimate) if drift.is_seen else estimate
     predicted = predict_period(later, steadied(other, later, drift) if is_corrected else other)
     return PlayedPeriod(other.rate, other.torque, other.position, predicted)
 
 
 def _as_fitted(estimate: Estimate, other: SettledPeriod | None, drift: Drift | None) -> NDArray[np.float64] | None:
-    """Relative prediction error of the held-out period with the friction of the fitted one, where it has changed."""
+    """Relative prediction error of the held-out period with the friction of the fitted one, if friction changed."""
     if other is None or drift is None or not drift.is_seen:
         return None
     return relative_error(other.position, predict_period(estimate, other))
 
 
 def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDArray[np.float64]:
-    """Add what the description of back-EMF neglects."""
+    """Add the variance due to what the back-EMF model neglects."""
     wider = covariance.copy()
     for name, std in neglected(Physics.of(estimate.parameters)).items():
         place = estimate.names.index(name)

@@ -1,11 +1,11 @@
-"""A supply whose voltage sags under load: found in the servos' Present Input Voltage, and what it does to the torque.
+"""A supply that sags under load: detected from the servos' Present Input Voltage, and its effect on the torque.
 
 The bridge of a motor that gets the voltage u (or the current i) at the velocity v draws a current in proportion to
-u^2 and u v (i^2 and i v) from the supply, whose resistance turns it into a drop. The register is read a few times a
-second only, in steps of 0.1 V. A regression of its readings on these products over the whole recording gives the drop
-at every sample nevertheless.
+u^2 and u v (i^2 and i v) from the supply, whose resistance turns it into a drop. The register is read only a few times
+a second, in steps of 0.1 V. A regression of its readings on these products over the whole recording nevertheless gives
+the drop at every sample.
 
-A voltage-driven joint gets its duty cycle's share of what the supply gives at that moment: its torque sags with it. A
+A voltage-driven joint receives its duty cycle times the supply voltage of that moment: its torque sags with it. A
 current-driven joint is not affected as long as its servo can still drive the current.
 """
 
@@ -25,7 +25,7 @@ STEP_V = 0.1  # of the register
 SIGNIFICANT = 6.0
 """Standard errors that the drop at full load must differ from zero."""
 LEAST = {Mode.PWM: 0.005, Mode.CURRENT: 0.05}
-"""Largest drop, relative to the voltage without load, that is not worth mentioning, by what drives the joints."""
+"""Largest drop, relative to the voltage without load, that is not worth mentioning, by drive mode."""
 _FULL_LOAD = 0.99  # quantile of the drop
 
 
@@ -102,6 +102,6 @@ def supply_notes(config: Config, sag: Sag | None) -> tuple[str, ...]:
             "supply or a shorter, thicker cable helps.",
         )
     return (
-        f"{found} The servos control their current, so that it matters only where they are fast: see whether the "
-        "measured current follows. A stronger supply or a shorter, thicker cable helps.",
+        f"{found} The servos control their current, so this matters only at high speed: check whether the measured "
+        "current follows. A stronger supply or a shorter, thicker cable helps.",
     )

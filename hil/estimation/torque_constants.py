@@ -35,7 +35,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
         ""
         if not exact
         else f"For {', '.join(exact)}, no uncertainty of the torque constant is given (torque_constant_std, or "
-        "torque_per_volt_std in PWM mode): servos of a model differ by about 10 %, and every value with them."
+        "torque_per_volt_std in PWM mode): servos of the same model differ by about 10 %, and so does every value."
     )
     unsure = [
         f"{joint.name} {100 * joint.torque_per_goal_std / joint.torque_per_goal:.2g} %"
@@ -57,7 +57,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
         f"constant of {first.name}"
     )
     if not first.torque_per_goal_std:
-        return f"{found}, of which no uncertainty is given."
+        return f"{found}, whose uncertainty is not given."
     return f"{found}, known to {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
 
 

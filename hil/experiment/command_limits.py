@@ -31,7 +31,7 @@ class CommandLimits:
         return clamped
 
     def holding(self, goals: Sequence[float]) -> None:
-        """The goals that the servos have now [A or V]: `clamp` goes on from there."""
+        """The goals that the servos have now [A or V]: `clamp` continues from these."""
         self._former = list(goals)
 
     def _not_a_number(self, index: int, goal: float) -> NoReturn:

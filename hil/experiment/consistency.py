@@ -5,8 +5,8 @@ velocity must equal the change in position. The difference,
 
     apart = position - integral of velocity,
 
-is tracked with exponential memories: a short one, which shows a sudden fault at once, and a long one, which shows one
-that creeps. Rounding and encoder noise do not accumulate in it. What ordinary servos contribute is known:
+is tracked with exponential memories: a short one, which reveals a sudden fault at once, and a long one, which reveals a
+creeping one. Rounding and encoder noise do not accumulate in it. What ordinary servos contribute is known:
 
 - a velocity that lags by tau, because the servo filters it: tau times the velocity, less its mean over the memory. Any
   lag up to `LAG_S` is accepted;
@@ -14,8 +14,8 @@ that creeps. Rounding and encoder noise do not accumulate in it. What ordinary s
 - the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where
   a fraction `CURVED` of the change of velocity times the interval remains.
 
-A reading that jumps to and fro, as one with a stuck bit does, cancels in those memories. So each single interval is
-compared too, with what its encoder's noise has been so far: `STEPS` jumps within `STEPS_S` count.
+A reading that jumps back and forth, as with a stuck bit, cancels in those memories. Therefore each single interval is
+also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
 
 Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, twice those
 observed by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
@@ -77,7 +77,7 @@ class Consistency:
     def look(self, position: float, velocity: float, seconds: float, unsure: float = 0.0) -> bool:
         """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
 
-        unsure: excess duration of its exchange [s], in which the time of the measurement is not known.
+        unsure: excess duration of its exchange [s], by which the time of the measurement is uncertain.
         """
         former, before = self._position, self._velocity
         self._position, self._velocity = position, velocity
@@ -98,7 +98,7 @@ class Consistency:
         short.add(moved, difference, velocity, seconds, curved, unknown)
         if short.is_wrong(velocity, self._lag, self._scale):
             return True
-        # The long memory takes several intervals at once: it is slow anyway, and time is scarce.
+        # The long memory processes several intervals at once: it is slow anyway, and time is scarce.
         self._sum_moved += moved
         self._sum_difference += difference
         self._sum_unknown += unknown

@@ -1,4 +1,4 @@
-"""Missed deadlines: how long the arm may be without a command, and what share of the deadlines may be missed."""
+"""Missed deadlines: how long the arm may go without a command, and what share of the deadlines may be missed."""
 
 from hil.config.schema import Config
 from hil.errors import Cause, SafetyStop

@@ -47,7 +47,7 @@ LONG_GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
 
 NONE_HEARD = "No servo was heard"
-"""Of a stop because all replies are missing."""
+"""Beginning of the message of a stop because all replies are missing."""
 
 
 class _Limits(NamedTuple):
@@ -124,7 +124,7 @@ class Guard:
         return self._commands.clamp(goals)
 
     def holding(self, goals: Sequence[float]) -> None:
-        """The goals that the servos have now [A or V]: `clamp` goes on from there."""
+        """The goals that the servos have now [A or V]: `clamp` continues from these."""
         self._commands.holding(goals)
 
     def woke_up(self, now: float, late: float) -> None:
@@ -204,7 +204,7 @@ class Guard:
         if consistency.look(position, velocity, elapsed, self._unsure):
             self._disagree(index, position, velocity)
         if self._work is not None:
-            # Where a goal before was another one meanwhile, nothing is known about its work.
+            # If other goals may have been in effect since the last sample, the work done is unknown.
             is_known = former is not None and elapsed < LONG_GAP * interval and not missed
             taken = self._work.look(index, goal, position - former if is_known and former is not None else None)
             if taken is not None:
@@ -228,8 +228,8 @@ class Guard:
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
         if self._missing[index] == 0 and self._position[index] is None:
             self._seen_at[index] = now
-        # An error with a right checksum is an answer, no lost packet: one is enough, unless it says that the question
-        # was damaged.
+        # An error with a valid checksum is an answer, not a lost packet: one is enough, unless it reports that the
+        # request was damaged.
         refused = bool(error) and error != StatusError.CRC
         too_long = self._silence.missed(index, now, refused=refused, alone=alone)
         if too_long is None:

@@ -28,7 +28,7 @@ _RELATIVE_STD = 0.1
 _FRICTIONS = 8.0
 """Smallest torque scale, in multiples of the mean dry friction, so that less than twice the friction causes no alarm.
 """
-_TILT_SHARE = 0.2  # standard deviation of gravity out of the assumed direction, relative to gravity
+_TILT_SHARE = 0.2  # standard deviation of gravity perpendicular to the assumed direction, relative to gravity
 _FRICTION_SPREAD = 3.0
 """Multiple of the spread of servo friction that is allowed for friction elsewhere in an arm without a description."""
 _UNDESCRIBED = {"gravity": 10.0, "viscous": 6.0, "offset": 0.3}
@@ -41,11 +41,11 @@ _STEP_S = 0.02
 """Time for which a joint must seem to stand under a torque that is held over several exchanges [s]."""
 
 _LAG_S = 0.012
-"""Time constant with which a step of the torque shows in the velocity [s]: current loop and velocity filter."""
+"""Time constant with which a torque step appears in the velocity [s]: current loop and velocity filter."""
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 _WINDOW_S = 0.3
-"""Time over which the commanded torques are told of a joint that stands still [s]: a multisine often crosses zero."""
+"""Time over which a message reports the torques commanded to a stationary joint [s]: a multisine often crosses zero."""
 
 
 class _Range:
@@ -92,7 +92,7 @@ class ModelWatch:
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
         self._shortest = float("inf")
-        # Goals held over several exchanges are steps, which motors and velocities follow only after a moment.
+        # Goals held over several exchanges are steps, which the current and the velocity follow with a delay.
         held = interval < 0.99 / config.experiment.rate
         self._follows = 1.0 - math.exp(-interval / _LAG_S) if held else 1.0
         self._felt = [0.0] * len(largest)

@@ -258,12 +258,12 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
 
 
 def _check_inside(config: Config, bus: ServoBus) -> None:
-    """Refuse an arm that the run before left far beyond its limits: an upright one that fell when torque was cut."""
+    """Refuse an arm that the previous run left far beyond its limits: an upright one that fell when torque was cut."""
     for joint, position, limited in zip(bus.joints, bus.read_positions(), config.joints, strict=True):
         low, high = limited.position_limit
         if not low - MOST_OUTSIDE_RAD <= position <= high + MOST_OUTSIDE_RAD:
             raise ExperimentError(
-                f"{joint} is at {position:.3f} rad, where the stop of the run before left it: its position limit is "
+                f"{joint} is at {position:.3f} rad, where the previous run's stop left it: its position limit is "
                 f"[{low:g}, {high:g}]. Move it back to arm.rest_pose by hand, then start again."
             )
 

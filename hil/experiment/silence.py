@@ -1,4 +1,4 @@
-"""How long servos have not replied, by the time for which this program listened to them.
+"""How long servos have not replied, counting only the time during which this program listened to them.
 
 While a computer stalls it hears nothing and sends nothing, which says nothing about the servos. That time is limited as
 missed deadlines are (`hil.experiment.deadlines`); silence proper is time in which a reply was awaited in vain.

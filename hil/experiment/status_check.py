@@ -110,7 +110,7 @@ class StatusCheck:
             if self._is_anothers(joint, offset, now):
                 return Cause.STALE, (
                     "returns another servo's data: its reply carries the clock of another joint. Replies are mixed up: "
-                    "check that every servo has an ID of its own, and the adapter."
+                    "check the adapter, and that every servo has its own ID."
                 )
             return Cause.STALE, (
                 f"returns stale data: by its own clock its reply is {1e3 * abs(ahead):.0f} ms off. Replies "

@@ -77,13 +77,13 @@ class StopRequest:
         return self._count > 1
 
     def check_again(self, asked: int) -> None:
-        """Raise StopRequested when more than `asked` signals have come."""
+        """Raise StopRequested when more than `asked` signals have arrived."""
         if self._count > asked:
             raise self._stop()
 
     @property
     def count(self) -> int:
-        """How many signals came."""
+        """Number of signals received."""
         return self._count
 
     def _note(self, number: int, _frame: FrameType | None) -> None:

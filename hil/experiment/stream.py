@@ -157,7 +157,7 @@ class Stream:
         state = self._play(self._silence(self._plan.rest_samples), Phase.REST)
         moving = self._moving(state)
         window = rest_window(self._plan.rate)
-        # The stabiliser may have to bring it back first from where the run before was stopped.
+        # The stabiliser may first have to bring it back from where the previous run was stopped.
         for _ in range(0, self._plan.end_samples if self._left_by_a_run else 0, window):
             if not moving:
                 break
@@ -168,7 +168,7 @@ class Stream:
             )
 
     def _warm_up(self, segment: Segment) -> None:
-        """Play periods that are recorded, but used for nothing."""
+        """Play periods that are recorded but not used."""
         for number in range(self._plan.warm_up_periods):
             self._note(f"{segment.role}: warm-up, period {number + 1} of {self._plan.warm_up_periods}")
             self._play(segment.period_current, Phase.WARM_UP)
@@ -192,7 +192,7 @@ class Stream:
                     self._play_period(segment, period + further)
                 return
         if difference <= self._plan.drift_within:
-            self._note(f"{segment.role}: still drifts slowly: {difference:.2%} per period; using the last ones")
+            self._note(f"{segment.role}: still drifts slowly: {difference:.2%} per period; using the last periods")
             return
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "

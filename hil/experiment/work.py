@@ -1,4 +1,4 @@
-"""Work of the motors: one that only takes energy out of the arm turns against its command.
+"""Work of the motors: a motor that only takes energy out of the arm turns against its command.
 
 It is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot return more work than was
 put in, so a motor that continually takes work out of it turns the wrong way.
@@ -28,10 +28,10 @@ class Work:
         self._held = [0.0] * len(config.joints)
 
     def look(self, joint: int, goal: float, moved: float | None) -> float | None:
-        """Add what the goal before has done until now; return the work taken out of the arm [J] if it is too much.
+        """Add the work done by the previous goal; return the work taken out of the arm [J] if it is too much.
 
-        goal: the new goal [A or V]. moved: way since the former sample [rad], None if it is unknown what the servo did
-        meanwhile.
+        goal: the new goal [A or V]. moved: displacement since the previous sample [rad], None if it is unknown what the
+        servo did meanwhile.
         """
         held, self._held[joint] = self._held[joint], goal
         if moved is not None:

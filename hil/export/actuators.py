@@ -16,7 +16,7 @@ def add_actuators(root: ET.Element, model: ArmModel | ChainArmModel) -> None:
     """
     actuators = ET.SubElement(root, "actuator")
     units = ", ".join(f"{joint.name} [{joint.goal_unit}]" for joint in model.joints)
-    comment(actuators, f"control is the servo's goal: {units}")
+    comment(actuators, f"controls are the servos' goals: {units}")
     lag = model.values.get("lag", 0.0)
     drive = {"dyntype": "filterexact", "dynprm": numbers(lag)} if lag > 0 else {}
     for number, facts in enumerate(model.joints, start=1):

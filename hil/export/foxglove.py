@@ -22,7 +22,7 @@ def stamp_of(nanoseconds: int) -> dict[str, int]:
 
 
 def scene_message(scene: MovingScene, nanoseconds: int) -> dict[str, Any]:
-    """All shapes, one entity a frame, which stay for good and follow their frames."""
+    """All shapes, one entity per frame, which persist and follow their frames."""
     entities = []
     for frame in scene.frames:
         rods = [rod for rod in scene.rods if rod.frame == frame.name]
@@ -44,7 +44,7 @@ def scene_message(scene: MovingScene, nanoseconds: int) -> dict[str, Any]:
 
 
 def transform_messages(scene: MovingScene, angles: Array, nanoseconds: list[int]) -> list[dict[str, Any]]:
-    """One message a sample, of angles (joints, samples) [rad]."""
+    """One message per sample, for angles (joints, samples) [rad]."""
     poses = [(frame, *frame.poses(angles)) for frame in scene.frames]
     return [
         {
@@ -96,7 +96,7 @@ def scene_schema() -> dict[str, Any]:
 
 
 def _cylinder(rod: Rod) -> dict[str, Any]:
-    """A cylinder stands along its own z axis."""
+    """A cylinder whose axis is its own z axis."""
     along = rod.ends[1] - rod.ends[0]
     length = float(np.linalg.norm(along))
     turn, _ = Rotation.align_vectors(along[None] / length, np.array([[0.0, 0.0, 1.0]]))

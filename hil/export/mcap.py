@@ -27,7 +27,7 @@ from hil.export.source import Recorded
 __all__ = ["export_mcap"]
 
 _SHOWN_HZ = 50.0
-"""Rate of the frames [Hz]: as smooth as a screen shows."""
+"""Rate of the frames [Hz]: smooth enough for a screen."""
 _WHOLE = ("phase", "segment", "period", "error", "missing")
 _TIMES = ("deadline", "time_before_write", "time_after_read")
 _SHARED = (*_TIMES, "phase", "segment", "period")

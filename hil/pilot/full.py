@@ -42,9 +42,10 @@ def identify_in_steps(
 def _full(search: Search, config: Config, found: Amplitude) -> Played:
     """Play the full run; repeat it with less torque if it exceeded a limit, and with other waves if it did not settle.
 
-    Friction may hold an arm elsewhere in every period, however long it moves: each time more of that is accepted. The
-    fit does not need the periods to be equal, and the verdict says how well they are predicted. A period unlike the one
-    before counts as not settled too; if it happens again and again, something is wrong with the arm.
+    Friction may hold an arm in a different place in every period, however long it moves: each repetition accepts a
+    larger difference. The fit does not need the periods to be equal, and the verdict says how well they are predicted.
+    A period unlike the one before counts as not settled too; if it happens again and again, something is wrong with the
+    arm.
     """
     run, say, options = search.run, search.player.say, search.options
     number = unlike = 0

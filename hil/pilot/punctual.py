@@ -1,4 +1,4 @@
-"""A run that is stopped because this computer was late says nothing about the arm: it is played again."""
+"""A run that is stopped because this computer was late says nothing about the arm: it is repeated."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ MOST_REPEATS = 3
 
 
 def punctual(play: Callable[[], str], config: Config, folder: RunFolder, name: str, say: Callable[[str], None]) -> str:
-    """Return what `play` returns; play again if deadlines were missed, at most MOST_REPEATS times.
+    """Return what `play` returns; repeat it if deadlines were missed, at most MOST_REPEATS times.
 
     The recording of a stopped run is set aside in `folder`. Raises what `play` raises.
     """

@@ -221,7 +221,8 @@ class Search:
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
         """The amplitude that leaves least of the range unused, of `found` and of other waves if it leaves much.
 
-        A little more torque may throw some of the arms over: with other waves that comes later, or to the other side.
+        Slightly more torque may tip some of the arms over: with other waves that happens at larger amplitudes, or to
+        the other side.
         """
         options = self.options
         limited = (found.peak_torque >= options.at_limit * most_torque(config)).all() or self.cap is not None
@@ -247,7 +248,7 @@ class Search:
         return self.player.play(config if self.pose is None else _from_anywhere(config), folder, name, found, arms)
 
     def waves(self, config: Config) -> Plan:
-        """Waves for the full run of the arm as it is thought to be."""
+        """Waves for the full run of the arm according to the current belief."""
         arm = Physics.of(self.belief.middle)
         if config.experiment.design == "optimal":
             return designed_plan(config, arm, [name for name in self.belief.names if _is_base(name)])
@@ -307,7 +308,9 @@ def _from_anywhere(config: Config) -> Config:
 
 
 def _within_limits(config: Config, pose: Array, inside: float) -> Array:
-    """A pose beyond a limit, where a stopped run may leave the arm, moved to it: the next run begins by moving in."""
+    """A pose beyond a limit, where a stopped run may leave the arm, moved onto the limit: the next run begins by moving
+    inwards.
+    """
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     return np.asarray(np.clip(pose, middle - inside * half, middle + inside * half))

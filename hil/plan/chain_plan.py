@@ -181,8 +181,8 @@ def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
         if peak > TORQUE_SHARE * most:
             raise NoHeadroom(
                 f"{config.path}: joint_path: {joint.name!r} needs about {peak:.3g} N m for this path, more than "
-                f"{100 * TORQUE_SHARE:.0f} % of its {most:.3g} N m, too little room for errors of the described "
-                "masses: lower joint_path.speed or swing, or raise its current_limit."
+                f"{100 * TORQUE_SHARE:.0f} % of its {most:.3g} N m, which leaves too little margin for errors of the "
+                f"described masses: lower joint_path.speed or swing, or raise its current_limit."
             )
 
 

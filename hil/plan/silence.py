@@ -8,7 +8,7 @@ WATCHDOG_SHARE = 0.8
 """Upper bound on both limits, relative to the watchdog timeout."""
 
 _FEWEST_MISSING = 2
-"""Smallest number of missing replies that counts: a single lost packet is no fault, however low the rate."""
+"""Smallest number of missing replies that counts: a single lost packet is not a fault, however low the rate."""
 
 _ROUNDING_S = 1e-6
 

@@ -11,9 +11,9 @@ from hil.estimator.data.recording import LONGEST_GAP, MOST_GAP
 
 Values = NDArray[np.float64]
 
-FEW = 0.02  # of the rows: what may be put right, if it is said
+FEW = 0.02  # of the rows: share that may be corrected, if reported
 LONGEST_HOLE = 0.05  # s of torque that are filled in
-RESTART = 0.2  # s: a time that goes back by more begins a new recording
+RESTART = 0.2  # s: a time that goes back by more starts a new recording
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def _with_time(source: str, rows: Rows) -> Rows:
     if not lost:
         return rows
     if lost > 0.5 * known.size:
-        raise CsvError(f"{source}: {lost} of {known.size} rows have no time: check the column of time.")
+        raise CsvError(f"{source}: {lost} of {known.size} rows have no time: check the time column.")
     return rows.kept(known, f"{source}: {lost} rows without a time were left out.")
 
 
@@ -88,7 +88,7 @@ def _unrepeated(source: str, rows: Rows) -> Rows:
             "values: they are too coarse. Write them with more digits, or, if the samples are equally spaced, set "
             "columns.rate (samples per second) in place of columns.time."
         )
-    return rows.kept(~again, f"{source}: of {count} pairs of rows with the same time the second was left out.")
+    return rows.kept(~again, f"{source}: {count} rows with the same time as the row before were left out.")
 
 
 def _ordered(source: str, rows: Rows) -> Rows:
@@ -97,7 +97,7 @@ def _ordered(source: str, rows: Rows) -> Rows:
         return rows
     if back > FEW * rows.time.size:
         raise CsvError(
-            f"{source}: time goes back {back} times: it must increase. Check the column of time, or sort the rows."
+            f"{source}: time goes back {back} times: it must increase. Check the time column, or sort the rows."
         )
     order = np.argsort(rows.time, kind="stable")
     sorted_rows = rows.kept(order, f"{source}: {back} rows out of order were sorted by time.")
@@ -118,7 +118,7 @@ def _filled(source: str, rows: Rows, held: bool) -> Rows:
     for row in torque:
         known = np.isfinite(row)
         if not known.any():
-            raise CsvError(f"{source}: a column of torque or current holds no numbers at all.")
+            raise CsvError(f"{source}: a torque or current column holds no numbers at all.")
         before = np.maximum.accumulate(np.where(known, np.arange(row.size), 0))
         row[~known] = row[before][~known] if held else np.interp(rows.time[~known], rows.time[known], row[known])
     notes = []
@@ -134,7 +134,7 @@ def _apart(rows: Rows) -> list[Rows]:
     step = np.diff(rows.time)
     usual = float(np.median(step)) if step.size else 0.0
     if usual > MOST_GAP:
-        return [rows]  # of another unit, or much too slow: the recording says which
+        return [rows]  # wrong unit, or much too slow: `Recording` reports which
     ends = np.nonzero(step > LONGEST_GAP)[0] + 1
     edges = [0, *ends.tolist(), rows.time.size]
     parts = [rows.kept(slice(first, last)) for first, last in pairwise(edges)]

@@ -138,11 +138,11 @@ def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
     lengths = [name for name in table.columns if (table.units.get(name) or split_head(name)[1] or "") in _LENGTHS]
     if what == "position" and not some and lengths:
         return CsvError(
-            f"{table.source}: {', '.join(lengths)} {'is a length' if len(lengths) == 1 else 'are lengths'}: needed is "
-            "the angle of each joint (rad, deg, turns or ticks), from the base outwards. Where the tip is does not "
-            "tell how the joints stand; record the encoders, or compute the angles first."
+            f"{table.source}: {', '.join(lengths)} {'is a length' if len(lengths) == 1 else 'are lengths'}: what is "
+            "needed is the angle of each joint (rad, deg, turns or ticks), from the base outwards. The position of the "
+            "tip does not determine the joint angles; record the encoders, or compute the angles first."
         )
-    seen = f"several may be meant ({', '.join(some[:12])})" if some else "none has a name that says so"
+    seen = f"several are candidates ({', '.join(some[:12])})" if some else "none has a recognisable name"
     example = '[columns]\ntime = "time"\nposition = ["q1", "q2"]\ntorque = ["tau1", "tau2"]'
     names = list(table.columns)
     if len(names) >= _EXAMPLE:  # with this file's own names, in the usual order
@@ -151,6 +151,6 @@ def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
             f"[columns]\ntime = {shown[0]}\nposition = [{shown[1]}, {shown[2]}]\ntorque = [{shown[3]}, {shown[4]}]"
         )
     return CsvError(
-        f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Say it in --config ARM.toml, for "
-        f"example, if this is their order:\n{example}"
+        f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Specify them in --config ARM.toml, "
+        f"for example, if this is their order:\n{example}"
     )

@@ -31,13 +31,13 @@ def write_dry_run_page(config: Config, found: DryRun | ChainDryRun, path: Path) 
 
 
 def _in_space(found: ChainDryRun) -> SpatialMotion | None:
-    """The simulated arm that comes closest to anything."""
+    """The simulated arm with the least clearance."""
     motions = found.prediction.shown
     if not len(motions):
         return None
     closest = int(np.argmin(found.foreseen.rooms[: len(motions)]))
     said = (
-        f"Of {len(motions)} simulated arms, the one that comes closest to anything: from the rest pose to the path, "
+        f"Of {len(motions)} simulated arms, the one with the least clearance: from the rest pose to the path, "
         "twice along it, and back."
     )
     ways = found.foreseen.ways

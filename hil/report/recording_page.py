@@ -68,22 +68,22 @@ def _prediction(shown: _Shown) -> Section | None:
             Series("model", *thin(time, longest.predicted[joint], MOST_POINTS), ORANGE),
         ]
         chart = Chart(f"position_{joint + 1}", f"Position of {facts.name}", "time [s]", "position [rad]", tuple(series))
-        said = f"{facts.name}: measured, and simulated segment by segment from estimated starting states."
+        said = f"{facts.name}: measured, and simulated segment by segment from estimated initial states."
         pictures.append(Picture(chart, said))
         torque = Series("", *thin(time, longest.torque[joint], MOST_POINTS), GREEN)
         chart = Chart(f"torque_{joint + 1}", f"Torque of {facts.name}", "time [s]", "torque [N m]", (torque,))
-        pictures.append(Picture(chart, f"{facts.name}: torque that moved it."))
+        pictures.append(Picture(chart, f"{facts.name}: driving torque."))
         left = Series("measured minus model", *thin(time, 1000.0 * error, MOST_POINTS), BLUE, "dots")
         chart = Chart(f"residual_{joint + 1}", f"Residual of {facts.name}", "time [s]", "mrad", (left,))
         rms = 1000.0 * float(np.sqrt(np.nanmean(error**2)))
-        pictures.append(Picture(chart, f"{facts.name}: {rms:.3g} mrad RMS remain."))
+        pictures.append(Picture(chart, f"{facts.name}: {rms:.3g} mrad RMS remain unexplained."))
     held_out = shown.result.validation.held_out_rms
     words = (
         ()
         if held_out is None
         else (
             "Segments that were not fitted are predicted to within "
-            f"{percent(max(held_out))} of the motion's RMS; drawn is the fit to all segments of {longest.name}.",
+            f"{percent(max(held_out))} of the motion's RMS; the plots show the fit to all segments of {longest.name}.",
         )
     )
     return Section("prediction", "Measured and simulated motion", words, pictures=tuple(pictures))
@@ -105,8 +105,8 @@ def _next(shown: _Shown) -> Section:
     folder = shown.folder
     commands = (
         ("the arm for MuJoCo, or as URDF", f"hil export {folder} --format mjcf --format urdf"),
-        ("the same against another recording", f"hil diff {folder} OTHER_RUN"),
-        ("once more, after a change of config.toml", f"hil estimate {folder}"),
+        ("compare with another recording", f"hil diff {folder} OTHER_RUN"),
+        ("estimate again, after a change of config.toml", f"hil estimate {folder}"),
     )
     return Section("next", "What next", tables=(Table(("", ""), commands, 2),))
 
@@ -123,7 +123,7 @@ def _provenance(shown: _Shown) -> Section:
     ]
     text = (shown.folder / "config.toml").read_text(encoding="utf-8")
     return Section(
-        *("provenance", "What this was estimated from", ()),
+        *("provenance", "Data used for this estimate", ()),
         tables=(Table(("", ""), tuple(rows), 2),),
         folded=(Folded("Configuration", text),),
     )

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 MOST_FRAMES = 600
 FEW_POSES = 60
-"""Number of poses from which the size of the picture is found."""
+"""Number of poses that determine the size of the picture."""
 MOST_SHOWN_M = 1.0
 """Clearances above this are shown as this [m]."""
 

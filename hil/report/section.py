@@ -39,7 +39,7 @@ class Folded:
 
 @dataclass(frozen=True)
 class Motion:
-    """A planar arm to be played. interval: between frames [s]; angles: of each joint, frame by frame [rad].
+    """An animated planar arm. interval: between frames [s]; angles: of each joint, frame by frame [rad].
 
     lengths: of the links, in any unit; hangs: whether gravity acts in the plane, downwards; caption: what is shown.
     """
@@ -53,7 +53,9 @@ class Motion:
 
 @dataclass(frozen=True)
 class SpatialMotion:
-    """A spatial arm to be played and turned. caption: what is shown; scene: data of the page's script (JSON types)."""
+    """An animated spatial arm that can be rotated. caption: what is shown; scene: data of the page's script (JSON
+    types).
+    """
 
     caption: str
     scene: dict[str, Any]

@@ -15,10 +15,10 @@ arm          facts needed to use the model: gravity, rest pose, and per joint na
              goal [N m/A, or N m/V in pwm mode]
 chain        only for a spatial arm: its geometry, and the combination that each base parameter stands for
 truth        only on a fake arm: the base parameters it was built with
-physical     masses, centres and inertias, where [known] says something
-stabiliser   what it gave of the torque, where there was one
-steps        with a pilot: what was predicted of each step, and what was seen
-zeros, recordings, notes   only of recordings made elsewhere; notes: what was guessed, put right or averaged
+physical     masses, centres and inertias, if [known] gives any quantity
+stabiliser   its share of the torque, if there was one
+steps        with a pilot: predicted and measured peaks of each step
+zeros, recordings, notes   only of recordings made elsewhere; notes: what was guessed, corrected or averaged
 """
 
 from collections.abc import Mapping

@@ -1,7 +1,7 @@
-"""The arm as the bus sees it, compared with its description: joint after joint is moved by hand, torque off.
+"""The arm as the bus sees it, compared with its description: each joint in turn is moved by hand, with torque off.
 
-Wrong IDs, directions, zeros and axes cannot be seen by an identification: a chain's parameters do not absorb a wrong
-geometry, they become wrong. A person sees them at once.
+An identification cannot detect wrong IDs, directions, zeros and axes: a chain's parameters do not absorb a wrong
+geometry, they become wrong. A person notices at once.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,8 +15,8 @@ from hil.config.schema import Config
 from hil.description.motion import end_point, moves
 from hil.drivers.clock import Clock
 
-MOVED = 0.15  # rad: a joint that a hand has moved
-STILL = 0.02  # rad in STILL_S: a hand that holds
+MOVED = 0.15  # rad: a joint that has been moved by hand
+STILL = 0.02  # rad in STILL_S: a joint that is held still
 STILL_S = 0.6
 POLL_S = 0.05
 PATIENCE_S = 60.0
@@ -73,8 +73,8 @@ def judge(config: Config, asked_for: int, asked: str, change: Array) -> Moved:
     angles = tuple(change.tolist())
     if abs(change[most]) < MOVED:
         found = (
-            f"{joint.name!r} did not move: is ID {joint.id} its servo? If another joint did that is not in [[joints]], "
-            "the IDs are wrong"
+            f"{joint.name!r} did not move: is ID {joint.id} its servo? If a joint that is not in [[joints]] moved "
+            f"instead, the IDs are wrong"
         )
         return Moved(joint.name, asked, angles, False, found)
     if most != asked_for:
@@ -86,8 +86,8 @@ def judge(config: Config, asked_for: int, asked: str, change: Array) -> Moved:
         return Moved(joint.name, asked, angles, False, found)
     if change[most] < 0.0:
         found = (
-            f"{joint.name!r} moved by {change[most]:+.2f} rad, so its angle counts the other way than the "
-            f"description's axis: set direction = {-joint.direction} and give zero_ticks anew, or correct the axis"
+            f"{joint.name!r} moved by {change[most]:+.2f} rad, so its angle increases in the opposite direction to the "
+            f"description's: set direction = {-joint.direction} and determine zero_ticks again, or correct the axis"
         )
         return Moved(joint.name, asked, angles, False, found)
     along = [
@@ -100,7 +100,7 @@ def judge(config: Config, asked_for: int, asked: str, change: Array) -> Moved:
 
 
 def _awaited(read: Read, clock: Clock, before: Array) -> Array:
-    """How all joints have moved once a hand has moved one and holds it; nothing if nobody does."""
+    """Displacements of all joints once one has been moved by hand and is held still; about zero if nobody does so."""
     end = clock.now() + PATIENCE_S
     held_since, last = clock.now(), before
     while clock.now() < end:

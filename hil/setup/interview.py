@@ -72,18 +72,18 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
 
 
 def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: Ask, say: Say) -> list[int]:
-    """Present Positions in the pose of rest. Hanging joints are read from both sides, since friction holds them."""
+    """Present Positions in the rest pose. Hanging joints are read from both sides, since friction holds them."""
     ask(_POSE[stance], "")
     first = [servo.read("Present Position") for servo in handles]
     if stance != HANGING:
         return first
-    ask("Friction may hold it aside: push each joint a little to its other side, let go, and press Enter", "")
+    ask("Friction may hold it to one side: push each joint slightly to the other side, let go, and press Enter", "")
     second = [servo.read("Present Position") for servo in handles]
     for name, before, after in zip(names, first, second, strict=True):
         if abs(after - before) > _MOVED_TICKS:
             say(
-                f"{name} came to rest {abs(after - before)} steps apart: friction holds it. The middle is taken for "
-                "hanging; if it is not, correct zero_ticks in the file."
+                f"{name} came to rest {abs(after - before)} steps apart: friction holds it. The midpoint is taken as "
+                "hanging straight down; if it is not, correct zero_ticks in the file."
             )
     return [round((before + after) / 2) for before, after in zip(first, second, strict=True)]
 

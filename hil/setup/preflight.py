@@ -137,7 +137,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
             return
         except DriverError as error:
             fix = (
-                f"{error} It answers a ping: if it never answers reads, its Status Return Level is 0; power-cycle "
+                f"{error} It answers pings: if it never answers reads, its Status Return Level is 0; power-cycle "
                 "it, which resets it to 2."
             )
             yield Finding(Level.STOP, where, "registers", "cannot be read", fix)
@@ -175,7 +175,7 @@ def _firmware(_config: Config, _joint_config: JointConfig, joint: Joint, servo: 
 
 def _status_level(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     level = servo.read("Status Return Level")
-    fix = "Below 2, writes are not confirmed. Power-cycle it, which resets it to 2."
+    fix = "Below 2, writes are not confirmed. Power-cycle the servo to reset it to 2."
     return _graded(level == 2, "status return level", str(level), fix)
 
 

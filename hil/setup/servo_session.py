@@ -40,7 +40,9 @@ REBOOT_S = 0.6
 
 
 COUNT_DOWN_S = 5.0
-"""Time between the announcement that an arm whose last run was stopped moves again by itself, and torque [s]."""
+"""Time from the announcement that an arm whose last run was stopped will move again by itself until torque is on
+[s].
+"""
 
 
 def to_stderr(text: str) -> None:
@@ -107,14 +109,14 @@ class ServoSession:
     def warn(self) -> None:
         """If the last run was stopped, announce that the arm is about to move again, and give people time to step back.
 
-        Whoever saw it go limp may believe that the program has ended, and reach into the arm.
+        Anyone who saw it go limp may believe that the program has ended, and reach into the arm.
         """
         if not self.was_stopped:
             return
         self.was_stopped = False
         self._say(
-            f"THE ARM MOVES AGAIN IN {COUNT_DOWN_S:.0f} s: the run before was stopped, but this command goes on. Keep "
-            "clear of the arm; Ctrl-C ends it here."
+            f"THE ARM MOVES AGAIN IN {COUNT_DOWN_S:.0f} s: the previous run was stopped, but this command continues. "
+            f"Keep clear of the arm; Ctrl-C ends it now."
         )
         clock = self.bus.port.clock
         clock.wait_until(clock.now() + COUNT_DOWN_S)
@@ -153,7 +155,7 @@ _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=N
 def servo_session(config: Config, folder: Path | None = None, say: Say = to_stderr) -> Iterator[ServoBus]:
     """Open the bus with every servo in its mode and torque off, prepared for exchanges; restore settings at the end.
 
-    A TorqueNotOff that leaves the block says how things stand at the very end: servos that answer again are read back.
+    A TorqueNotOff that leaves the block reports the final state: servos that answer again are read back.
 
     folder: run folder that receives a copy of the settings. say: receives messages for the user. Raises as
     `ServoBus.open`, and RunFolderError.

@@ -70,8 +70,8 @@ def _check_fake(study: Study, config: Config) -> None:
     """Raise ConfigError for an arm that would move, unattended and by several workers at once."""
     if study.study.task != "dry_run" and not config.url.startswith("fake://"):
         raise ConfigError(
-            f'{study.path}: study.config: {arm_path(study).name} has port.url = "{config.port.url}", and a study moves '
-            'no real arm. Set port.url = "fake://", or record its runs one by one and use task = "estimate".'
+            f'{study.path}: study.config: {arm_path(study).name} has port.url = "{config.port.url}", and a study never '
+            'moves a real arm. Set port.url = "fake://", or record its runs one by one and use task = "estimate".'
         )
     if study.study.task == "fault" and config.experiment.pilot:
         raise ConfigError(f'{study.path}: task = "fault" plays one experiment: set experiment.pilot = false.')

@@ -75,7 +75,7 @@ def arm_values(study: Study) -> dict[str, Any]:
         raise ConfigError(f"{study.path}: study.config: {path}: not valid TOML: {error}.") from error
     for table in (values.get("arm"), values.get("fake", {}).get("chain")):
         if isinstance(table, dict) and isinstance(table.get("urdf"), str):
-            # A run's arm is a file in another folder.
+            # Each run's arm is written to another folder.
             table["urdf"] = str(found_beside(path.parent.absolute(), table["urdf"]))
     return values
 
@@ -108,7 +108,7 @@ def put(values: dict[str, Any], key: str, value: Scalar) -> None:
 
 
 class _NewList(list[Any]):
-    """A list that the file does not have, which therefore may grow."""
+    """A list that is not in the file and may therefore grow."""
 
 
 def _inside(place: Any, part: str, after: str = "") -> Any:

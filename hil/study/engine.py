@@ -39,8 +39,8 @@ _ADDRESS = re.compile(r"([a-z]+://)?[^\s/]+:\d{1,5}")
 _PACKAGES = ("numpy", "scipy", "numba", "distributed")
 _CONNECT_S = 10.0
 _MOST_DEATHS = 10
-"""Number of worker losses during one run before the run has failed: a machine may reboot several times, but a run that
-needs too much memory never ends."""
+"""Number of worker losses during one run after which it counts as failed: a machine may reboot several times, but a run
+that needs too much memory never ends."""
 
 
 @contextmanager
@@ -72,7 +72,7 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
 
 
 def _silence() -> None:
-    """Keep Dask's own log off the terminal: whoever asked tells what went wrong."""
+    """Keep Dask's own log off the terminal: the caller reports what went wrong."""
     silent = ("distributed", "tornado", "asyncio")
     for name in [each for each in logging.root.manager.loggerDict if each.split(".")[0] in silent]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -111,8 +111,8 @@ def _local(count: int, memory: str) -> Any:
         )
     except RuntimeError as error:
         raise ConfigError(
-            f"The workers did not start ({error}). A script that starts them does so below `if __name__ == "
-            '"__main__":`, since each worker imports it; with little memory, ask for fewer (--workers).'
+            f"The workers did not start ({error}). A script must start them under `if __name__ == "
+            '"__main__":`, since each worker imports it; if memory is short, ask for fewer (--workers).'
         ) from error
 
 
@@ -132,7 +132,7 @@ def executor(scheduler: str | None = None, count: int | None = None) -> Iterator
 
 
 def versions() -> dict[str, str]:
-    """Of what makes the numbers, in this process: of a worker, where Dask runs it there."""
+    """Versions of everything that affects the numbers, in this process, or in a worker if Dask runs it there."""
     return {"hil": __version__, **_package_versions()}
 
 

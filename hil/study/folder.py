@@ -1,4 +1,4 @@
-"""The folder of a study: one process at a time works in it, and it goes on only as what it was begun as.
+"""The folder of a study: one process at a time works in it, and it is only continued as it was started.
 
 DIR/study.toml   an exact copy of the study
 DIR/about.json   number of runs, seed, versions, the arm's and the recordings' fingerprints
@@ -24,9 +24,9 @@ from hil.study.schema import Study
 
 @contextmanager
 def opened(study: Study, out: Path, runs: int, *, resume: bool) -> Iterator[Dataset]:
-    """The dataset in `out`, new or of the same study, for this process alone.
+    """The dataset in `out`, new or of the same study, locked for this process.
 
-    Raises RunFolderError where it cannot be used, ConfigError where it holds another study or one begun otherwise.
+    Raises RunFolderError where it cannot be used, ConfigError where it holds another study or one started differently.
     """
     copy, about = out / "study.toml", out / "about.json"
     text, now = study.path.read_bytes(), _about(study, runs)
@@ -42,7 +42,7 @@ def opened(study: Study, out: Path, runs: int, *, resume: bool) -> Iterator[Data
         if copy.is_file():
             if not resume:
                 raise RunFolderError(
-                    f"{out} holds a study already: go on with --resume, or name another folder with --out."
+                    f"{out} already holds a study: continue with --resume, or choose another folder with --out."
                 )
             if copy.read_bytes() != text:
                 raise ConfigError(
@@ -66,7 +66,7 @@ def opened(study: Study, out: Path, runs: int, *, resume: bool) -> Iterator[Data
 
 
 def _discard(out: Path) -> None:
-    """A start that failed before the first row leaves nothing in the way of the next one."""
+    """Remove what a start that failed before its first row left behind, so that it does not block the next one."""
     for name in ("study.toml", "about.json", ".lock"):
         (out / name).unlink(missing_ok=True)
     with suppress(OSError):  # what somebody else put there stays
@@ -75,11 +75,11 @@ def _discard(out: Path) -> None:
 
 
 def _hold(lock: int, out: Path) -> None:
-    """The kernel lets go of it when this process ends, however it ends."""
+    """Lock the folder; the kernel releases the lock when this process ends, however it ends."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        raise RunFolderError(f"Another process works on the study in {out}: wait for it, or end it.") from error
+        raise RunFolderError(f"Another process is working on the study in {out}: wait for it, or end it.") from error
 
 
 def _about(study: Study, runs: int) -> dict[str, Any]:
@@ -109,13 +109,13 @@ def _check_begun(out: Path, then: dict[str, Any], now: dict[str, Any]) -> None:
         return
     for key, what in (
         ("arm_sha256", "the arm's file has changed"),
-        ("recordings_sha256", "other recordings are there"),
+        ("recordings_sha256", "the recordings have changed"),
     ):
         if then.get(key) != now[key]:
-            raise ConfigError(f"{out} was begun differently: {what} since. Name another folder with --out.")
+            raise ConfigError(f"{out} was started differently: {what} since. Choose another folder with --out.")
     before = then.get("versions", {})
     other = [
         f"{name} {before.get(name)} (now {new})" for name, new in now["versions"].items() if before.get(name) != new
     ]
     if other:
-        raise ConfigError(f"{out} was begun with {', '.join(other)}: use those, or name another folder with --out.")
+        raise ConfigError(f"{out} was started with {', '.join(other)}: use those, or choose another folder with --out.")

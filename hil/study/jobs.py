@@ -1,4 +1,4 @@
-"""Independent jobs on the workers: few in flight at a time, results as they end, whatever becomes of a worker."""
+"""Independent jobs on the workers: few in flight at a time, results as they finish, even if workers die."""
 
 import math
 import time
@@ -24,11 +24,11 @@ _AHEAD = 8
 
 
 _TASK_S, _MOST_IN_A_TASK = 0.1, 50
-"""Jobs that are shorter than this go several together: a task costs some milliseconds, whatever it does."""
+"""Jobs shorter than this share a task: every task costs some milliseconds, whatever it does."""
 
 
 _COUNTED_EVERY_S = 1.0
-"""How often workers are counted, which asks the scheduler."""
+"""Interval at which the workers are counted, which queries the scheduler."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ def run_jobs(
 
     Args:
         client: of `hil.study.engine.workers`.
-        function: one that a worker can import, or else picklable with all it refers to.
-        items: with a number each, which names the job; taken from as workers become free.
+        function: importable by a worker, or else picklable with everything it refers to.
+        items: each with a number, which identifies the job; consumed as workers become free.
 
     Raises:
-        SchedulerLost: the scheduler answers no more.
+        SchedulerLost: the scheduler no longer responds.
     """
     from distributed import as_completed
 
@@ -92,14 +92,14 @@ class _Flight(Generic[Item, Result]):
 
     @property
     def room(self) -> int:
-        """How many tasks more may be in flight. Workers may come at any time, and then they wait."""
+        """How many more tasks may be in flight. Workers may join at any time; until counted, they wait."""
         if time.monotonic() - self._counted > _COUNTED_EVERY_S:
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
             self._window, self._counted = max(1, len(workers)) * (1 + _AHEAD), time.monotonic()
         return self._window - len(self._tasks)
 
     def start(self, count: int) -> list[Any]:
-        """Futures of so many tasks more, as far as there are jobs."""
+        """Futures of up to `count` further tasks, as long as there are jobs."""
         taken = (list(islice(self._waiting, self._size)) for _ in range(count))
         return self._submit([jobs for jobs in taken if jobs])
 
@@ -137,7 +137,7 @@ def _call(
     return outcomes, time.perf_counter() - began
 
 
-_LOST = "The scheduler answers no more. What was done is kept: start it again, then go on with --resume."
+_LOST = "The scheduler no longer responds. Finished runs are kept: restart it, then continue with --resume."
 
 
 def each(

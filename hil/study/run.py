@@ -55,7 +55,7 @@ def run_study(
     worker_count: int | None = None,
     watch: Watch = lambda _: None,
 ) -> Dataset:
-    """Do all runs that have no row yet.
+    """Perform all runs that have no row yet.
 
     Raises ConfigError and RunFolderError before anything runs, MissingExtra, and SchedulerLost.
     """

@@ -24,7 +24,7 @@ def slurm_cluster(count: int, memory: str, environment: Mapping[str, str]) -> It
 
     Raises:
         MissingExtra: dask-jobqueue is not installed.
-        ConfigError: there is no queue here, or it does not take the jobs.
+        ConfigError: there is no queue here, or it rejects the jobs.
     """
     try:
         from dask_jobqueue import SLURMCluster
@@ -65,11 +65,11 @@ def slurm_cluster(count: int, memory: str, environment: Mapping[str, str]) -> It
 
 
 def _wait_for_answer(answers: list[str | None]) -> None:
-    """Until the queue has answered the first submission; raises ConfigError if it refused."""
+    """Wait until the queue has answered the first submission; raises ConfigError if it refused."""
     until = time.monotonic() + _ANSWERED_WITHIN_S
     while not answers and time.monotonic() < until:
         time.sleep(_EVERY_S)
     refusal = answers[0] if answers else None
     if refusal is not None:
         lines = [line for line in refusal.splitlines() if line.strip()] or ["no reason given"]
-        raise ConfigError(f"--scheduler slurm: the queue does not take the workers: {lines[-1].strip()}")
+        raise ConfigError(f"--scheduler slurm: the queue rejected the workers: {lines[-1].strip()}")

@@ -30,7 +30,7 @@ TIMINGS = ("seconds", "cpu_seconds", "worker")
 _STATE = "XDG_STATE_HOME"
 
 _ONE_AT_A_TIME = threading.Lock()
-"""A worker that was started with several threads still does one run at a time: its settings are the process's."""
+"""A worker that was started with several threads still does one run at a time: settings apply to the whole process."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def work(spec: Spec) -> Row:
 
 def lost_row(spec: Spec, error: BaseException | None) -> Row:
     """Return the row of a run that returned no result because every worker that tried it died."""
-    why = RuntimeError("no worker brought it to an end") if error is None else error
+    why = RuntimeError("no worker finished it") if error is None else error
     if type(error).__name__ == "KilledWorker":
         why = MemoryError("every worker that tried it died: it needs more than engine.worker_memory_gib, or crashes")
     return _row_of(spec) | _failure(why) | {"seconds": None, "cpu_seconds": None, "worker": None}
@@ -151,7 +151,7 @@ def _kept(name: str, columns: tuple[str, ...]) -> bool:
 
 
 def _result(spec: Spec, folder: Path) -> Row:
-    """The columns asked for; raises what the run raises, its folder's name taken out of the words."""
+    """The requested columns; raises what the run raises, with its folder's name removed from the message."""
     try:
         result = dict(flat(_done(spec, folder)))
     except Exception as error:

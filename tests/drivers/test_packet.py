@@ -204,4 +204,4 @@ def test_data_that_the_sdk_gets_wrong() -> None:
     (status,) = Framer().feed(encode_status(1, 0, data))
     assert status.data == data
     received, _ = Protocol2PacketHandler().rxPacket(_Wire(encode_status(1, 0, data)), False)
-    assert bytes(received[9:15]) != data  # when this fails, the SDK is fixed: take the assume above away
+    assert bytes(received[9:15]) != data  # when this fails, the SDK is fixed: remove the assume above

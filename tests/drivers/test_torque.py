@@ -188,7 +188,7 @@ def take_another_id(bus: ServoBus) -> None:
 def test_a_servo_that_hears_and_does_not_obey_is_stopped_by_its_watchdog(
     fake_config: Make, happens: Callable[[ServoBus], None]
 ) -> None:
-    """Every question feeds its watchdog: whoever did not answer the last exchange is left in silence."""
+    """Every query feeds its watchdog: a servo that did not answer the last exchange is not addressed."""
     with ServoBus.open(fake_config()) as bus:
         with contextlib.suppress(TorqueNotOff), bus.torque(watchdog=0.08):
             bus.exchange([0.3, 0.3])

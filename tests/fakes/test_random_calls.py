@@ -1,4 +1,4 @@
-"""dynamixel_sdk in random order against rules from the manual: the same answers, and the comparison is sharp.
+"""dynamixel_sdk in random order against rules from the manual: the answers are the same, and the comparison is strict.
 
 In virtual time; `benchmarks/bus/random_calls.py` does the same over a terminal.
 """

@@ -1,4 +1,4 @@
-"""docs/first_evening.md typed word by word: every step works, and each names the next command."""
+"""docs/first_evening.md typed command by command: every step works and names the next command."""
 
 import shlex
 import shutil

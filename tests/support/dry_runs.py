@@ -99,7 +99,7 @@ def run_on(config: Config, found: Amplitude, folder: Path) -> np.ndarray | None:
 
 
 def prior_study(arms: int, seed: int = 1, jobs: int | None = 0) -> dict[str, Any]:
-    """Play the largest safe experiment of one prior on arms drawn from it; jobs: workers, 0 is this process."""
+    """Run the largest safe experiment of one prior on arms drawn from it; jobs: workers, 0 is this process."""
     config = study_config()
     found = largest_amplitude(config, prior_ensemble(config, ARMS_IN_PRIOR))
     quantile = found.prediction.quantile

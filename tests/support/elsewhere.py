@@ -1,4 +1,4 @@
-"""An executor whose work happens as on another machine: everything it is given and gives back goes through pickle."""
+"""An executor that works as if on another machine: everything passed to it and returned by it goes through pickle."""
 
 import pickle
 from collections.abc import Callable

@@ -1,4 +1,5 @@
-"""A person who types docs/first_evening.md word by word: commands are taken from the page, questions are answered.
+"""A person who types docs/first_evening.md command by command: commands are taken from the page, questions are
+answered.
 
 The arm is a fake one behind a pseudo-terminal, its joints are moved with `hil hand`, and every command is a process
 of its own on a terminal, as on the evening. Only the name of the serial port is replaced.
@@ -39,7 +40,7 @@ def commands_of(page: Path = PAGE) -> list[list[str]]:
 
 @dataclass
 class Typed:
-    """One command as it was typed and what came of it; text: what the terminal showed, without its styling."""
+    """One command as it was typed, and its outcome; text: what the terminal showed, without its styling."""
 
     words: list[str]
     code: int
@@ -57,10 +58,10 @@ class Typed:
 class Person:
     """Types in `folder`, and moves the joints of the fake arm at `port`: a device, or a fake:// URL.
 
-    Behind a URL the arm lives in virtual time and only while a command runs, so no hand can move it.
+    Behind a URL the arm exists in virtual time and only while a command runs, so no hand can move it.
 
-    rest: joint angles at which the arm hangs [rad]. lengths_mm: what a ruler says, by joint. swings_deg: how far each
-    joint may swing.
+    rest: joint angles at which the arm hangs [rad]. lengths_mm: as measured with a ruler, by joint. swings_deg: how far
+    each joint may swing.
     """
 
     folder: Path
@@ -190,7 +191,7 @@ def faults_of(done: Sequence[Typed], commands: Sequence[list[str]]) -> list[str]
 
 
 def _dead_end(done: Sequence[Typed]) -> list[str]:
-    """Whoever only follows the named commands must come from the scan to the export."""
+    """Following only the named commands must lead from the scan to the export."""
     by_command = {each.words[1]: each for each in done}
     here, seen = "scan", ["scan"]
     while here != "export":

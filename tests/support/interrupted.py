@@ -113,7 +113,7 @@ def _watch_samples(wanted: Callable[[Phase, int, int, int], bool], send: Callabl
 
 
 def _report_servos() -> None:
-    """At the end of the process, say how it leaves the servos: a fake arm lives only as long as the process."""
+    """At the end of the process, report how it leaves the servos: a fake arm exists only as long as the process."""
     from hil.fakes.bus.bus import FakeBus
 
     original, buses = FakeBus.__init__, []
@@ -136,7 +136,7 @@ def _report_servos() -> None:
 
 @dataclass(frozen=True)
 class Interrupted:
-    """A command that was interrupted. next: the command that its messages name; then: what became of that one."""
+    """A command that was interrupted. next: the command that its messages name; then: the outcome of that command."""
 
     code: int
     said: str
@@ -168,7 +168,7 @@ def interrupt(stage: str, number: signal.Signals, words: list[str], folder: Path
 
 
 def main() -> None:
-    """Run `hil` with the words that follow the stage and the signal."""
+    """Run `hil` with the arguments that follow the stage and the signal."""
     name, number, *words = sys.argv[1:]
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs start with it ignored
     _report_servos()

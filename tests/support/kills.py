@@ -1,4 +1,4 @@
-"""Kills of a program that runs an experiment on a pty; benchmarks/safety/kills.py makes a campaign of them."""
+"""Kills of a program that runs an experiment on a pty; benchmarks/safety/kills.py turns them into a campaign."""
 
 import os
 import signal

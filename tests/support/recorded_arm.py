@@ -63,7 +63,7 @@ def wave(seed: int, peak: Sequence[float], period: float = PERIOD) -> Multisine:
 
 
 def record(arm: Arm, multisine: Multisine) -> Recorded:
-    """Play the multisine: one period to settle, and one that is returned."""
+    """Run the multisine: one period to settle, and one that is returned."""
     constant = np.array([drive.torque_constant for drive in arm.drives])[:, None]
     current = np.round(multisine.torque / constant / CURRENT_STEP) * CURRENT_STEP
     commands: list[Any] = current.T.tolist()

@@ -1,4 +1,4 @@
-"""A simulated arm's motion as somebody else would record it: no bus, no periods that settle."""
+"""A simulated arm's motion as another tool would record it: no bus, no settled periods."""
 
 import math
 from dataclasses import dataclass

@@ -6,7 +6,7 @@ worst joint. The criterion includes all unknowns of the regression, friction and
 its gravity torque cannot be distinguished from an offset, which a criterion on inertial parameters alone would miss.
 
 This designer is for a box of angles and speeds that the user has chosen ([joint_path]); nothing else limits the path.
-Where the box is to be found too, within limits of torque and clearance, `path_design` chooses it.
+If the box itself is to be found, within limits of torque and clearance, `path_design` chooses it.
 """
 
 from dataclasses import dataclass

@@ -148,7 +148,7 @@ class PathDesigner:
     def widest(self, centre: Array, seed: int, tries: int = WIDEST_OF) -> Design:
         """Return the random path about a centre whose least moved joint moves most, for validation.
 
-        A prediction cannot be seen to be more exact than encoder rounding relative to the motion. Raises
+        A prediction cannot be verified to be more accurate than encoder rounding relative to the motion. Raises
         ExcitationError if no path is allowed.
         """
         random = np.random.default_rng(seed)

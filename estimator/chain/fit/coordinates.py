@@ -37,7 +37,7 @@ SHAPES = {
 Without them, these parameters would be undetermined for a joint that never moves slowly.
 """
 ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
-"""Priors on small angles that gravity may not show: standard deviations around zero [rad]."""
+"""Priors on small angles that gravity may not reveal: standard deviations around zero [rad]."""
 RESHAPING = 1.0  # maximum change of their logarithms in one step
 NARROWING, WIDENING = 1.6, 1.1  # maximum decrease and increase of a width's logarithm in one step
 LONGEST = 2.0  # maximum change of any coordinate in one step

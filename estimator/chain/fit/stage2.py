@@ -256,7 +256,7 @@ def _fit(
     structured = sum(float(np.sum(structured_share(each) * np.sum(each**2, axis=1))) for each in residuals)
     white = robust_covariance(minimum.at, None, samples, count)
     covariance = coloured_covariance(problem, x, minimum.at.normal)[:count, :count]
-    if structured > 0.0:  # a model error repeats itself and may be larger at some times than at others
+    if structured > 0.0:  # a model error repeats itself, and its size may vary over time
         robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
         covariance = _larger(covariance, robust)
     value = problem.coordinates.values(x[:count])

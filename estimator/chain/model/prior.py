@@ -25,7 +25,7 @@ class Prior:
     """Standard deviations (base parameters,) [SI]."""
     scale_precision: Array | None = None
     """Inverse covariance of the logarithms of the torque scales of all joints but the first (joints - 1, joints - 1);
-    None if nothing is known of them."""
+    None if nothing is known about them."""
 
     @classmethod
     def of(

@@ -2,7 +2,7 @@
 
 The tilt is a rotation of the base about a horizontal axis, given by the components of its rotation vector along two
 axes that are fixed to the base and perpendicular to the nominal gravity; for an upright base they are its x and y. A
-rotation about the vertical does not change gravity, so two angles are all that gravity can show.
+rotation about the vertical does not change gravity, so two angles are all that gravity can reveal.
 """
 
 import numpy as np
@@ -19,7 +19,9 @@ _STEP = 1e-6  # rad, of the differences
 
 
 def tilt_axes(gravity: Array) -> Array:
-    """Return the axes of the two angles (2, 3): the base's x and y, turned with the shortest way from -z to gravity."""
+    """Return the axes of the two angles (2, 3): the base's x and y, turned by the shortest rotation from -z to
+    gravity.
+    """
     down = gravity / np.linalg.norm(gravity)
     x, y, z = down
     if z > 1.0 - 1e-9:  # hanging from a ceiling: half a turn about x

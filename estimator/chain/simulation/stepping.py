@@ -34,7 +34,7 @@ JOINT_TERMS = (
     *("torque_scale", "zero"),
 )
 NEAR = 6.0  # distance from standstill within which steps may be divided, in widths of friction's step
-CROSSED = 1.0  # such widths that a joint may cross in one step
+CROSSED = 1.0  # number of such widths that a joint may cross in one step
 WORST = 1e4  # rad or rad/s: a simulation that reaches this has diverged
 
 

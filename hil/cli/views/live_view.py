@@ -41,7 +41,7 @@ def layout_for(columns: int, name: int) -> Layout:
 class LiveView:
     """Draws progress reports; stores values that are not in every sample: positions, temperatures and voltages.
 
-    Each run of a pilot starts anew: its timing is not compared with that of the run before.
+    Each run of a pilot starts over: its timing is not compared with that of the previous run.
     """
 
     def __init__(self, config: Config, columns: int) -> None:

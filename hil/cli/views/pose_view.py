@@ -1,4 +1,4 @@
-"""What `hil pose` prints: where the arm is, joint by joint, and what came of moving it by hand."""
+"""What `hil pose` prints: where the arm is, joint by joint, and the outcome of moving it by hand."""
 
 from typing import Any
 
@@ -14,9 +14,9 @@ from hil.setup.by_hand import Moved, Pose
 
 
 def print_pose(config: Config, pose: Pose) -> None:
-    """Angles in the description's convention, which way each joint moves the end, and where that is."""
+    """Angles in the description's convention, which way each joint moves the end, and the position of the end."""
     arm, angles = described_arm(config), np.array(pose.angles)
-    table = Table(title=f"{escape(arm.path.name)} as the bus sees it", title_justify="left")
+    table = Table(title=f"{escape(arm.path.name)} as read from the bus", title_justify="left")
     for heading in ("joint", "ID", "angle rad", "degrees", "limits rad", "a positive angle"):
         table.add_column(heading)
     for index, joint in enumerate(config.joints):
@@ -28,13 +28,13 @@ def print_pose(config: Config, pose: Pose) -> None:
     print_fitting(console, table)
     x, y, z = pose.end
     console.print(f"The end link's centre of mass is at x {x:+.3f}, y {y:+.3f}, z {z:+.3f} m from the base.")
-    console.print("Does the arm stand like that? If not: zero_ticks, direction or the description is wrong.")
+    console.print("Is the arm really in this pose? If not, zero_ticks, a direction or the description is wrong.")
 
 
 def print_moved(moved: Moved) -> None:
     """One joint's outcome."""
     style = "green" if moved.well else "red"
-    result_console().print(f"[{style}]{'as it should' if moved.well else 'WRONG'}[/]: {escape(moved.found)}.")
+    result_console().print(f"[{style}]{'correct' if moved.well else 'WRONG'}[/]: {escape(moved.found)}.")
 
 
 def pose_values(config: Config, pose: Pose) -> dict[str, Any]:

@@ -4,7 +4,7 @@
     hil identify arm.toml --live rerun:watch.rrd    # writes a file, to be opened with `rerun watch.rrd`
     hil identify arm.toml --live rerun:rerun+http://localhost:9876/proxy
 
-It gets what the terminal gets: about 20 reports a second, never from the control loop itself.
+It receives what the terminal receives: about 20 reports a second, never from the control loop itself.
 """
 
 import math
@@ -25,7 +25,7 @@ _FLUSH_S = 2.0
 
 
 def wants_rerun(live: str) -> bool:
-    """Whether `--live` names the Rerun viewer, with or without a place."""
+    """Whether `--live` names the Rerun viewer, with or without a destination."""
     return live == _NAME or live.startswith(f"{_NAME}:")
 
 
@@ -60,7 +60,7 @@ def _open(recording: Any, place: str) -> None:
 
 
 class _View:
-    """Logs progress reports to a recording; time goes on from one run of a pilot to the next."""
+    """Logs progress reports to a recording; time continues from one run of a pilot to the next."""
 
     def __init__(self, rerun: ModuleType, recording: Any, config: Config) -> None:
         self._rerun, self._recording = rerun, recording

@@ -20,10 +20,10 @@ _NOTHING = 1e-9
 """Fraction of a value below which a truth is rounding error, so that a relative error means nothing."""
 
 _MOST_NAMED = 3
-"""Number of models tried up to which all are named."""
+"""Largest number of tried models that are all listed by name."""
 
 _ALIKE = 0.05
-"""Relative difference up to which two errors are about the same."""
+"""Relative difference up to which two errors count as the same."""
 
 
 def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:
@@ -51,7 +51,7 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
     if all(map(math.isfinite, result.fit.residual_rms_rad)):
         print(f"Residual {rms} mrad RMS{counted} over {result.fit.segments} segments.")
     else:
-        print("Regression on the measured torque: no motion was simulated, so that there is no residual of the angles.")
+        print("Regression on the measured torque: no motion was simulated, so there is no position residual.")
     if result.model_choice is not None:
         choice = result.model_choice
         times = f"error {choice.error_divided_by:.3g} times smaller than with the plainest model"
@@ -202,7 +202,7 @@ def _next(result: SettledResult, run: Path) -> list[str]:
 
 
 def what_next(result: Result, run: Path) -> str:
-    """The line that names the next command: export, or another estimate of numbers that are not to be used."""
+    """The line that names the next command: export, or another estimate if the numbers should not be used."""
     if _is_useless(result):
         return next_step("estimate", run)
     return next_step("export", run, "--format", _usual_format(result))

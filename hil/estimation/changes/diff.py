@@ -86,7 +86,7 @@ def diff_runs(
 
 
 def _covariance(path: Path) -> Covariance | None:
-    """Of a run's result; None for a model that was exported without one."""
+    """Covariance of a run's result; None for a model that was exported without one."""
     try:
         return read_result(path).covariance
     except ResultError:

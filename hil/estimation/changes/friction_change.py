@@ -1,11 +1,11 @@
-"""Whether one joint's friction changed between two runs, tested with what the parameters' covariances say together.
+"""Whether one joint's friction changed between two runs, tested with the joint covariance of its parameters.
 
-Coulomb friction, its rise at low speed and the speed at which it falls are known together far better than each alone: a
-change of one of them by 10 % may be less than its own standard error and still be plain. With d, the difference of the
-joint's friction parameters, and S, the sum of both runs' covariances of them, two kinds of question are asked.
+Coulomb friction, its rise at low speed and the speed at which it falls are known far better jointly than individually:
+a change of one of them by 10 % may be less than its own standard error and still be obvious. With d, the difference of
+the joint's friction parameters, and S, the sum of both runs' covariances of them, two kinds of question are asked.
 
 one term alone    Did only term i change? The most powerful test is z_i = (S^-1 d)_i / sqrt((S^-1)_ii), and
-                  (S^-1 d)_i / (S^-1)_ii is the change that it would have to be (generalised least squares).
+                  (S^-1 d)_i / (S^-1)_ii is the change that this implies (generalised least squares).
 several at once   Is d anything but noise? d' S^-1 d has a chi-square distribution.
 
 The covariances are marginal ones: changes of inertia, gravity or another joint do not count. Friction itself does

@@ -27,7 +27,9 @@ from hil.runs.run_folder import RunFolder
 
 CUTOFFS = (2.0, 4.0, 6.0, 10.0, 15.0, 25.0)  # Hz
 LARGE = 0.1
-"""Parameters below this fraction of the largest of their kind are not judged: a sum near zero has no relative error."""
+"""Parameters below this fraction of the largest of their kind are not judged: near zero, a relative error is
+meaningless.
+"""
 
 Array = NDArray[np.float64]
 

@@ -159,8 +159,8 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     else:
         trust = "with care"
         sentences.append(
-            "The torque was taken as measured, so the result is a regression, whose errors are not only random. If the "
-            'columns hold commands, set columns.between = "held": their likelihood is many times as exact.'
+            "The torque was taken as measured, so the result is a regression, whose errors are partly systematic. "
+            'If the columns hold commands, set columns.between = "held": maximum likelihood is then far more accurate.'
         )
     if foretold is None:
         trust = "with care"

@@ -41,7 +41,7 @@ def _torques(recordings: Sequence[Recording]) -> list[str]:
         most = max(float(np.abs(each.torque[joint]).max()) for each in recordings)
         if most > TORQUE[1]:
             found.append(
-                f"Joint {joint + 1}: its torque reaches {most:.3g} N m; hardly any servo has that: check its unit."
+                f"Joint {joint + 1}: its torque reaches {most:.3g} N m; few servos can deliver that: check its unit."
             )
         elif 0.0 < most < TORQUE[0]:
             found.append(f"Joint {joint + 1}: its torque is at most {most:.2g} N m: check its unit.")
@@ -49,7 +49,9 @@ def _torques(recordings: Sequence[Recording]) -> list[str]:
 
 
 def _pendulum(estimate: ShootingEstimate, gravity: float) -> list[str]:
-    """inertia gravity / weight is a length, whatever the unit of torque: wrong if those of time or angle are."""
+    """Check inertia gravity / weight, a length in any unit of torque; it is implausible if time or angle have a wrong
+    unit.
+    """
     if gravity <= 0.0:
         return []
     value, names = estimate.parameters, list(estimate.names)
@@ -70,7 +72,7 @@ def _weight(estimate: ShootingEstimate, gravity: float) -> list[str]:
     for name, value, std in zip(estimate.names, estimate.value, estimate.std, strict=True):
         if kind_of(name) == "gravity" and gravity > 0.0 and value < -SURE * std:
             found.append(
-                f"{name} is {value:.3g} N m, negative: the angle is counted from the other side (columns.zero), or a "
+                f"{name} is {value:.3g} N m, negative: the angle is measured from the other side (columns.zero), or a "
                 "sign is reversed."
             )
     return found

@@ -33,7 +33,7 @@ MOST_RECORDINGS = 200
 
 @dataclass(frozen=True)
 class _Read:
-    """All recordings of one arm. notes: what was guessed, put right or averaged, in sentences."""
+    """All recordings of one arm. notes: what was guessed, corrected or averaged, in sentences."""
 
     recordings: tuple[Recording, ...]
     names: tuple[str, ...]
@@ -111,7 +111,7 @@ def _notes(found: Iterable[Converted]) -> tuple[str, ...]:
 
 
 def _zeroed(read: _Read, gravity: float) -> _Read:
-    """Angles counted from the horizontal, where nobody said from where and gravity does."""
+    """Measure angles from the horizontal, if their origin is not given but can be determined from gravity."""
     if gravity <= 0.0 or read.columns.zero is not None:
         return read
     zeros = turned_zeros(read.recordings)
@@ -123,8 +123,8 @@ def _zeroed(read: _Read, gravity: float) -> _Read:
     moved = tuple(replace(each, position=each.position + zeros[:, None]) for each in read.recordings)
     listed = ", ".join(f"{zero:.4g}" for zero in zeros)
     said = (
-        f"Gravity says that joint 1 is not counted from the horizontal: zero = [{listed}] rad was added. If that is "
-        "wrong, set columns.zero."
+        f"According to gravity, joint 1 is not measured from the horizontal: zero = [{listed}] rad was added. If that "
+        "is wrong, set columns.zero."
     )
     columns = read.columns.model_copy(update={"zero": zeros.tolist()})
     return replace(read, recordings=moved, columns=columns, notes=(*read.notes, said))
@@ -153,7 +153,7 @@ def _named(found: Estimated, read: _Read, gravity: float) -> ShootingResult:
 
 
 def _back_emf(columns: Columns, result: ShootingResult) -> list[str]:
-    """A motor on a voltage is braked by its own turning, which counts as viscous friction."""
+    """Say how much of the viscous friction of voltage-driven joints is the back-EMF."""
     gains = columns.gains
     if columns.drive not in {"voltage", "pwm"} or gains is None:
         return []
@@ -167,7 +167,7 @@ def _back_emf(columns: Columns, result: ShootingResult) -> list[str]:
 
 
 def _arm(read: _Read, gravity: float) -> ArmFacts:
-    """What the recordings say of the joints: their limits are what was seen."""
+    """What the recordings reveal about the joints: the limits are the observed extremes."""
     columns = read.columns
     gains = columns.gains or [1.0] * len(columns.position or ())
     joints = []
@@ -217,7 +217,7 @@ def _keep(
 def _as_toml(config: RecordingConfig, columns: Columns) -> str:
     """A configuration with which the same files give the same result."""
     lines = [
-        "# What `hil estimate` took the columns for.",
+        "# How `hil estimate` interpreted the columns.",
         "[arm]",
         f"gravity = {config.arm.gravity!r}",
         "",

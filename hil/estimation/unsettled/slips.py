@@ -1,4 +1,4 @@
-"""Slips in recordings so clear that no estimate is made: it would take a minute and lead to nothing."""
+"""Mistakes in recordings that are so clear that no estimate is made: it would take a minute and be useless."""
 
 from collections.abc import Sequence
 
@@ -14,11 +14,11 @@ WELL = 0.3
 
 
 def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
-    """Raise CsvError if a sign is reversed, or an angle counted from elsewhere, beyond doubt."""
+    """Raise CsvError if a sign is reversed, or an angle measured from a different direction, beyond doubt."""
     absolute = suspect_absolute(recordings)
     if absolute is not None and _is_clear(*absolute):
         raise CsvError(
-            f"{source}: the angle of joint 2 seems to be counted from a fixed direction, such as the horizontal, "
+            f"{source}: the angle of joint 2 seems to be measured from a fixed direction, such as the horizontal, "
             f"instead of from link 1. With the difference of both angles, inverse dynamics leaves "
             f"{_percent(absolute[0])} of the torque unexplained instead of {_percent(absolute[1])}. Set in "
             '[columns] of --config ARM.toml: angles = "absolute"'
@@ -31,7 +31,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
         raise CsvError(
             f"{source}: the sign of {columns} is reversed: with the sign changed, inverse dynamics leaves "
             f"{_percent(signs.residual)} of the torque unexplained instead of {_percent(signs.residual_given)}. Change "
-            "the sign in the file, or exchange the columns."
+            "the sign in the file, or swap the columns."
         )
     # All torques reversed leave the same residual, but nothing has a negative inertia.
     inertias = [name for name in signs.impossible if name.startswith("inertia")]

@@ -19,7 +19,7 @@ WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
 
 @dataclass(frozen=True)
 class Doubts:
-    """Sentences. faults: the estimate is of no use; doubts: it may be wrong; warnings: worth knowing."""
+    """Sentences. faults: the estimate is unusable; doubts: it may be wrong; warnings: worth knowing."""
 
     faults: tuple[str, ...]
     doubts: tuple[str, ...]
@@ -53,7 +53,7 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
     return [
         f"The sign of {columns} seems to be reversed: with the sign changed, inverse dynamics leaves "
         f"{100 * suspicion.residual:.2g} % of the torque unexplained instead of {100 * suspicion.residual_given:.2g} %"
-        f"{negative}. Correct the sign in the file, or exchange the columns."
+        f"{negative}. Correct the sign in the file, or swap the columns."
     ]
 
 

@@ -16,7 +16,7 @@ def correlation(data: RunData) -> Section | None:
 
 
 def correlation_of(result: Result) -> Section | None:
-    """Of any result."""
+    """The section for any kind of result."""
     names = result.covariance.names
     if not names:
         return None

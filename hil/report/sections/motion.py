@@ -44,7 +44,7 @@ def next_commands(data: RunData) -> Section:
     """Commands to copy; always present."""
     run, length = data.run.path, ""
     if not data.config.is_chain and not data.config.arm.gravity and len(data.config.joints) > 1:
-        # Of an arm that gravity does not move, the motion says nothing of the length of link 1.
+        # If gravity does not act on the arm, the motion reveals nothing about the length of link 1.
         known = data.config.arm.link_lengths
         length = f" --link-length {f'{known[0]:g}' if known else 'METRES'}"
     rows = (

@@ -20,7 +20,7 @@ def parameters(data: RunData) -> Section:
 
 
 def parameters_of(result: Result) -> Section:
-    """Of any result."""
+    """The section for any kind of result."""
     groups = {} if result.chain is None else result.chain.groups
     tables = [_table(result.parameters, result.truth or {}, groups, "Base parameters")]
     if result.extra:

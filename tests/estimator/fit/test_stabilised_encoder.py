@@ -69,7 +69,7 @@ def test_derivatives_are_those_of_the_motion() -> None:
 
 
 def test_the_motion_without_derivatives_is_the_same() -> None:
-    """Steps are judged by it: springs, encoders and substeps have to agree with the simulation that has derivatives."""
+    """Steps are judged by it: springs, encoders and substeps must agree with the simulation with derivatives."""
     physics = Physics.of(PARAMETERS | ERRORS)
     reading, torque = played(physics)
     run = stabilised(reading, torque)

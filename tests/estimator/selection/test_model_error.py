@@ -1,4 +1,6 @@
-"""Under a model error: cogging is found, priors keep their say, and narrow steps are found behind a Stribeck rise."""
+"""Under a model error: cogging is found, priors keep their influence, and narrow steps are found behind a Stribeck
+rise.
+"""
 
 from collections.abc import Callable
 

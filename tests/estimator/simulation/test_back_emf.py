@@ -1,4 +1,4 @@
-"""Joints driven by voltage: the motion of a motor with a winding, and derivatives by what it is made of."""
+"""Joints driven by voltage: the motion of a motor with a winding, and derivatives by its constituents."""
 
 import numpy as np
 import pytest

@@ -124,7 +124,7 @@ def test_an_instruction_to_all_that_one_servo_does_not_receive(bench: Any, kind:
     lights = encode(BROADCAST_ID, Instruction.SYNC_WRITE, b"\x41\0\1\0" + b"\1\1\2\1")
     bench.exchange(lights)
     assert [bench.servo(servo_id).value("LED") for servo_id in (1, 2)] == [1, 0]
-    assert raw_replies(bench) == [PONG], "the other one hears what is for it"
+    assert raw_replies(bench) == [PONG], "the other one receives what is addressed to it"
     assert len(bench.exchange(encode(2, Instruction.PING))) == (kind == "corrupted_instruction")
     bench.wait(1.0)
     bench.exchange(lights)

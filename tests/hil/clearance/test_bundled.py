@@ -13,7 +13,7 @@ from hil.plan.chain_plan import check_rest_pose
 CONFIGS = Path(__file__).parents[3] / "configs"
 SPATIAL = sorted(path.stem for path in CONFIGS.glob("*.toml") if "urdf = " in path.read_text(encoding="utf-8"))
 MOST_M = 0.02
-"""Largest overlap of capsules, which are fatter than the parts they enclose [m]."""
+"""Largest overlap of capsules, which are larger than the parts they enclose [m]."""
 
 
 @pytest.mark.parametrize("name", SPATIAL)

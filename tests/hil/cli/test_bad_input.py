@@ -75,7 +75,7 @@ FILES: dict[str, bytes] = {
     "result.json": b"{}",
 }
 
-# command line, exit code, what the message says; a run folder `run` is there, and broken copies of it (see `folder`).
+# command line, exit code, part of the message; there is a run folder `run`, and broken copies of it (see `folder`).
 CASES: list[tuple[str, int, str]] = [
     # configuration files, by every command that takes one
     *((f"{command} nowhere.toml", 2, "nowhere.toml") for command in ("identify", "record", "check", "dry-run")),
@@ -223,10 +223,10 @@ CASES: list[tuple[str, int, str]] = [
     ("schema --out nowhere/deep/schema.json", 2, "nowhere/deep"),
     ("dry-run arm.toml --arms 0", 2, "arms"),
     ("dry-run arm.toml", 2, "link_lengths"),
-    # thirty more, as an outsider who types them for the first time (2026-11-22)
+    # thirty more, as typed by an outsider for the first time (2026-11-22)
     ("identfy arm.toml", 2, "Did you mean 'identify'?"),
     ("--versoin", 2, "--version"),
-    ("identify arm.toml --live paper", 2, "known are terminal, rerun"),
+    ("identify arm.toml --live paper", 2, "must be terminal, rerun"),
     ("record arm.toml --live", 2, "--live"),
     ("identify study.toml", 2, "Type: hil study study.toml"),
     ("identify columns.toml", 2, "Type: hil estimate FILE.csv --config columns.toml"),
@@ -279,7 +279,7 @@ CASES: list[tuple[str, int, str]] = [
 
 @pytest.fixture
 def folder(tmp_path: Path, identified_once: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The files above, a run folder and broken copies of it (of links, but for what is broken)."""
+    """The files above, a run folder and broken copies of it (made of links, except for the broken part)."""
     here = tmp_path / "here"
     here.mkdir()
     for name, content in FILES.items():

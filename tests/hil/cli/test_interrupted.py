@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM at every stage: nothing finished is lost, and the command that is named next works."""
+"""Ctrl-C and SIGTERM at every stage: nothing finished is lost, and the command named as the next one works."""
 
 import shutil
 import signal

@@ -21,7 +21,7 @@ NAN = float("nan")
 
 
 class Recording:
-    """Keeps what a RecordingStream is asked for."""
+    """Records the calls to a RecordingStream."""
 
     def __init__(self, name: str) -> None:
         self.name, self.places, self.logged, self.seconds = name, [], [], []
@@ -120,7 +120,7 @@ def test_without_the_sdk_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_another_place_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert hil("record", ARM, "--out", tmp_path / "run", "--live", "paper") == 2
-    assert "known are terminal, rerun" in " ".join(capsys.readouterr().err.split())
+    assert "must be terminal, rerun" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_real_recording_holds_every_joint(arm_file: Any, tmp_path: Path) -> None:

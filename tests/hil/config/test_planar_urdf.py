@@ -1,4 +1,4 @@
-"""A planar arm that a URDF describes: where its angles are counted as the planar model's, nothing changes."""
+"""A planar arm described by a URDF: if its angles follow the planar model's convention, nothing changes."""
 
 from pathlib import Path
 
@@ -42,9 +42,9 @@ def test_its_base_may_be_turned(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        urdf(second="0 1 0"),  # the elbow counts the other way
+        urdf(second="0 1 0"),  # the elbow's angle increases the other way
         urdf(axis="0 1 0", second="0 1 0"),  # positive angles lower the arm
-        urdf(turned="0 0.3 0"),  # angle zero is not level
+        urdf(turned="0 0.3 0"),  # the first link is not horizontal at angle zero
         urdf(second="1 0 0"),
         urdf(turned="0.5 0 0"),  # gravity has a part along the axes
     ],

@@ -1,7 +1,7 @@
 """Every number of the TOML files, a thousand times too large or too small, or in degrees.
 
 The keys come from the models, so that a new one is tried too. A number that is refused names the unit in which it would
-make sense and what to write; those that are accepted all the same, or refused without a unit, are listed.
+make sense and what to write; those that are accepted nevertheless, or refused without a unit, are listed.
 """
 
 import copy
@@ -89,7 +89,7 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
     "fake": ("arm.drives.coulomb_width",),  # excludes presliding, which is tried
     "chain": ("chain.drives", "servos"),
 }
-"""Keys that do not belong into that file, or are tried in another one."""
+"""Keys that do not belong in that file, or are tried in another one."""
 EXCEPTIONS: dict[str, dict[str, str]] = {
     "arm": {
         "joints.torque_constant /1000": OTHER,

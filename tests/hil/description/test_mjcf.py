@@ -1,4 +1,4 @@
-"""MJCF as MuJoCo reads it, against the same arm's URDF, and what is wrong with a file."""
+"""MJCF as MuJoCo reads it, compared with the same arm's URDF; and error messages for invalid files."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Arms said to have too little energy to leave their limits do not leave them in a simulation, and most are found."""
+"""Arms judged to have too little energy to leave their limits do not leave them in a simulation, and most are found."""
 
 import numpy as np
 import pytest

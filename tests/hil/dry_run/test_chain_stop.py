@@ -1,4 +1,4 @@
-"""Whether a stop of a spatial arm would lay it down decides about "safe" as well."""
+"""A dry run of a spatial arm is only "safe" if a stop would lay the arm down."""
 
 import numpy as np
 

@@ -106,7 +106,7 @@ def test_the_ways_of_stopping_in_their_order() -> None:
 
 
 def test_a_plan_that_passes_a_limit_is_stopped_there() -> None:
-    """Motion beyond a limit is never played, because the guard stops the arm there."""
+    """Motion beyond a limit never occurs, because the guard stops the arm there."""
     config = close_config()
     harder = scaled(config, make_plan(config), np.array([2.1, 1.4]))
     moved = respond(

@@ -154,7 +154,7 @@ def test_a_csv_whose_columns_are_unclear_needs_a_config_and_no_run_beside_it(
     assert hil("estimate", "data.csv") == 2
     error = capsys.readouterr().err
     assert "--config ARM.toml" in error and "a, b, c" in error and "[columns]" in error
-    assert not any(Path("runs").glob("*")), "nothing stands in the way of the next try"
+    assert not any(Path("runs").glob("*")), "nothing blocks the next attempt"
     assert hil("estimate", "data.csv", "some_run", "--config", "arm.toml") == 2
 
 

@@ -191,7 +191,7 @@ def test_it_predicts_a_held_out_path_better_than_regressions(run: RunFolder, res
 
 def test_a_calibration_asks_for_what_the_kind_of_arm_needs(run: RunFolder, result: SettledResult) -> None:
     for added, message in (
-        (AddedMass(0.2, distance=0.1), "give the place of the mass"),
+        (AddedMass(0.2, distance=0.1), "give the position of the mass"),
         (AddedMass(0.2, at=(0.1, 0.0, 0.0), joint="wrist"), "the arm's joints are joint1, joint2"),
     ):
         with pytest.raises(ConfigError, match=message):
@@ -241,7 +241,7 @@ def test_the_way_to_the_path_stays_between_rest_and_path() -> None:
         ('name = "joint2"', 'name = "elbow"', 'no joint "elbow"'),
         ("swing = [0.9", "swing = [3.9", "outside its position_limit"),
         ("speed = [4.8", "speed = [48.0", "velocity_limit"),
-        ("[experiment]", "[experiment]\npilot = true", "the path is found"),
+        ("[experiment]", "[experiment]\npilot = true", "the path is designed"),
         ('drive = "lag"', 'drive = "lag"\nripple = true', "model.ripple = true"),
         ("[stabiliser]", "[stabilizer]", "stabili"),
         ('urdf = "open_manipulator_x_like.urdf"\nrest', 'urdf = "none.urdf"\nrest', "cannot be read"),

@@ -73,7 +73,7 @@ def friction_of(level: float, rise: float, velocity: float, speed: np.ndarray) -
 
 
 def confounded() -> np.ndarray:
-    """Covariance of Coulomb level, rise and its velocity, seen together at speeds that do not leave the rise."""
+    """Covariance of Coulomb level, rise and its velocity, all observed at speeds within the rise."""
     at = np.array([0.055, 0.4, 0.3])
     speed = np.linspace(0.02, 0.25, 40)
     steps = 1e-6 * at
@@ -105,7 +105,7 @@ def curves(rng: np.random.Generator, factor: float, kept: Covariance, spread: fl
 def test_a_rise_that_no_parameter_shows_alone_is_found_with_the_others() -> None:
     names = ("coulomb_1", "stribeck_rise_1", "stribeck_velocity_1")
     covariance = confounded()
-    assert math.sqrt(covariance[1, 1]) > 0.03, "a rise of 10 % is hardly a standard error"
+    assert math.sqrt(covariance[1, 1]) > 0.03, "a rise of 10 % is barely one standard error"
     kept = Covariance(names, tuple(map(tuple, covariance.tolist())))
     rng = np.random.default_rng(3)
 

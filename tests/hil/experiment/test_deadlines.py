@@ -138,7 +138,7 @@ def test_missing_too_long(count: int, seconds: float, too_long: bool) -> None:
 
 
 def asked(silence: Silence, times: Sequence[float], *, refused: bool = False, alone: bool = True) -> list[str | None]:
-    """What is said about one joint that replies to the first exchange and to no other."""
+    """The message about one joint that replies to the first exchange only."""
     silence.ask(0.0)
     silence.heard(0, 0.0)
     said = []
@@ -204,7 +204,9 @@ def test_one_refusal_is_enough_after_the_time_allowed(arm: Arm) -> None:
     interval=st.sampled_from([0.001, 0.0025, 0.01]),
 )
 def test_a_servo_is_never_silent_for_longer_than_either_limit(gaps: list[float], interval: float) -> None:
-    """Whatever the computer does: the second missing reply after the limit of missed deadlines is one too many."""
+    """Regardless of the computer's load, the second missing reply after the limit of missed deadlines is one too
+    many.
+    """
     times = np.cumsum(gaps).tolist()
     said = asked(Silence(FAKE, interval), times)
     for count, (now, each) in enumerate(zip(times, said, strict=True), start=1):

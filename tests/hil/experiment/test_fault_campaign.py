@@ -16,7 +16,7 @@ from benchmarks.faults import campaign, figures
 INJECTIONS = 312
 
 PERIOD_S = 1.2
-"""Of the multisines: shorter than in the script's campaign, for the processor's sake."""
+"""Period of the multisines: shorter than in the script's campaign, to save processor time."""
 
 PARTS = 2
 """Number of tests that share them, so that they run side by side."""
@@ -49,7 +49,7 @@ def taught(outcome: Outcome) -> bool:
 
 
 def chosen() -> list[Setting]:
-    """Every configuration at every rate, except that two thirds of them, for time's sake, are left out at 1 kHz."""
+    """Every configuration at every rate, except that two thirds of them are left out at 1 kHz to save time."""
     return [each for each in settings() if each.rate != RATES[-1] or names().index(each.name) % EVERY_THIRD == 0]
 
 
@@ -65,7 +65,7 @@ def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
     assert len(learnt) <= MOST_LEARNT, "\n\n".join(map(str, learnt))
     counted = figures(outcomes)
     assert counted["unnamed"] <= (1 - NAMED) * counted["stopped"]
-    assert 0.3 * len(outcomes) < counted["stopped"] < 0.9 * len(outcomes), "it meets stops and runs that go on"
+    assert 0.3 * len(outcomes) < counted["stopped"] < 0.9 * len(outcomes), "it includes stops and runs that continue"
 
 
 def test_every_shipped_configuration_is_in_it_at_every_rate() -> None:

@@ -61,7 +61,7 @@ def test_a_healthy_motor_is_never_stopped(rate: int, seed: int, noise: float, ga
         return planned / 4 * sum(math.sin(math.tau * f * held + phase) for f, phase in waves)
 
     def carried(_: float, now: float) -> float:
-        # Measured right after the write: mostly the previous goal, and hardly any of the newest one.
+        # Measured right after the write: mainly the previous goal, and hardly any of the newest one.
         former = goal(now - 1 / rate) if now > 0 else 0.0
         share = 1.0 if lag < 1e-6 else 1.0 - math.exp(-0.2e-3 / lag)
         return gain * (former + share * (goal(now) - former)) + random.gauss(0.0, noise * planned)
@@ -100,7 +100,7 @@ def following(planned: float = 1.0, name: str = "xm430_two_link") -> Following:
 def replies_until_seen(
     follow: Following, goal: float, carried: float, seconds: float = STEP, followed: int = 1
 ) -> tuple[int, float]:
-    """Number of replies that carry `carried` until that is reported, and the time that it reports [s].
+    """Number of replies with the value `carried` until that is reported, and the reported time [s].
 
     followed: replies before these, in which the motor carries the goal.
     """
@@ -120,7 +120,7 @@ def replies_until_seen(
         (1.0, 0.5, 0.0, 16),  # a ratio of 12.5 counts as 2: 0.06 s / (2 STEP) = 15.4
         (1.0, 0.15, 0.0, 28),  # 1.125: 27.3
         (1.0, 0.25, 0.05, 17),  # (0.2^2 - 0.05^2) 50 = 1.875: 16.4
-        (1.0, 0.1, 0.05, 0),  # as near to the goal as to nothing
+        (1.0, 0.1, 0.05, 0),  # as near to the goal as to zero
         (1.0, 0.5, 0.3, 0),  # nearer to the goal
         (0.01, 0.02, 0.0, 18),  # sigma is 4 ticks of 2.69 mA: 1.7275: 17.8
     ],

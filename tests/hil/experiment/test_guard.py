@@ -57,7 +57,7 @@ def test_an_encoder_jump_stops_and_the_same_way_over_lost_samples_does_not(arm: 
 
 
 def test_a_frozen_encoder_is_seen_between_lost_replies(arm: Arm) -> None:
-    """A reply lost now and then must not make the comparison of position and velocity begin anew."""
+    """A reply lost now and then must not restart the comparison of position and velocity."""
     guard = Guard(arm())
     fast = STILL._replace(velocity=(0.0, 4.0))
     with pytest.raises(SafetyStop) as stop:
@@ -129,7 +129,7 @@ def test_a_motor_that_only_takes_work_out_turns_the_wrong_way(arm: Arm) -> None:
     assert look(Guard(arm(), PLANNED), *falling) is Cause.WRONG_SIGN
     guard = Guard(arm(), [2.0 * each for each in PLANNED])
     for state in falling:
-        guard.look(state)  # it may have been put in by a larger goal
+        guard.look(state)  # a larger goal may have put it in
 
 
 def test_a_goal_that_falls_is_slew_limited_like_one_that_rises(arm: Arm) -> None:
@@ -168,7 +168,7 @@ def test_work_that_another_joint_put_in_may_come_out_at_this_one(arm: Arm) -> No
 
 @pytest.mark.parametrize("hertz", [1.0, 4.0])
 def test_work_is_what_a_goal_has_done_until_the_next_one(arm: Arm, hertz: float) -> None:
-    """At 20 Hz half a period passes in two samples: a motor that drives an arm forth and back only puts work in."""
+    """At 20 Hz half a period passes in two samples: a motor that drives an arm back and forth only puts work in."""
     guard = Guard(arm(*AT_20_HZ))
     position, velocity = -1.57, 0.0
     for n in range(200):
@@ -185,7 +185,7 @@ def test_a_refusal_needs_no_second_one_at_a_slow_rate(arm: Arm) -> None:
     assert look(Guard(slow), STILL, refused) is Cause.MISSING
     guard = Guard(slow)
     for state in (STILL, at(20, MISSING._replace(error=(0, 3))), at(40, STILL), at(60, MISSING)):
-        guard.look(state)  # a damaged question, and a lost reply
+        guard.look(state)  # a damaged request, and a lost reply
 
 
 def test_an_arm_with_a_stabiliser_may_give_out_work(arm: Arm) -> None:

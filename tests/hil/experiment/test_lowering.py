@@ -22,7 +22,7 @@ AT_S = 6.0
 
 
 def play(folder: Path, text: str, signals: tuple[float, ...] = ()) -> tuple[BaseException, NDArray[np.void]]:
-    """Run the arm of this text, Ctrl-C at these times [s]; what ended it and what was recorded."""
+    """Run the arm of this text with Ctrl-C at these times [s]; return what ended it and what was recorded."""
     urdf = "open_manipulator_x_like.urdf"
     (folder / urdf).write_bytes((CONFIGS / urdf).read_bytes())
     (folder / NAME).write_text(text, encoding="utf-8")
@@ -72,7 +72,7 @@ def test_a_joint_held_for_a_moment_is_noticed_and_the_arm_lowered(tmp_path: Path
 
 def test_a_joint_that_stays_held_ends_the_lowering(tmp_path: Path) -> None:
     error, samples = play(tmp_path, with_fault(TEXT, f'kind = "stuck_joint"\nservo = 2\nat = {AT_S}'))
-    assert any("off its way down" in note for note in error.__notes__)
+    assert any("off its path down" in note for note in error.__notes__)
     assert (samples["phase"] == Phase.LOWERING).any()
 
 
@@ -83,7 +83,7 @@ def test_a_lost_torque_is_cut_at_once(tmp_path: Path) -> None:
 
 
 def test_a_servo_that_only_lost_its_watchdog_is_lowered(tmp_path: Path) -> None:
-    """Its Bus Watchdog is cleared by somebody else; it still hears and obeys."""
+    """Its Bus Watchdog is cleared by another program; it still receives and obeys."""
     from benchmarks.fault_campaign.attack import Attack, Kind
     from benchmarks.fault_campaign.campaign import play as play_attacked
     from benchmarks.fault_campaign.campaign import prepare

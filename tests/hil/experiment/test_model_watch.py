@@ -86,7 +86,7 @@ def test_arms_of_the_prior_pass_and_what_is_not_their_motion_does_not(config: Co
 def test_a_joint_that_stands_still_is_told_with_the_torques_of_the_last_moments(
     config: Config, interval: float
 ) -> None:
-    """Whatever is commanded in the very moment of the stop, which often is nothing, and however goals are held."""
+    """Whatever is commanded at the moment of the stop, which is often nothing, and however goals are held."""
     watch = ModelWatch(config, [0.5, 0.25], interval=interval)
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     rest = tuple(config.arm.rest_pose)

@@ -136,7 +136,7 @@ def test_the_floor_of_the_tolerance() -> None:
 
 
 def test_a_joint_at_zero_from_the_first_sample_on_is_compared_too() -> None:
-    """Nothing of what the buffers hold at first may count as a motion."""
+    """The initial contents of the buffers must not count as a motion."""
     periods = np.zeros((3, 1, 10))
     assert unlike_at(periods) is None
     repetition = Repetition(10, 1, INTERVAL)

@@ -1,4 +1,4 @@
-"""At slow rates faults are seen as soon as at fast ones: the goals are exchanged again between two samples."""
+"""At slow rates faults are detected as early as at fast ones: the goals are exchanged again between two samples."""
 
 import os
 import signal
@@ -69,7 +69,7 @@ def test_goals_are_exchanged_a_hundred_times_a_second_and_recorded_twenty_times(
     assert np.diff(times[:-10]).max() < 1.2 * CHECK_S, "the last ones cut torque"
     assert np.allclose(np.diff(samples["deadline"]), 1 / RATE)
     assert np.allclose(samples["time_before_write"] - samples["deadline"], 0.0, atol=1e-3)
-    # The slow registers are read in samples only, which are on file.
+    # The slow registers are read only in samples, which are recorded.
     assert np.count_nonzero(np.isfinite(samples["temperature"][:, 0])) >= len(samples) / RATE - 2
 
 

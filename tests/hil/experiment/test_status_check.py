@@ -94,7 +94,7 @@ def test_another_servos_clock_is_told_from_a_late_reply(arm: Arm) -> None:
             if (wrong := check.look_at_clock(joint, tick, now)) is not None:
                 assert wrong[0] is Cause.STALE and "another servo's data" in wrong[1] and index == 11
                 return
-    raise AssertionError("swapped replies were not seen")
+    raise AssertionError("swapped replies were not detected")
 
 
 def test_either_doubt_asks_for_another_reading(arm: Arm) -> None:
@@ -131,7 +131,7 @@ def test_how_far_a_clock_may_be_ahead(arm: Arm) -> None:
 
 
 def test_the_smallest_difference_of_the_clocks_counts(arm: Arm) -> None:
-    """Requests that left late at first make the replies look younger, not those later on older."""
+    """If the first requests left late, their replies look fresher; later ones must not look stale because of that."""
     assert clocked(StatusCheck(arm()), [1.3, 1.2, 1.0] + [1.0] * 5) == [False] * 8
     assert clocked(StatusCheck(arm()), [1.3, 1.0, 1.2, 1.2, 0.99, 0.98]) == [False] * 5 + [True]
 
@@ -163,7 +163,7 @@ def test_a_clock_that_nobody_has_learnt_is_not_another_servos(arm: Arm) -> None:
 
 
 def test_an_early_request_that_was_late_counts_for_nothing(arm: Arm) -> None:
-    """The clock is learnt anew from three readings after it."""
+    """The clock is learnt again from the three readings after it."""
     assert clocked(StatusCheck(arm()), [1.3, 1.0, 1.0, 0.9, 0.9]) == [False] * 5
     check = StatusCheck(arm())
     clocked(check, [1.3, 1.0])

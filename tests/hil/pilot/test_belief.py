@@ -99,7 +99,7 @@ def test_a_joint_that_friction_holds_against_its_weight_gets_a_spring_alone(conf
     assert held.stabiliser.stiffness[0] == held.stabiliser.damping[0] == 0.0
     assert held.stabiliser.stiffness[1] > weight
     kept = with_stabiliser(config, belief, np.array([False, True])).stabiliser
-    assert kept is not None and kept.stiffness[0] == 0.0 < kept.stiffness[1], "what had a spring keeps it"
+    assert kept is not None and kept.stiffness[0] == 0.0 < kept.stiffness[1], "a joint that had a spring keeps it"
 
 
 def test_the_search_gives_up_at_the_current_limit_only_and_says_what_it_tried(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A run that this computer was too late for is played again; what the arm or a fault has stopped is not."""
+"""A run stopped because this computer was late is repeated; one stopped by the arm or a fault is not."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,7 @@ Arm = Callable[..., Config]
 
 
 class Plays:
-    """Stopped by each cause in turn, then finished; every time it leaves a recording in the folder."""
+    """A run stopped by each cause in turn, then finished; each time it leaves a recording in the folder."""
 
     def __init__(self, folder: RunFolder, *causes: Cause) -> None:
         self.folder = folder

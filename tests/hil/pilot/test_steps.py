@@ -62,7 +62,7 @@ def in_steps(
 def test_a_whole_identification_writes_four_eeprom_registers_a_joint_at_most(
     in_steps: Any, eeprom_writes: Counter[tuple[int, str]]
 ) -> None:
-    """Mode and current limit, set once and put back once, whatever the number of steps."""
+    """Mode and current limit, set once and restored once, whatever the number of steps."""
     assert len(in_steps[0].steps) >= 2
     assert {servo_id for servo_id, _ in eeprom_writes} == {1, 2}
     for servo_id in (1, 2):

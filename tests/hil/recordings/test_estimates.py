@@ -1,4 +1,4 @@
-"""Recordings of other tools all the way: the same numbers from every format, and a folder like a run's."""
+"""Recordings of other tools end to end: the same numbers from every format, and a folder like a run's."""
 
 import json
 import sys
@@ -38,7 +38,7 @@ def held(**columns: object) -> str:
 
 
 def test_a_short_recording_has_all_that_a_run_has(capsys: pytest.CaptureFixture[str]) -> None:
-    """Eight seconds, angles counted from where the arm hangs, which nobody says."""
+    """Eight seconds of angles measured from the hanging pose, which the file does not say."""
     as_csv(two_joints(8.0), offset=np.pi / 2)
     assert hil("estimate", "arm.csv", "--config", held(), "--out", "run") == 0
     out = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Recordings as other programs write them, down to recordings in SI units."""
+"""Recordings as other programs write them, converted to SI units."""
 
 import json
 import math
@@ -266,7 +266,7 @@ def test_units_are_read_from_headers(header: str, name: str, unit: str | None) -
 
 
 def swung(slip: Callable[[np.ndarray], np.ndarray]) -> Recording:
-    """A simulated arm's recording whose positions (joints, samples) are written down wrongly."""
+    """A simulated arm's recording whose positions (joints, samples) are stored incorrectly."""
     time = np.arange(2000) * 0.005
     position = np.stack([0.8 * np.sin(2.1 * time) + 0.3 * np.sin(7.3 * time), 0.9 * np.sin(3.3 * time + 1.0)])
     velocity = np.gradient(position, 0.005, axis=1)

@@ -1,4 +1,4 @@
-"""The moving spatial arm: in the page's data, and in a real browser as a visitor would see and turn it."""
+"""The moving spatial arm: in the page's data, and in a real browser as a visitor would view and rotate it."""
 
 import json
 import re

@@ -75,7 +75,7 @@ def test_after_it_was_abandoned_nothing_more_is_done() -> None:
     assert work.close(0.05) == [1, 2]
     free.set()
     work._thread.join(5.0)
-    assert done == [1], "what was under way ends; what was given back is somebody else's"
+    assert done == [1], "what was in progress ends; what was returned belongs to the caller"
 
 
 def test_events_are_on_file_when_the_log_is_left(tmp_path: Path) -> None:

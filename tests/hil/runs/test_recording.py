@@ -55,7 +55,7 @@ def test_the_end_cuts_the_file_to_length_where_it_lies(tmp_path: Path, count: in
     with Recorder(path, 2, 100) as recorder:
         inode = path.stat().st_ino
         reserved = path.stat().st_blocks * 512
-        assert reserved >= 100 * sample_type(2).itemsize, "all the room that may be needed was taken at the start"
+        assert reserved >= 100 * sample_type(2).itemsize, "all the space that may be needed was allocated at the start"
         for number in range(count):
             recorder.keep(0.0, Phase.REST, 0, -1, state(number))
         held = recorder.samples
@@ -126,7 +126,7 @@ def test_phases_are_numbered_as_in_recordings_made_before() -> None:
 
 
 class AtOnce:
-    """A background thread that does its work when it is told."""
+    """A background thread that does its work when it is told to."""
 
     made: list["AtOnce"]
 

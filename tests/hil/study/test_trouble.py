@@ -67,7 +67,7 @@ def test_a_job_that_kills_every_worker_is_given_up_and_the_others_are_done(monke
     monkeypatch.setattr("hil.study.engine._MOST_DEATHS", 0)
     with workers(EngineTable(), None, 1) as client:
         ended = {each.number: each for each in run_jobs(client, die_at, enumerate(range(6)))}
-    # With no death allowed, one that waited on the same worker goes with it.
+    # If no death is allowed, a run that waited on the same worker fails with it.
     given_up = {number for number, each in ended.items() if each.error is not None}
     assert 3 in given_up and len(given_up) <= 2
     assert all(each.result == number for number, each in ended.items() if number not in given_up)
@@ -122,7 +122,7 @@ def test_what_a_study_was_begun_with_must_be_there_still(tmp_path: Path, monkeyp
 def test_no_real_arm_is_moved(tmp_path: Path) -> None:
     text = '[study]\ntask = "{task}"\nconfig = "fake_two_link"\n[vary]\n"port.url" = ["/dev/ttyUSB0"]\n'
     for task in ("identify", "fault"):
-        with pytest.raises(ConfigError, match="a study moves no real arm"):
+        with pytest.raises(ConfigError, match="a study never moves a real arm"):
             check_study(study(tmp_path, text.format(task=task)), tmp_path / "out")
     check_study(study(tmp_path, text.format(task="dry_run")), tmp_path / "out")
 
@@ -148,7 +148,7 @@ def test_faults_are_rows_that_say_how_it_ended(tmp_path: Path) -> None:
 
 @pytest.fixture
 def scheduler(tmp_path: Path) -> Iterator[tuple[str, "subprocess.Popen[bytes]"]]:
-    """A Dask scheduler and a worker as somebody would start them, with several threads; its address."""
+    """A Dask scheduler and a worker as a user would start them, with several threads; yields the address."""
     port_file = tmp_path / "scheduler.json"
     python, quiet = [sys.executable, "-m"], {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     words = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(port_file)]
@@ -216,7 +216,7 @@ def test_workers_are_jobs_of_a_slurm_queue(tmp_path: Path, queue: Path) -> None:
 def test_a_queue_that_refuses_is_quoted_and_nothing_is_left(tmp_path: Path, queue: Path) -> None:
     (queue / "sbatch").write_text("#!/bin/bash\necho 'invalid partition: gpu' >&2\nexit 1\n", encoding="utf-8")
     made, out = study(tmp_path, EMPTY.format(runs=20)), tmp_path / "out"
-    with pytest.raises(ConfigError, match="does not take the workers: invalid partition: gpu"):
+    with pytest.raises(ConfigError, match="rejected the workers: invalid partition: gpu"):
         run_study(made, out, scheduler="slurm", worker_count=1)
     assert not out.exists()
 

@@ -1,4 +1,4 @@
-"""A real process on a pty whose terminal, disk or reader hangs: a signal still cuts torque, and a line on file says so.
+"""A real process on a pty whose terminal, disk or reader hangs: a signal still cuts torque, and a logged line says so.
 
 The emulated servos themselves record when they lose torque. Whether that takes long is counted in the commands that
 they receive after the signal, not in seconds, because the computer may be busy; the slow tests measure seconds.
@@ -155,7 +155,7 @@ class UnreadPipe:
         self.said = b""
 
     def hang(self) -> None:
-        os.set_blocking(self.output, False)  # of the same open pipe the program has: it is set back at once
+        os.set_blocking(self.output, False)  # it applies to the program's open pipe too, so it is reset at once
         with suppress(BlockingIOError):
             while True:
                 os.write(self.output, b"." * 64)
@@ -233,7 +233,7 @@ def _try(folder: Path, what: Hung, act: Callable[[int], None]) -> Ending | None:
             if not moving or process.poll() is not None or not all(servos.torque):
                 return None
             output.hang()
-            time.sleep(0.3)  # until a thread has met what hangs
+            time.sleep(0.3)  # until a thread has run into what hangs
             if process.poll() is not None:
                 return None
             signalled = time.monotonic()
@@ -241,7 +241,7 @@ def _try(folder: Path, what: Hung, act: Callable[[int], None]) -> Ending | None:
             assert until(lambda: not any(servos.torque)), "the servos never lost their torque"
             off = min(when for when, what in servos.commands if what == "off" and when > signalled)
             goals = sum(what == "goals" and signalled < when < off for when, what in servos.commands)
-            assert until(lambda: any("Torque is off" in each for each in events(run))), "no line about torque on file"
+            assert until(lambda: any("Torque is off" in each for each in events(run))), "no logged line about torque"
             output.release()
             assert until(lambda: output.go_on() is None and process.poll() is not None), "the program never ends"
             return Ending(goals, off - signalled, events(run), output.said.decode(), process.returncode)
