@@ -53,6 +53,12 @@ class CoordinateOptions:
 
     width_floor: float
     """Lower bound of the width of every smoothed Coulomb step [rad/s]."""
+    widths_per_substep: float = 2.0
+    """Widths of the Coulomb step through which reversed friction may move a joint within the shortest substep.
+
+    Beyond about ten, the simulation jumps back and forth across the step: its motion hardly changes, but its
+    derivatives grow without limit.
+    """
     min_initial: float = 1e-3
     """Minimum initial value of a positive parameter, as a fraction of its scale."""
     max_initial_share: float = 0.95
