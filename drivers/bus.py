@@ -324,7 +324,7 @@ class ServoBus:
         """What was received in the last tenth of a second instead of complete replies in time; "" for nothing."""
         exchange, since = self.prepared, self.port.clock.now() - _RECENT_S
         if exchange.late_at > since:
-            return "Replies arrived too late, or twice."
+            return "Replies did arrive, but too late or twice: suspect the adapter or this computer's load first."
         if exchange.damaged_at > since:
             return "Bytes arrived, but damaged, incomplete or late."
         return ""

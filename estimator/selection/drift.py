@@ -19,6 +19,7 @@ from hil.estimator.selection.candidates import by_parameters, colour, linearised
 ITERATIONS = 3
 LEAST = 0.005  # minimum relative change of friction that matters
 MOST = 0.3  # maximum relative change of friction in one iteration
+SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step, tried until the prediction improves
 UNEVEN = 0.25  # relative part of a change that is not even in time, or not the same for all friction
 SCALED = ("viscous", "coulomb", "load", "viscous_asymmetry")
 
@@ -86,37 +87,58 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
     """Return the change of friction from `estimate` to `period`, which is `seconds` [s] later.
 
     It is found by Gauss-Newton iterations on one factor per joint and the initial state; all other parameters are
-    fixed.
+    fixed. A step that does not improve the prediction is shortened. Where no simulation from the period's start stays
+    finite, nothing is known of a change: its standard error is infinite.
     """
     joints = period.joints
-    run = simulated_run(period)
-    weight = np.where(period.valid, 1.0 / period.noise[:, None], 0.0)
     change, state = np.zeros(joints), _first_state(period)
-    names = [f"{name}_{joint + 1}" for joint in range(joints) for name in SCALED]
-    names = [name for name in names if name in estimate.names]
+    A, r = _linear(period, estimate, change, state)
+    if not _is_finite(A, r):
+        return Drift(change, np.full(joints, np.inf), seconds)
     for _ in range(ITERATIONS):
-        changed = Drift(change, change, seconds).at_the_later(estimate)
-        physics = Physics.of(changed.parameters)
-        columns, residual = [], []
-        for part, position, derivative in run.pieces(physics, state, tuple(names)):
-            columns.append(derivative * weight[:, part, None])
-            residual.append(weight[:, part] * (run.measured[:, part] - position))
-        J = np.concatenate(columns, axis=1)
-        r = np.concatenate(residual, axis=1).reshape(-1)
-        by_factor = np.zeros((*J.shape[:2], joints))
-        for i, name in enumerate(names):
-            joint = int(name.rsplit("_", 1)[1]) - 1
-            by_factor[:, :, joint] += J[:, :, i] * estimate.parameters[name]
-        A = np.concatenate((by_factor, J[:, :, len(names) :]), axis=2).reshape(r.size, -1)
         step = np.linalg.lstsq(A, r, rcond=None)[0]
-        change = change + np.clip(step[:joints], -MOST, MOST)
-        state = state + step[joints:].reshape(2, -1)
+        for share in SHARES:
+            further = change + np.clip(share * step[:joints], -MOST, MOST)
+            start = state + share * step[joints:].reshape(2, -1)
+            trial = _linear(period, estimate, further, start)
+            if _is_finite(*trial) and trial[1] @ trial[1] <= r @ r:
+                change, state, (A, r) = further, start, trial
+                break
+        else:
+            break
     inverse = np.linalg.pinv(A.T @ A, hermitian=True)
-    rest = r - A @ step
+    rest = r - A @ np.linalg.lstsq(A, r, rcond=None)[0]
     std = np.sqrt(
         np.diag(inverse)[:joints] * float(rest @ rest) / max(1, r.size - A.shape[1]) * colour(rest.reshape(joints, -1))
     )
     return Drift(change, std, seconds)
+
+
+def _linear(period: SettledPeriod, estimate: Estimate, change: Array, state: Array) -> tuple[Array, Array]:
+    """Return the weighted residual (samples of all joints,) with friction changed by `change` (joints,), from the
+    initial state `state` (2, joints), and its derivatives (samples, joints + 2 joints).
+    """
+    joints = period.joints
+    run = simulated_run(period)
+    weight = np.where(period.valid, 1.0 / period.noise[:, None], 0.0)
+    names = [f"{name}_{joint + 1}" for joint in range(joints) for name in SCALED]
+    names = [name for name in names if name in estimate.names]
+    physics = Physics.of(Drift(change, change, 0.0).at_the_later(estimate).parameters)
+    columns, residual = [], []
+    for part, position, derivative in run.pieces(physics, state, tuple(names)):
+        columns.append(derivative * weight[:, part, None])
+        residual.append(weight[:, part] * (run.measured[:, part] - position))
+    J = np.concatenate(columns, axis=1)
+    r = np.concatenate(residual, axis=1).reshape(-1)
+    by_factor = np.zeros((*J.shape[:2], joints))
+    for i, name in enumerate(names):
+        joint = int(name.rsplit("_", 1)[1]) - 1
+        by_factor[:, :, joint] += J[:, :, i] * estimate.parameters[name]
+    return np.concatenate((by_factor, J[:, :, len(names) :]), axis=2).reshape(r.size, -1), r
+
+
+def _is_finite(A: Array, r: Array) -> bool:
+    return bool(np.isfinite(r).all() and np.isfinite(A).all())
 
 
 def _first_state(period: SettledPeriod) -> Array:

@@ -64,10 +64,15 @@ def check(config: ConfigPath, json_only: Json = False) -> None:
     from hil.api.check import check as check_arm
     from hil.cli.terminal import Terminal
     from hil.cli.views.setup_view import print_findings
+    from hil.config.schema import load_config
 
+    checked = load_config(config)
     with Terminal(quiet=json_only).following(config) as follow:
-        report = check_arm(config, on_progress=follow)
-    print(json.dumps(report.to_json())) if json_only else print_findings(report.findings, config)
+        report = check_arm(checked, on_progress=follow)
+    if json_only:
+        print(json.dumps(report.to_json()))
+    else:
+        print_findings(report.findings, config, has_dry_run=checked.is_chain or checked.arm.link_lengths is not None)
     if not report.ready:
         raise typer.Exit(1)
 

@@ -1,7 +1,5 @@
 """Conversion of exceptions to messages and exit codes."""
 
-from hil.next_step import NEXT
-
 
 def exit_code(error: Exception) -> int | None:
     """Exit code of an expected error; None for a bug in the program."""
@@ -17,13 +15,12 @@ def exit_code(error: Exception) -> int | None:
 
 
 def message(error: Exception) -> str:
-    """Message with its notes and, if the error occurred while another one was handled, that error's message.
+    """Message, that of the error that was being handled when it occurred, and its notes.
 
-    The last line is the next command, if a note names one.
+    The notes end with the next command, if they name one.
     """
-    lines = [f"hil: {error}", *getattr(error, "__notes__", [])]
+    lines = [f"hil: {error}"]
     cause = error.__context__
     if cause is not None and error.__cause__ is None and isinstance(cause, Exception) and exit_code(cause) is not None:
-        behind = len(lines) - 1 if lines[-1].startswith(NEXT) else len(lines)
-        lines.insert(behind, f"Preceded by: {cause}")
-    return "\n".join(lines)
+        lines.append(f"Preceded by: {cause}")
+    return "\n".join([*lines, *getattr(error, "__notes__", [])])

@@ -121,18 +121,18 @@ class ServoSession:
         clock = self.bus.port.clock
         clock.wait_until(clock.now() + COUNT_DOWN_S)
 
-    def end(self) -> None:
-        """Restore every servo's settings and report those that cannot be restored. Never raises DriverError."""
+    def end(self) -> list[str]:
+        """Restore every servo's settings; return a message for each that cannot be. Never raises DriverError."""
         failed = self._put_back(self._kept)
         if failed:
             clock = self.bus.port.clock
             clock.wait_until(clock.now() + REBOOT_S)
             failed = self._put_back(failed)
-        for joint, error in failed.items():
-            self._say(
-                f"{joint.title}: its settings could not be restored ({error}) The next hil identify, record, check "
-                f"or setup on this port restores them from {self._kept[joint].path}."
-            )
+        return [
+            f"{joint.title}: its settings could not be restored ({error}) The next hil identify, record, check "
+            f"or setup on this port restores them from {self._kept[joint].path}."
+            for joint, error in failed.items()
+        ]
 
     def _put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
         """Restore the settings of these joints; return the error of each joint that failed."""
@@ -176,20 +176,22 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
     with ServoBus.connect(config.bus) as bus:
         session = ServoSession(bus, say)
         token = _outermost.set(session)
-        not_off: TorqueNotOff | None = None
+        stopped: BaseException | None = None
         try:
             session.begin(config, folder)
             bus.prepare()
             yield bus
-        except TorqueNotOff as error:
-            not_off = error
+        except BaseException as error:
+            stopped = error
             raise
         finally:
             _outermost.reset(token)
             with signals_held_back():
-                session.end()
-            if not_off is not None:  # a servo may have answered again since
-                not_off.args = (str(bus.torque_off_report),)
+                left = session.end()
+            if isinstance(stopped, TorqueNotOff):  # a servo may have answered again since
+                stopped.args = (str(bus.torque_off_report),)
+            for line in left:  # behind what stopped the arm and the state of its torque, which matter more
+                stopped.add_note(line) if stopped is not None else say(line)
 
 
 def has_moved() -> bool:

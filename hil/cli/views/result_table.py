@@ -16,8 +16,8 @@ from hil.printing import print_fitting, say
 from hil.results.parts import Quantity
 from hil.results.result import Result, SettledResult, ShootingResult
 
-_NOTHING = 1e-9
-"""Fraction of a value below which a truth is rounding error, so that a relative error means nothing."""
+_NOTHING = 0.01
+"""Fraction of a standard error below which a true value is practically 0, so that a relative error means nothing."""
 
 _MOST_NAMED = 3
 """Largest number of tried models that are all listed by name."""
@@ -132,7 +132,7 @@ def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
     cells = [f"{value:.5g}", f"{std:.1e}"]
     if truth is not None:
         error = value - truth
-        is_nothing = abs(truth) < _NOTHING * max(abs(value), std)
+        is_nothing = abs(truth) <= _NOTHING * std
         percent = "-" if is_nothing else f"{100 * error / abs(truth):+.3f}"
         cells += [f"{truth:.5g}", percent, f"{error / counted:+.1f}" if counted > 0 else "-"]
     return cells

@@ -75,8 +75,11 @@ def _after_scan(servos: Sequence[Found], port: str) -> str:
     return next_step("init", port, "--out", "my_arm.toml")
 
 
-def print_findings(findings: Sequence[Finding], config: Path) -> None:
-    """Print one line per finding, with its fix below it, and whether an experiment can start."""
+def print_findings(findings: Sequence[Finding], config: Path, *, has_dry_run: bool) -> None:
+    """Print one line per finding, with its fix below it, and whether an experiment can start.
+
+    has_dry_run: the arm is described well enough for `hil dry-run`, which is then the next command.
+    """
     console = result_console()
     former = None
     for finding in findings:
@@ -93,7 +96,7 @@ def print_findings(findings: Sequence[Finding], config: Path) -> None:
         say(console, f"\n{_counted(stops, 'blocking problem')}, {_counted(warnings, 'warning')}. Fix them.")
     else:
         say(console, f"\nReady, {_counted(warnings, 'warning')}.")
-    print(next_step("check" if stops else "dry-run", config))
+    print(next_step("check" if stops else "dry-run" if has_dry_run else "identify", config))
 
 
 def _counted(number: int, what: str) -> str:

@@ -133,3 +133,22 @@ def test_error_bars_count_what_a_changing_friction_does_to_other_parameters(
 def test_after_a_correction_its_own_error_and_unevenness_remain() -> None:
     left = Drift(np.array([-0.08, 0.0]), np.array([0.0, 0.01]), SECONDS).after_correction()
     assert left.change == pytest.approx([0.02, 0.01])
+
+
+def test_a_start_that_no_simulation_survives_gives_an_unknown_change(
+    periods: tuple[SettledPeriod, SettledPeriod], constant: Estimate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hil.estimator.selection.drift._first_state", lambda each: np.full((2, each.joints), np.nan))
+    unknown = friction_change(periods[1], constant, SECONDS)
+    assert not unknown.is_seen and np.isinf(unknown.std).all()
+
+
+def test_a_start_that_is_far_off_gives_the_same_change(
+    periods: tuple[SettledPeriod, SettledPeriod], constant: Estimate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = friction_change(periods[1], constant, SECONDS)
+    lines = lines_of(periods[1].position)
+    motion = motion_of(lines, cut_off(lines), periods[1].fundamental, periods[1].samples)
+    off = np.stack((motion.position[:, 0], motion.velocity[:, 0])) + 0.2
+    monkeypatch.setattr("hil.estimator.selection.drift._first_state", lambda _: off)
+    np.testing.assert_allclose(friction_change(periods[1], constant, SECONDS).change, usual.change, atol=5e-3)

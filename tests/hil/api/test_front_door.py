@@ -122,8 +122,8 @@ def test_a_callback_that_raises_disturbs_nothing(arm_file: ArmFile, caplog: pyte
 
 
 def test_a_dry_run_foretells(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
-    base = (("rest_pose = ", "link_lengths = [0.12, 0.10]\nrest_pose = "),)
-    path = arm_file(*base)
+    lengths = ("rest_pose = ", "link_lengths = [0.12, 0.10]\nrest_pose = ")
+    path = arm_file(lengths, ("ramp = 1.0 ", "held_out = false\nramp = 1.0 "))
     rehearsal = hil.dry_run(path, arms=20)
     code = command("dry-run", path, "--arms", "20", "--json")
     assert json.loads(capsys.readouterr().out) == rehearsal.to_json()

@@ -124,15 +124,15 @@ def test_settings_are_on_the_disk_before_the_first_write(arm: Arm, tmp_path: Pat
 
 @pytest.mark.parametrize("kind", ["silent_servo", "reboot", "overheating", "cable_pulled"])
 def test_whatever_stops_a_run_its_settings_are_put_back_then_or_at_the_next_start(
-    arm: Arm, tmp_path: Path, bench: Bench, kind: str, capsys: pytest.CaptureFixture[str]
+    arm: Arm, tmp_path: Path, bench: Bench, kind: str
 ) -> None:
     config = arm(SHORT)
     bench.prepare = lambda port: port.bus.faults.add(Fault(kind=kind, servo=2, at=2.0))
-    with pytest.raises((DriverError, HilError)):
+    with pytest.raises((DriverError, HilError)) as stopped:
         play(config, tmp_path / "run")
     left = bench.changed()
     if left:
-        assert "could not be restored" in capsys.readouterr().err
+        assert any("could not be restored" in note for note in stopped.value.__notes__)
         assert settings_path(config.url, 2, "XM430-W350").is_file()
         bench.port.bus.faults.clear()
         found = list(check_arm(config))

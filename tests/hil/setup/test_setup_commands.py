@@ -182,6 +182,8 @@ def test_a_port_that_does_not_open_is_a_finding(arm: Arm) -> None:
 def test_check_command(arm_file: ArmFile) -> None:
     result = invoke("check", arm_file())
     assert result.exit_code == 0
+    assert "Next: hil identify" in result.stdout, "without link lengths there is no dry run"
+    result = invoke("check", arm_file(("[arm]\n", "[arm]\nlink_lengths = [0.147, 0.18]\n")))
     assert "Next: hil dry-run" in result.stdout
     result = invoke("check", arm_file((SERVO_2, SERVO_2 + "input_voltage_v = 5.0\n")), "--json")
     assert result.exit_code == 1

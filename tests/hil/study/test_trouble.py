@@ -110,7 +110,7 @@ def test_what_a_study_was_begun_with_must_be_there_still(tmp_path: Path, monkeyp
     made, out = study(tmp_path, '[study]\ntask = "dry_run"\nconfig = "arm.toml"\nruns = 2\n'), tmp_path / "out"
     with opened(made, out, 2, resume=False):
         pass
-    with monkeypatch.context() as patched, pytest.raises(ConfigError, match="begun with hil 0"):
+    with monkeypatch.context() as patched, pytest.raises(ConfigError, match="started with hil 0"):
         patched.setattr("hil.study.engine.__version__", "99.0")
         with opened(made, out, 2, resume=True):
             pass
