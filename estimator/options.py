@@ -255,6 +255,8 @@ class SelectionOptions:
     """Prediction error relative to the chosen model's that another model must reach to replace it."""
     wave_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))
     """Numbers of ripple and cogging cycles per turn that are tried."""
+    max_wave_peaks: int = 3
+    """Maximum number of cycles per turn from which a fit with ripple or cogging is started."""
     wave_evidence: float = 0.05
     """Evidence in the score test at which ripple or cogging is tried.
 
