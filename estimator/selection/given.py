@@ -17,7 +17,7 @@ from hil.estimator.identify import Estimate, identify
 from hil.estimator.models.model import Model
 from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.candidates import candidates
-from hil.estimator.selection.waves import wave_peaks
+from hil.estimator.selection.waves import ranked_cycles, wave_peaks
 
 DEFAULTS = SelectionOptions()
 
@@ -55,8 +55,7 @@ def _with_wave(period: SettledPeriod, estimate: Estimate, wave: Wave, options: S
     model = estimate.model.having(wave)
     peaks = wave_peaks(without_spikes(period), estimate, options.wave_cycles, (wave,))
     fits: list[Estimate] = []
-    for rank in range(min(options.max_wave_peaks, max(map(len, peaks.values())))):
-        known = {name: each[min(rank, len(each) - 1)] for name, each in peaks.items()}
+    for known in ranked_cycles(peaks, options.max_wave_peaks):
         values = next(each.values for each in candidates(period, estimate, known) if each.part == wave)
         near = Near({**estimate.parameters, **values}, estimate.start)
         try:

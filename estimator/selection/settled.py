@@ -13,22 +13,20 @@ from itertools import islice
 from types import MappingProxyType
 
 import numpy as np
-from scipy.stats import chi2
 
-from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.ripple import WAVES
-from hil.estimator.identify import Estimate
 from hil.estimator.models.model import Model
-from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_of
+from hil.estimator.models.terms import FRICTIONS, Drive, Option
 from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.candidates import Candidate, candidates, colour
 from hil.estimator.selection.drift import Drift, friction_change
+from hil.estimator.selection.pruning import removable_parts, without_nothings
 from hil.estimator.selection.restarts import bristles, restarts, undisguised
 from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.trial import Choice, Fitting, Trial
-from hil.estimator.selection.waves import wave_cycles
+from hil.estimator.selection.waves import ranked_cycles, wave_peaks
 
 DEFAULTS = SelectionOptions()
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
@@ -247,11 +245,16 @@ class Selection:
         absent = [wave for wave in WAVES if wave not in best.model.options]
         if not absent:
             return best
-        known = wave_cycles(self._periods[0], best.estimate, self._options.wave_cycles, absent)
-        for each in candidates(self._periods[0], best.estimate, known):
-            if each.part in absent and each.evidence > self._options.wave_evidence:
-                return self._better(self._try_or_none(each.model, best, each.values, coarse=True), best) or best
-        return best
+        peaks = wave_peaks(self._periods[0], best.estimate, self._options.wave_cycles, absent)
+        found = best
+        for known in ranked_cycles(peaks, self._options.max_wave_peaks):
+            for each in candidates(self._periods[0], best.estimate, known):
+                if each.part in absent and each.evidence > self._options.wave_evidence:
+                    found = self._better(self._try_or_none(each.model, best, each.values, coarse=True), found) or found
+                    break
+            if self._is_explained(found):
+                break
+        return found
 
     def _converged(self, trial: Trial) -> Trial:
         """Return a fit with full precision: during model comparison, fits that leave much unexplained stop early."""
@@ -285,8 +288,10 @@ class Selection:
         assert best.estimate is not None
         if self._left(best) > self._options.presliding_residual**2:
             return best  # effects of missing terms would be attributed to present ones
+        if not np.isfinite(best.estimate.std).any():
+            return self._pruned_by_fits(best)
         for level in self._options.prune_levels:
-            plainest = _without_nothings(best.estimate, level, self._fixed)
+            plainest = without_nothings(best.estimate, level, self._fixed)
             if plainest != best.model:
                 self._begin(plainest, best)
         for level in self._options.prune_levels:
@@ -298,11 +303,19 @@ class Selection:
     def _pruned_at(self, level: float, best: Trial) -> Trial:
         """Prune and refit until no more terms are insignificant; with fewer terms, the others become more certain."""
         while best.estimate is not None:
-            plainer = _without_nothings(best.estimate, level, self._fixed)
+            plainer = without_nothings(best.estimate, level, self._fixed)
             trial = None if plainer == best.model else self._try_or_none(plainer, best)
             if trial is None:
                 break
             best = trial
+        return best
+
+    def _pruned_by_fits(self, best: Trial) -> Trial:
+        """Remove terms one by one, each judged by a fit without it: for a motion too sensitive for standard errors."""
+        for part, plainer in removable_parts(best.model):
+            trial = None if part == self._fixed else self._try_or_none(plainer, best)
+            if trial is not None and self._gain(best, trial) < self._worth(best, trial):
+                return self._pruned_by_fits(trial)
         return best
 
     def judged(self, chosen: Trial) -> Trial:
@@ -358,57 +371,3 @@ class Selection:
         trial = self._fitting.trial(model, near, values, coarse) if begun is None else begun.result()
         self.trials.append(trial)
         return trial
-
-
-def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) -> Model:
-    """Return the model without parts that do not differ significantly from zero, the least significant removed first.
-
-    Significance is judged by A. Wald's test (Trans. AMS 54 (1943) 426): the squared distance from zero in standard
-    errors, compared with chi^2 at `level`. The remaining parameters are updated with the linearised model.
-    """
-    return pruned_model(estimate.model, estimate.names, estimate.value, estimate.covariance, level, fixed)
-
-
-def pruned_model(
-    model: Model, names: Sequence[str], value: Array, covariance: Array, level: float, fixed: Option | None
-) -> Model:
-    """Return `model` without the parts that do not differ significantly from zero at `level`; `fixed` is kept.
-
-    value, covariance: parameters (parameters,) and their covariance, in the order of `names`.
-    """
-    names, value, covariance = list(names), value.copy(), covariance.copy()
-    covariance[~np.isfinite(covariance)] = 0.0
-    while True:
-        doubtful = []
-        for part, plainer in _parts(model):
-            at = [names.index(name) for name in _tested(model, plainer)]
-            away = value[at] - np.array([term_of(names[i]).absent for i in at])
-            own = np.linalg.pinv(covariance[np.ix_(at, at)], rcond=1e-12, hermitian=True)
-            doubtful.append((float(away @ own @ away) / float(chi2.isf(level, len(at))), part, plainer, at, own, away))
-        doubtful = [each for each in doubtful if each[0] < 1.0 and each[1] != fixed]
-        if not doubtful:
-            return model
-        _, _, model, at, own, away = min(doubtful, key=lambda each: each[0])
-        follow = covariance[:, at] @ own
-        value = value - follow @ away
-        covariance = covariance - follow @ covariance[at]
-
-
-def _parts(model: Model) -> list[tuple[str, Model]]:
-    """Return the removable parts of a model, each with the reduced model; presliding has no significance test."""
-    parts: list[tuple[str, Model]] = [
-        (option, model.without(option)) for option in sorted(model.options) if option != "presliding"
-    ]
-    law = FRICTIONS.index(model.friction)
-    if law:
-        parts.append((model.friction, replace(model, friction=FRICTIONS[law - 1])))
-    return parts
-
-
-def _tested(model: Model, plainer: Model) -> list[str]:
-    """Return the tested parameters of the part that `plainer` lacks.
-
-    Parameters that only have an effect together with others, such as a wave's period, are not tested.
-    """
-    lacking = [name for name in model.names if name not in plainer.names]
-    return [name for name in lacking if kind_of(name) not in ("ripple_cycles", "cogging_cycles", "stribeck_velocity")]

@@ -1,6 +1,6 @@
 """Periods of torque ripple and cogging: score tests of one number of cycles per turn after the other."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -67,6 +67,15 @@ def wave_peaks(
             own = found[:, 2 * place : 2 * place + 2]
             falls[name].append(float(np.sum((np.linalg.qr(own)[0].T @ rest) ** 2)))
     return {name: _peaks(cycles, np.nan_to_num(fall)) for name, fall in falls.items()}
+
+
+def ranked_cycles(peaks: Mapping[str, Sequence[float]], most: int) -> list[dict[str, float]]:
+    """Return at most `most` choices of cycles from the result of `wave_peaks`, by parameter name, the best first.
+
+    Later choices take the next number of every wave that has one.
+    """
+    ranks = min(most, max(map(len, peaks.values()), default=0))
+    return [{name: each[min(rank, len(each) - 1)] for name, each in peaks.items()} for rank in range(ranks)]
 
 
 def _peaks(cycles: Sequence[float], falls: Array) -> tuple[float, ...]:
