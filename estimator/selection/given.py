@@ -6,6 +6,7 @@ search may end at a wrong period, from which no fit returns. The second search s
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,8 +16,9 @@ from hil.estimator.fit.ripple import WAVES, Wave
 from hil.estimator.fit.stage2 import Near
 from hil.estimator.identify import Estimate, identify
 from hil.estimator.models.model import Model
+from hil.estimator.models.terms import FRICTIONS
 from hil.estimator.options import SelectionOptions
-from hil.estimator.selection.candidates import candidates
+from hil.estimator.selection.candidates import SMOOTH
 from hil.estimator.selection.waves import ranked_cycles, wave_peaks
 
 DEFAULTS = SelectionOptions()
@@ -44,29 +46,44 @@ def fit_given(
         return best
     found = identify(period, model.without(*waves), starts=starts, coarse=True)
     for wave in waves:
-        found = _with_wave(period, found, wave, options)
+        found = _with_wave(period, found, wave, starts, options)
     if best is not None and not _left(period, found) < _left(period, best):
         return best
     return identify(period, model, near=Near(found.parameters, found.start))
 
 
-def _with_wave(period: SettledPeriod, estimate: Estimate, wave: Wave, options: SelectionOptions) -> Estimate:
-    """Return the best fit of the estimate's model with a wave, from its most likely numbers of cycles."""
+def _with_wave(
+    period: SettledPeriod,
+    estimate: Estimate,
+    wave: Wave,
+    starts: Sequence[Mapping[str, float]],
+    options: SelectionOptions,
+) -> Estimate:
+    """Return the best fit of the estimate's model with a wave, from its most likely numbers of cycles.
+
+    A wave is seen best where other terms explain most, even if they only imitate it; they are fitted for that alone.
+    """
     model = estimate.model.having(wave)
-    peaks = wave_peaks(without_spikes(period), estimate, options.wave_cycles, (wave,))
+    rich = replace(estimate.model, friction=FRICTIONS[-1]).having("zeros", *SMOOTH)
+    about = identify(period, rich, starts=starts, coarse=True)
+    peaks = wave_peaks(without_spikes(period), about, options.wave_cycles, (wave,))
     fits: list[Estimate] = []
     for known in ranked_cycles(peaks, options.max_wave_peaks):
-        values = next(each.values for each in candidates(period, estimate, known) if each.part == wave)
-        near = Near({**estimate.parameters, **values}, estimate.start)
+        near = Near({**estimate.parameters, **_still(wave, model.joints), **known}, estimate.start)
         try:
             fits.append(identify(period, model, near=near, coarse=True))
         except ConvergenceError:
             continue
-        if _left(period, fits[-1]) < options.explained_residual:
+        if _left(period, fits[-1]) < options.presliding_residual:
             break
     if not fits:
         raise ConvergenceError(f"no period of the {wave} leads to a minimum: try a simpler model")
     return min(fits, key=lambda each: _left(period, each))
+
+
+def _still(wave: Wave, joints: int) -> dict[str, float]:
+    """Return the parameters, by name, of a wave of no height."""
+    return {f"{wave}_{part}_{joint}": 0.0 for part in ("sin", "cos") for joint in range(1, joints + 1)}
 
 
 def _left(period: SettledPeriod, estimate: Estimate) -> float:

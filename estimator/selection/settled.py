@@ -20,7 +20,7 @@ from hil.estimator.fit.ripple import WAVES
 from hil.estimator.models.model import Model
 from hil.estimator.models.terms import FRICTIONS, Drive, Option
 from hil.estimator.options import SelectionOptions
-from hil.estimator.selection.candidates import Candidate, candidates, colour
+from hil.estimator.selection.candidates import SMOOTH, Candidate, candidates, colour
 from hil.estimator.selection.drift import Drift, friction_change
 from hil.estimator.selection.pruning import removable_parts, without_nothings
 from hil.estimator.selection.restarts import bristles, restarts, undisguised
@@ -29,8 +29,6 @@ from hil.estimator.selection.trial import Choice, Fitting, Trial
 from hil.estimator.selection.waves import ranked_cycles, wave_peaks
 
 DEFAULTS = SelectionOptions()
-SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
-"""Terms that vanish smoothly, so that including them costs a fit little."""
 
 
 def choose(
@@ -154,7 +152,7 @@ class Selection:
             best = self._better(self._try_or_none(smooth.having("presliding"), coarse=True), best) or best
         for near in self._closest():
             if not self._is_explained(best):
-                best = self._better(self._with_wave(near), best) or best
+                best = self._better(self._with_wave(near, plain), best) or best
         if set(WAVES) & set(best.model.options) and not self._is_explained(best):
             best = self._with_wave(best)
         best = self._steadied(best) or best
@@ -239,8 +237,13 @@ class Selection:
         assert trial.estimate is not None
         return [each for each in candidates(self._periods[0], trial.estimate, {}) if each.evidence > 1.0]
 
-    def _with_wave(self, best: Trial) -> Trial:
-        """Add ripple or cogging, whichever explains more, if the score test finds it."""
+    def _with_wave(self, best: Trial, plain: Trial | None = None) -> Trial:
+        """Add ripple or cogging, whichever explains more, if the score test finds it.
+
+        The score test needs the model that explains most, `best`. A fit from there may end far from the truth: until
+        then, cables, saturation and load have imitated the wave, and only together do they explain about as much. So
+        the wave is first added to `plain`, which has few terms that could, and the others to the result.
+        """
         assert best.estimate is not None
         absent = [wave for wave in WAVES if wave not in best.model.options]
         if not absent:
@@ -248,13 +251,28 @@ class Selection:
         peaks = wave_peaks(self._periods[0], best.estimate, self._options.wave_cycles, absent)
         found = best
         for known in ranked_cycles(peaks, self._options.max_wave_peaks):
-            for each in candidates(self._periods[0], best.estimate, known):
-                if each.part in absent and each.evidence > self._options.wave_evidence:
-                    found = self._better(self._try_or_none(each.model, best, each.values, coarse=True), found) or found
-                    break
-            if self._is_explained(found):
+            seen = candidates(self._periods[0], best.estimate, known)
+            wave = next((e for e in seen if e.part in absent and e.evidence > self._options.wave_evidence), None)
+            if wave is None:
+                continue
+            simple = self._waving(plain, wave)
+            if simple is not None and self._is_explained(simple) and not self._seen(simple):
+                return simple
+            near, values = (best, wave.values) if simple is None else (simple, {})
+            found = self._better(simple, found) or found
+            found = self._better(self._try_or_none(wave.model, near, values, coarse=True), found) or found
+            if self._left(found) < self._options.presliding_residual**2:
                 break
         return found
+
+    def _waving(self, plain: Trial | None, wave: Candidate) -> Trial | None:
+        """Return `plain` with the wave and encoder errors if these explain nearly everything, otherwise None."""
+        if plain is None:
+            return None
+        named = {name: value if "cycles" in name else 0.0 for name, value in wave.values.items()}
+        options = [each for each in WAVES if each == wave.part]
+        simple = self._try_or_none(plain.model.having(*options, "encoder"), plain, named, coarse=True)
+        return simple if simple is not None and self._left(simple) < self._options.presliding_residual**2 else None
 
     def _converged(self, trial: Trial) -> Trial:
         """Return a fit with full precision: during model comparison, fits that leave much unexplained stop early."""
