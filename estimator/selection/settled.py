@@ -250,9 +250,10 @@ class Selection:
             return best
         peaks = wave_peaks(self._periods[0], best.estimate, self._options.wave_cycles, absent)
         found = best
-        for known in ranked_cycles(peaks, self._options.max_wave_peaks):
+        for rank, known in enumerate(ranked_cycles(peaks, self._options.max_wave_peaks)):
             seen = candidates(self._periods[0], best.estimate, known)
-            wave = next((e for e in seen if e.part in absent and e.evidence > self._options.wave_evidence), None)
+            least = 1.0 if rank else self._options.wave_evidence
+            wave = next((each for each in seen if each.part in absent and each.evidence > least), None)
             if wave is None:
                 continue
             simple = self._waving(plain, wave)
@@ -261,18 +262,26 @@ class Selection:
             near, values = (best, wave.values) if simple is None else (simple, {})
             found = self._better(simple, found) or found
             found = self._better(self._try_or_none(wave.model, near, values, coarse=True), found) or found
-            if self._left(found) < self._options.presliding_residual**2:
+            if self._is_nearly_explained(found):
                 break
         return found
 
     def _waving(self, plain: Trial | None, wave: Candidate) -> Trial | None:
-        """Return `plain` with the wave and encoder errors if these explain nearly everything, otherwise None."""
-        if plain is None:
+        """Return `plain` with the wave, and encoder errors if needed, if these explain nearly everything, else None."""
+        if plain is None or wave.evidence < 1.0:
             return None
         named = {name: value if "cycles" in name else 0.0 for name, value in wave.values.items()}
-        options = [each for each in WAVES if each == wave.part]
-        simple = self._try_or_none(plain.model.having(*options, "encoder"), plain, named, coarse=True)
-        return simple if simple is not None and self._left(simple) < self._options.presliding_residual**2 else None
+        waving = plain.model.having(*(each for each in WAVES if each == wave.part))
+        simple = self._try_or_none(waving, plain, named, coarse=True)
+        if simple is not None and self._is_nearly_explained(simple):
+            if not self._is_explained(simple):
+                simple = self._better(self._try_or_none(waving.having("encoder"), simple, coarse=True), simple)
+        else:
+            simple = self._try_or_none(waving.having("encoder"), plain, named, coarse=True)
+        return simple if simple is not None and self._is_nearly_explained(simple) else None
+
+    def _is_nearly_explained(self, trial: Trial) -> bool:
+        return self._left(trial) < self._options.presliding_residual**2
 
     def _converged(self, trial: Trial) -> Trial:
         """Return a fit with full precision: during model comparison, fits that leave much unexplained stop early."""
