@@ -18,8 +18,8 @@ from hil.estimator.selection.given import fit_given
 from hil.fakes.plants.arm import Arm, base_parameters
 from tests.support import recorded_arm
 
-PEAK = 0.065  # N m, twice the weight
-LINK = {"length": 0.122, "mass": 0.038, "centre": 0.082, "inertia": 3.9e-5}
+PEAK = 0.05  # N m, three times the weight and twice the friction
+LINK = {"length": 0.08, "mass": 0.03, "centre": 0.05, "inertia": 2e-5}
 DRIVE = {"mass": 0.018, "rotor_inertia": 1.2e-9, "gear_ratio": 288.35, "torque_constant": 0.354, "current_lag": 1e-3}
 FRICTION = {"viscous": 0.0068, "coulomb": 0.0187, "stribeck_rise": 0.37, "stribeck_velocity": 0.14, "offset": 0.0025}
 COGGING = {"cogging": 0.001, "cogging_cycles": 4}
