@@ -40,8 +40,12 @@ EARLY_MOTION_RAD = 0.05
 FARTHER_OUT_RAD = 0.01
 """How much farther out a joint may move if an earlier run left it beyond its limit [rad]."""
 
-MOST_OUTSIDE_RAD = 0.15
-"""How far beyond its limit a joint may start if an earlier run left it there [rad]."""
+MOST_OUTSIDE_RAD = 0.5
+"""How far beyond its limit a joint may start if an earlier run left it there [rad].
+
+A light arm that was stopped at a limit coasts on by some tenths of a radian, and friction holds it there; an upright
+one that has fallen is farther away.
+"""
 
 LONG_GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
