@@ -53,6 +53,12 @@ class CoordinateOptions:
 
     width_floor: float
     """Lower bound of the width of every smoothed Coulomb step [rad/s]."""
+    widths_per_substep: float = 2.0
+    """Widths of the Coulomb step through which reversed friction may move a joint within the shortest substep.
+
+    Beyond about ten, the simulation jumps back and forth across the step: its motion hardly changes, but its
+    derivatives grow without limit.
+    """
     min_initial: float = 1e-3
     """Minimum initial value of a positive parameter, as a fraction of its scale."""
     max_initial_share: float = 0.95
@@ -249,6 +255,8 @@ class SelectionOptions:
     """Prediction error relative to the chosen model's that another model must reach to replace it."""
     wave_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))
     """Numbers of ripple and cogging cycles per turn that are tried."""
+    max_wave_peaks: int = 3
+    """Maximum number of cycles per turn from which a fit with ripple or cogging is started."""
     wave_evidence: float = 0.05
     """Evidence in the score test at which ripple or cogging is tried.
 

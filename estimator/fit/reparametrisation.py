@@ -32,6 +32,8 @@ class Coordinates:
     scales: Array
     """Scale of each parameter (parameters,) [its unit], from `scales_of`."""
     options: CoordinateOptions
+    resolved: Array | None = None
+    """Lower bound of each width, elsewhere 0 (parameters,) [rad/s]: the larger of this and `width_floor` counts."""
 
     def values(self, x: Array) -> Array:
         """Return the parameters (parameters,) at the coordinates `x` (parameters,)."""
@@ -59,7 +61,7 @@ class Coordinates:
         """
         y = x + step
         widths = np.flatnonzero(self._floors)
-        least = self.options.min_width * self.options.width_floor
+        least = self.options.min_width * self._floors[widths]
         y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), least))
         return y
 
@@ -72,7 +74,7 @@ class Coordinates:
         least[: x.size] = np.maximum(least[: x.size], -self._longest)
         most[: x.size] = np.minimum(most[: x.size], self._longest)
         widths = np.flatnonzero(self._floors)
-        share = 1.0 + self.options.width_floor * np.exp(-x[widths])  # width relative to its distance from the floor
+        share = 1.0 + self._floors[widths] * np.exp(-x[widths])  # width relative to its distance from the floor
         least[widths] = np.maximum(-1.0, -max_relative_decrease * share)
         most[widths] = self.options.max_relative_increase * share
 
@@ -92,7 +94,9 @@ class Coordinates:
 
     @cached_property
     def _floors(self) -> Array:
-        return np.array([self.options.width_floor if term_of(name).range == "floor" else 0.0 for name in self.names])
+        floor = self.options.width_floor
+        floors = np.array([floor if term_of(name).range == "floor" else 0.0 for name in self.names])
+        return floors if self.resolved is None else np.maximum(floors, self.resolved)
 
     @cached_property
     def _longest(self) -> Array:

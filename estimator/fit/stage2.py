@@ -29,7 +29,8 @@ from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.fit.stage1 import LinearEstimate
 from hil.estimator.models.model import Model
-from hil.estimator.models.terms import FRICTIONS, term_of
+from hil.estimator.models.parameters import Physics
+from hil.estimator.models.terms import FRICTIONS, joint_of, term_of
 from hil.estimator.options import LikelihoodOptions
 
 DEFAULTS = LikelihoodOptions()
@@ -146,13 +147,31 @@ def _objective(
     states = [np.concatenate((m.position[:, 0], m.velocity[:, 0])) / state_scale for m in linear.motions]
     weights = tuple(np.where(period.valid, 1.0 / period.noise[:, None], 0.0) for period in periods)
     runs = tuple(_simulated(period, options) for period in periods)
-    coordinates = Coordinates(model.names, scales, options.coordinates)
+    coordinates = Coordinates(model.names, scales, options.coordinates, _resolved_widths(model, linear, options))
     steps = options.minimiser, options.max_relative_decrease
     prior = CoordinatePrior.of(model.names, scales, sizes)
     weight = dict(zip(linear.names, linear.value.tolist(), strict=True)).get("gravity_2", 0.0)
     lever = Lever.of(model, weight, sizes)
     objective = Objective(runs, coordinates, state_scale, weights, prior, *steps, lever=lever)
     return objective, np.concatenate(states)
+
+
+def _resolved_widths(model: Model, linear: LinearEstimate, options: LikelihoodOptions) -> Array:
+    """Return the narrowest Coulomb steps that the simulation resolves [rad/s], 0 for other parameters (parameters,).
+
+    On a light arm, friction stops a joint within microseconds: narrower steps look the same in any recording, but their
+    simulation is chaotic.
+    """
+    values = dict(zip(linear.names, np.abs(linear.value).tolist(), strict=True))
+    inertias = Physics.of(values).free_inertias()
+    shortest = options.integration.max_step / options.integration.max_substeps
+    widths = np.zeros(len(model.names))
+    for index, name in enumerate(model.names):
+        if term_of(name).range == "floor":
+            joint = joint_of(name) or 1
+            reversal = 2.0 * values[f"coulomb_{joint}"] / max(inertias[joint - 1], 1e-12)
+            widths[index] = reversal * shortest / options.coordinates.widths_per_substep
+    return widths
 
 
 def _simulated(period: SettledPeriod, options: LikelihoodOptions) -> Run:

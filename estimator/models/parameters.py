@@ -91,11 +91,7 @@ class Physics:
     def crossing_time(self) -> float:
         """Return the shortest time in which reversed friction crosses a joint's step or bristle deflection [s]."""
         constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))
-        shared = constant["inertia_2"] ** 2 / (constant["inertia_2"] + constant["armature_2"])
-        inertia = (
-            constant["inertia_1"] + constant["inertia_2"] - shared,
-            constant["inertia_2"] + constant["armature_2"],
-        )
+        inertia = self.free_inertias()
         times = []
         for joint in (1, 2):
             stiffness = constant[f"presliding_stiffness_{joint}"]
@@ -106,3 +102,9 @@ class Physics:
                 turned = 2.0 * constant[f"coulomb_{joint}"] * (1.0 + constant[f"stribeck_rise_{joint}"])
                 times.append(constant[f"coulomb_width_{joint}"] * inertia[joint - 1] / (turned + 1e-12))
         return float(min(times))
+
+    def free_inertias(self) -> tuple[float, float]:
+        """Return the inertia of each joint about its own axis while the other moves freely, arm straight [kg m^2]."""
+        constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))
+        shared = constant["inertia_2"] ** 2 / (constant["inertia_2"] + constant["armature_2"])
+        return constant["inertia_1"] + constant["inertia_2"] - shared, constant["inertia_2"] + constant["armature_2"]

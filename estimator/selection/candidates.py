@@ -25,11 +25,13 @@ from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.identify import Estimate
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
-from hil.estimator.models.terms import FRICTIONS, OPTIONS, term_of
+from hil.estimator.models.terms import FRICTIONS, OPTIONS, Option, term_of
 from hil.estimator.options import IntegrationOptions
 
 MAX_LAG_SHARE = 0.05  # fraction of the samples over which a residual's autocorrelation is summed
 INTEGRATION = IntegrationOptions()
+SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
+"""Terms that vanish smoothly, so that including them costs a fit little."""
 
 
 @dataclass(frozen=True)

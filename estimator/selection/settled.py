@@ -13,26 +13,22 @@ from itertools import islice
 from types import MappingProxyType
 
 import numpy as np
-from scipy.stats import chi2
 
-from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.ripple import WAVES
-from hil.estimator.identify import Estimate
 from hil.estimator.models.model import Model
-from hil.estimator.models.terms import FRICTIONS, Drive, Option, kind_of, term_of
+from hil.estimator.models.terms import FRICTIONS, Drive, Option
 from hil.estimator.options import SelectionOptions
-from hil.estimator.selection.candidates import Candidate, candidates, colour
+from hil.estimator.selection.candidates import SMOOTH, Candidate, candidates, colour
 from hil.estimator.selection.drift import Drift, friction_change
+from hil.estimator.selection.pruning import removable_parts, without_nothings
 from hil.estimator.selection.restarts import bristles, restarts, undisguised
 from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.trial import Choice, Fitting, Trial
-from hil.estimator.selection.waves import wave_cycles
+from hil.estimator.selection.waves import ranked_cycles, wave_peaks
 
 DEFAULTS = SelectionOptions()
-SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
-"""Terms that vanish smoothly, so that including them costs a fit little."""
 
 
 def choose(
@@ -156,7 +152,7 @@ class Selection:
             best = self._better(self._try_or_none(smooth.having("presliding"), coarse=True), best) or best
         for near in self._closest():
             if not self._is_explained(best):
-                best = self._better(self._with_wave(near), best) or best
+                best = self._better(self._with_wave(near, plain), best) or best
         if set(WAVES) & set(best.model.options) and not self._is_explained(best):
             best = self._with_wave(best)
         best = self._steadied(best) or best
@@ -241,17 +237,51 @@ class Selection:
         assert trial.estimate is not None
         return [each for each in candidates(self._periods[0], trial.estimate, {}) if each.evidence > 1.0]
 
-    def _with_wave(self, best: Trial) -> Trial:
-        """Add ripple or cogging, whichever explains more, if the score test finds it."""
+    def _with_wave(self, best: Trial, plain: Trial | None = None) -> Trial:
+        """Add ripple or cogging, whichever explains more, if the score test finds it.
+
+        The score test needs the model that explains most, `best`. A fit from there may end far from the truth: until
+        then, cables, saturation and load have imitated the wave, and only together do they explain about as much. So
+        the wave is first added to `plain`, which has few terms that could, and the others to the result.
+        """
         assert best.estimate is not None
         absent = [wave for wave in WAVES if wave not in best.model.options]
         if not absent:
             return best
-        known = wave_cycles(self._periods[0], best.estimate, self._options.wave_cycles, absent)
-        for each in candidates(self._periods[0], best.estimate, known):
-            if each.part in absent and each.evidence > self._options.wave_evidence:
-                return self._better(self._try_or_none(each.model, best, each.values, coarse=True), best) or best
-        return best
+        peaks = wave_peaks(self._periods[0], best.estimate, self._options.wave_cycles, absent)
+        found = best
+        for rank, known in enumerate(ranked_cycles(peaks, self._options.max_wave_peaks)):
+            seen = candidates(self._periods[0], best.estimate, known)
+            least = 1.0 if rank else self._options.wave_evidence
+            wave = next((each for each in seen if each.part in absent and each.evidence > least), None)
+            if wave is None:
+                continue
+            simple = self._waving(plain, wave)
+            if simple is not None and self._is_explained(simple) and not self._seen(simple):
+                return simple
+            near, values = (best, wave.values) if simple is None else (simple, {})
+            found = self._better(simple, found) or found
+            found = self._better(self._try_or_none(wave.model, near, values, coarse=True), found) or found
+            if self._is_nearly_explained(found):
+                break
+        return found
+
+    def _waving(self, plain: Trial | None, wave: Candidate) -> Trial | None:
+        """Return `plain` with the wave, and encoder errors if needed, if these explain nearly everything, else None."""
+        if plain is None or wave.evidence < 1.0:
+            return None
+        named = {name: value if "cycles" in name else 0.0 for name, value in wave.values.items()}
+        waving = plain.model.having(*(each for each in WAVES if each == wave.part))
+        simple = self._try_or_none(waving, plain, named, coarse=True)
+        if simple is not None and self._is_nearly_explained(simple):
+            if not self._is_explained(simple):
+                simple = self._better(self._try_or_none(waving.having("encoder"), simple, coarse=True), simple)
+        else:
+            simple = self._try_or_none(waving.having("encoder"), plain, named, coarse=True)
+        return simple if simple is not None and self._is_nearly_explained(simple) else None
+
+    def _is_nearly_explained(self, trial: Trial) -> bool:
+        return self._left(trial) < self._options.presliding_residual**2
 
     def _converged(self, trial: Trial) -> Trial:
         """Return a fit with full precision: during model comparison, fits that leave much unexplained stop early."""
@@ -285,8 +315,10 @@ class Selection:
         assert best.estimate is not None
         if self._left(best) > self._options.presliding_residual**2:
             return best  # effects of missing terms would be attributed to present ones
+        if not np.isfinite(best.estimate.std).any():
+            return self._pruned_by_fits(best)
         for level in self._options.prune_levels:
-            plainest = _without_nothings(best.estimate, level, self._fixed)
+            plainest = without_nothings(best.estimate, level, self._fixed)
             if plainest != best.model:
                 self._begin(plainest, best)
         for level in self._options.prune_levels:
@@ -298,11 +330,19 @@ class Selection:
     def _pruned_at(self, level: float, best: Trial) -> Trial:
         """Prune and refit until no more terms are insignificant; with fewer terms, the others become more certain."""
         while best.estimate is not None:
-            plainer = _without_nothings(best.estimate, level, self._fixed)
+            plainer = without_nothings(best.estimate, level, self._fixed)
             trial = None if plainer == best.model else self._try_or_none(plainer, best)
             if trial is None:
                 break
             best = trial
+        return best
+
+    def _pruned_by_fits(self, best: Trial) -> Trial:
+        """Remove terms one by one, each judged by a fit without it: for a motion too sensitive for standard errors."""
+        for part, plainer in removable_parts(best.model):
+            trial = None if part == self._fixed else self._try_or_none(plainer, best)
+            if trial is not None and self._gain(best, trial) < self._worth(best, trial):
+                return self._pruned_by_fits(trial)
         return best
 
     def judged(self, chosen: Trial) -> Trial:
@@ -358,57 +398,3 @@ class Selection:
         trial = self._fitting.trial(model, near, values, coarse) if begun is None else begun.result()
         self.trials.append(trial)
         return trial
-
-
-def _without_nothings(estimate: Estimate, level: float, fixed: Option | None) -> Model:
-    """Return the model without parts that do not differ significantly from zero, the least significant removed first.
-
-    Significance is judged by A. Wald's test (Trans. AMS 54 (1943) 426): the squared distance from zero in standard
-    errors, compared with chi^2 at `level`. The remaining parameters are updated with the linearised model.
-    """
-    return pruned_model(estimate.model, estimate.names, estimate.value, estimate.covariance, level, fixed)
-
-
-def pruned_model(
-    model: Model, names: Sequence[str], value: Array, covariance: Array, level: float, fixed: Option | None
-) -> Model:
-    """Return `model` without the parts that do not differ significantly from zero at `level`; `fixed` is kept.
-
-    value, covariance: parameters (parameters,) and their covariance, in the order of `names`.
-    """
-    names, value, covariance = list(names), value.copy(), covariance.copy()
-    covariance[~np.isfinite(covariance)] = 0.0
-    while True:
-        doubtful = []
-        for part, plainer in _parts(model):
-            at = [names.index(name) for name in _tested(model, plainer)]
-            away = value[at] - np.array([term_of(names[i]).absent for i in at])
-            own = np.linalg.pinv(covariance[np.ix_(at, at)], rcond=1e-12, hermitian=True)
-            doubtful.append((float(away @ own @ away) / float(chi2.isf(level, len(at))), part, plainer, at, own, away))
-        doubtful = [each for each in doubtful if each[0] < 1.0 and each[1] != fixed]
-        if not doubtful:
-            return model
-        _, _, model, at, own, away = min(doubtful, key=lambda each: each[0])
-        follow = covariance[:, at] @ own
-        value = value - follow @ away
-        covariance = covariance - follow @ covariance[at]
-
-
-def _parts(model: Model) -> list[tuple[str, Model]]:
-    """Return the removable parts of a model, each with the reduced model; presliding has no significance test."""
-    parts: list[tuple[str, Model]] = [
-        (option, model.without(option)) for option in sorted(model.options) if option != "presliding"
-    ]
-    law = FRICTIONS.index(model.friction)
-    if law:
-        parts.append((model.friction, replace(model, friction=FRICTIONS[law - 1])))
-    return parts
-
-
-def _tested(model: Model, plainer: Model) -> list[str]:
-    """Return the tested parameters of the part that `plainer` lacks.
-
-    Parameters that only have an effect together with others, such as a wave's period, are not tested.
-    """
-    lacking = [name for name in model.names if name not in plainer.names]
-    return [name for name in lacking if kind_of(name) not in ("ripple_cycles", "cogging_cycles", "stribeck_velocity")]

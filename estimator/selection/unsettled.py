@@ -23,8 +23,8 @@ from hil.estimator.fit.multiple_shooting import ALL, ShootingEstimate, estimate_
 from hil.estimator.models.model import Model
 from hil.estimator.models.terms import FRICTIONS, Drive, Option
 from hil.estimator.options import SelectionOptions, ShootingOptions
+from hil.estimator.selection.pruning import pruned_model
 from hil.estimator.selection.segments import held_out_errors, missing_terms
-from hil.estimator.selection.settled import pruned_model
 
 DEFAULTS = SelectionOptions()
 FITTED, PREDICTED = slice(0, None, 2), slice(1, None, 2)

@@ -1,9 +1,10 @@
 """Periods of torque ripple and cogging: score tests of one number of cycles per turn after the other."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.fit.ripple import WAVES, Wave
 from hil.estimator.identify import Estimate
@@ -12,6 +13,8 @@ from hil.estimator.options import IntegrationOptions
 from hil.estimator.selection.candidates import columns_of, simulated_run
 
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
+COMPARABLE = 0.3
+"""Decrease of the sum of squares, relative to the best number's, at which another number of cycles is worth a fit."""
 
 
 def wave_cycles(
@@ -23,8 +26,23 @@ def wave_cycles(
 ) -> dict[str, float]:
     """Return the numbers of `cycles` per turn for which each wave of each joint would explain most of the residual.
 
+    The result is by parameter name. The arguments are those of `wave_peaks`.
+    """
+    return {name: peaks[0] for name, peaks in wave_peaks(period, estimate, cycles, waves, only).items()}
+
+
+def wave_peaks(
+    period: SettledPeriod,
+    estimate: Estimate,
+    cycles: Sequence[float],
+    waves: Sequence[Wave] = WAVES,
+    only: Sequence[int] = (),
+) -> dict[str, tuple[float, ...]]:
+    """Return the numbers of `cycles` per turn at which a wave explains more than at neighbouring ones, the best first.
+
     What the fitted parameters explain is removed first. The result is by parameter name. Waves that the estimate's
-    model includes are left out where they are sought.
+    model includes are left out where they are sought. While other terms have absorbed part of a wave, the best number
+    may be a wrong one: those that explain at least `COMPARABLE` of what it does are returned as well.
 
     only: joints, from 1, that are considered; by default all.
     """
@@ -39,7 +57,7 @@ def wave_cycles(
     Q = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
     residual = (weight * (run.measured - position)).reshape(-1)
     rest = residual - Q @ (Q.T @ residual)
-    best: dict[str, tuple[float, float]] = {}
+    falls: dict[str, list[float]] = {f"{wave}_cycles_{joint}": [] for wave, joint in places}
     names = tuple(f"{wave}_{part}_{joint}" for wave, joint in places for part in ("sin", "cos"))
     for each in cycles:
         given = {f"{wave}_cycles_{joint}": each for wave, joint in places}
@@ -47,6 +65,23 @@ def wave_cycles(
         found = found[:, : len(names)] - Q @ (Q.T @ found[:, : len(names)])
         for place, name in enumerate(given):
             own = found[:, 2 * place : 2 * place + 2]
-            fall = float(np.sum((np.linalg.qr(own)[0].T @ rest) ** 2))
-            best[name] = max(best.get(name, (-1.0, 0.0)), (fall, each))
-    return {name: most[1] for name, most in best.items()}
+            falls[name].append(float(np.sum((np.linalg.qr(own)[0].T @ rest) ** 2)))
+    return {name: _peaks(cycles, np.nan_to_num(fall)) for name, fall in falls.items()}
+
+
+def ranked_cycles(peaks: Mapping[str, Sequence[float]], most: int) -> list[dict[str, float]]:
+    """Return at most `most` choices of cycles from the result of `wave_peaks`, by parameter name, the best first.
+
+    Later choices take the next number of every wave that has one.
+    """
+    ranks = min(most, max(map(len, peaks.values()), default=0))
+    return [{name: each[min(rank, len(each) - 1)] for name, each in peaks.items()} for rank in range(ranks)]
+
+
+def _peaks(cycles: Sequence[float], falls: Array) -> tuple[float, ...]:
+    """Return those `cycles` whose decrease of the sum of squares is a local maximum, the largest first."""
+    order = np.argsort(cycles)
+    padded = np.concatenate(([-1.0], falls[order], [-1.0]))
+    is_peak = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
+    found = sorted(((float(falls[i]), float(cycles[i])) for i in order[is_peak]), reverse=True)
+    return tuple(number for fall, number in found if fall >= COMPARABLE * found[0][0])

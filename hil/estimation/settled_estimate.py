@@ -21,10 +21,11 @@ from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.supply import supply_notes, supply_sag
 from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
-from hil.estimator.identify import Estimate, identify
+from hil.estimator.identify import Estimate
 from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import candidates, considered
 from hil.estimator.selection.drift import Drift, drifting, friction_change
+from hil.estimator.selection.given import fit_given
 from hil.estimator.selection.other_period import predict_period
 from hil.estimator.selection.settled import choose
 from hil.estimator.selection.steadied import steadied
@@ -170,4 +171,4 @@ def _estimate(
             executor=executor,
         )
         return choice.estimate, choice
-    return identify(period, wanted_model(wanted, len(config.joints), by_voltage, lever), starts=starts), None
+    return fit_given(period, wanted_model(wanted, len(config.joints), by_voltage, lever), starts), None

@@ -1,0 +1,91 @@
+"""Fit of a model whose terms are given, with the periods of its ripple and cogging searched twice.
+
+The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period as long as it explains the rest of
+the motion. Encoder errors, cables and narrow Stribeck friction are not linear in its lines, and if they matter, the
+search may end at a wrong period, from which no fit returns. The second search starts from a fit of all other terms.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hil.estimator.data.settled_period import SettledPeriod, without_spikes
+from hil.estimator.errors import ConvergenceError
+from hil.estimator.fit.ripple import WAVES, Wave
+from hil.estimator.fit.stage2 import Near
+from hil.estimator.identify import Estimate, identify
+from hil.estimator.models.model import Model
+from hil.estimator.models.terms import FRICTIONS
+from hil.estimator.options import SelectionOptions
+from hil.estimator.selection.candidates import SMOOTH
+from hil.estimator.selection.waves import ranked_cycles, wave_peaks
+
+DEFAULTS = SelectionOptions()
+
+
+def fit_given(
+    period: SettledPeriod,
+    model: Model,
+    starts: Sequence[Mapping[str, float]] = (),
+    options: SelectionOptions = DEFAULTS,
+) -> Estimate:
+    """Return the best fit of `model` to `period`.
+
+    starts: additional initial guesses as in `hil.estimator.identify.identify`.
+    Raises the errors of `identify`.
+    """
+    waves = [wave for wave in WAVES if wave in model.options]
+    try:
+        best = identify(period, model, starts=starts)
+    except ConvergenceError:
+        if not waves:
+            raise
+        best = None
+    if best is not None and (not waves or _left(period, best) < options.presliding_residual):
+        return best
+    found = identify(period, model.without(*waves), starts=starts, coarse=True)
+    for wave in waves:
+        found = _with_wave(period, found, wave, starts, options)
+    if best is not None and not _left(period, found) < _left(period, best):
+        return best
+    return identify(period, model, near=Near(found.parameters, found.start))
+
+
+def _with_wave(
+    period: SettledPeriod,
+    estimate: Estimate,
+    wave: Wave,
+    starts: Sequence[Mapping[str, float]],
+    options: SelectionOptions,
+) -> Estimate:
+    """Return the best fit of the estimate's model with a wave, from its most likely numbers of cycles.
+
+    A wave is seen best where other terms explain most, even if they only imitate it; they are fitted for that alone.
+    """
+    model = estimate.model.having(wave)
+    rich = replace(estimate.model, friction=FRICTIONS[-1]).having("zeros", *SMOOTH)
+    about = identify(period, rich, starts=starts, coarse=True)
+    peaks = wave_peaks(without_spikes(period), about, options.wave_cycles, (wave,))
+    fits: list[Estimate] = []
+    for known in ranked_cycles(peaks, options.max_wave_peaks):
+        near = Near({**estimate.parameters, **_still(wave, model.joints), **known}, estimate.start)
+        try:
+            fits.append(identify(period, model, near=near, coarse=True))
+        except ConvergenceError:
+            continue
+        if _left(period, fits[-1]) < options.presliding_residual:
+            break
+    if not fits:
+        raise ConvergenceError(f"no period of the {wave} leads to a minimum: try a simpler model")
+    return min(fits, key=lambda each: _left(period, each))
+
+
+def _still(wave: Wave, joints: int) -> dict[str, float]:
+    """Return the parameters, by name, of a wave of no height."""
+    return {f"{wave}_{part}_{joint}": 0.0 for part in ("sin", "cos") for joint in range(1, joints + 1)}
+
+
+def _left(period: SettledPeriod, estimate: Estimate) -> float:
+    """Return the RMS of the residual in units of the noise."""
+    return float(np.sqrt(np.nanmean((estimate.residual / period.noise[:, None]) ** 2)))
