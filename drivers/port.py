@@ -42,7 +42,7 @@ def open_port(url: str, baud: int) -> "Port":
         opened = serial.serial_for_url(url, baudrate=baud, timeout=0, exclusive=True)
     except (OSError, termios.error, ValueError) as error:
         kind = NotPermitted if "Permission denied" in str(error) else PortNotOpened
-        raise kind(f"Cannot open port {url!r}: {_why(error, baud)}. {_advice(error)}".rstrip()) from error
+        raise kind(f"Cannot open port {url!r}: {_why(error, baud)}. {_advice(error, url)}".rstrip()) from error
     return (DescriptorPort if type(opened) is serial.Serial else Port)(url, baud, opened)
 
 
@@ -271,12 +271,14 @@ def _why(error: BaseException, baud: int | None = None) -> str:
     return f"{text.rstrip('.') or type(error).__name__}{at}"
 
 
-def _advice(error: BaseException) -> str:
+def _advice(error: BaseException, url: str) -> str:
     text = str(error)
     if "Permission denied" in text:
         return "Add yourself to the port's group (`sudo usermod -aG dialout $USER`), then log out and in again."
     if "exclusively lock" in text:
         return "Another program has it open; close that program first."
+    if "No such file" in text and "://" in url:
+        return "The file in this URL does not exist; a relative path starts at the file or folder that names it."
     if "No such file" in text:
         return "Is the adapter plugged in? `hil scan` lists the ports that exist."
     if "ioctl" in text:

@@ -21,7 +21,7 @@ from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
 from hil.fakes.servo.servo import EmulatedServo
-from hil.toml_errors import Described, describe
+from hil.toml_errors import Described, describe, meant_name
 
 __all__ = ["DescriptionError", "FakeArm", "FakeServo", "beside", "found_beside", "load_fake", "make_bus"]
 
@@ -70,6 +70,8 @@ class FakeServo(Described):
     @classmethod
     def _known_model(cls, model: str) -> str:
         if model not in all_model_names():
+            if near := meant_name(model, all_model_names()):
+                raise ValueError(f"did you mean {near}?")
             others = ", ".join(all_model_names()[len(MODEL_NAMES) :])
             raise ValueError(f"known models: {', '.join(MODEL_NAMES)}; by addresses and sizes only: {others}")
         return model

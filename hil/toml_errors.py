@@ -1,6 +1,7 @@
 """Error messages for TOML files, and for the same tables written in Python: key, value, and what is allowed."""
 
 import difflib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_origin
@@ -57,10 +58,16 @@ class Described(_Table):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
-def describe(error: ValidationError, path: Path | str, root: type[BaseModel], table: str = "") -> str:
-    """All errors of one file, one per line; table: location of the checked model in the file, "" for the whole file."""
+def describe(
+    error: ValidationError, path: Path | str, root: type[BaseModel], table: str = "", joints: int | None = None
+) -> str:
+    """All errors of one file, one per line.
+
+    table: location of the checked model in the file, "" for the whole file. joints: number of joints in the file, if it
+    describes an arm.
+    """
     details = _without_consequences(_joined_alternatives(error.errors(include_url=False)))
-    faults = [_fault(detail, root, table) for detail in details]
+    faults = [_fault(detail, root, table) + _as_list(detail, joints) for detail in details]
     if len(faults) == 1:
         return f"{path}: {faults[0]}" + ("" if faults[0].endswith("?") else ".")
     lines = "".join(f"\n  {fault}" for fault in faults)
@@ -109,6 +116,14 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
     return f"{key} = {_shown(detail['input'])}: {message}{_unit_hint(detail, root)}"
 
 
+def _as_list(detail: Any, joints: int | None) -> str:
+    """For a number in place of a list with one entry per joint: what to write."""
+    value = detail["input"]
+    if joints is None or detail["type"] != "list_type" or isinstance(value, bool) or not isinstance(value, int | float):
+        return ""
+    return f", with one entry for each joint: [{', '.join([str(value)] * joints)}]"
+
+
 def _unit_hint(detail: Any, root: type[BaseModel]) -> str:
     """Name the unit in which a number beyond its bounds would make sense, and what to write."""
     value = detail["input"]
@@ -136,9 +151,11 @@ def _constraint(kind: str, context: dict[str, Any], value: object) -> str | None
             return f"must be a multiple of {context['multiple_of']}"
         case "enum":
             known = context["expected"].replace(" or ", ", ")
-            near = difflib.get_close_matches(repr(value), known.split(", "), n=1)
-            return f"did you mean {near[0]}? Known: {known}" if near else f"must be one of {known}"
+            near = _meant(value, known)
+            return f"did you mean {near}?" if near else f"must be one of {known}"
         case "literal_error":
+            if near := _meant(value, context["expected"]):
+                return f"did you mean {near}?"
             return f"must be one of {context['expected']}{_in_thousands(context['expected'], value)}"
         case "string_too_short":
             return "must not be empty"
@@ -149,6 +166,17 @@ def _constraint(kind: str, context: dict[str, Any], value: object) -> str | None
         case "too_long":
             return f"may have at most {context['max_length']} entries"
     return None
+
+
+def _meant(value: object, expected: str) -> str:
+    return meant_name(value, re.findall(r"'([^']*)'", expected)) if isinstance(value, str) else ""
+
+
+def meant_name(given: str, names: Sequence[str]) -> str:
+    """The name that is meant: the same but for case, spaces and dashes, or the most similar one; "" if none is."""
+    plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
+    near = difflib.get_close_matches(re.sub(r"[^a-z0-9]", "", given.lower()), list(plain), n=1, cutoff=0.75)
+    return plain[near[0]] if near else ""
 
 
 def _in_thousands(expected: str, value: object) -> str:
@@ -162,13 +190,39 @@ def _in_thousands(expected: str, value: object) -> str:
     return ""
 
 
-def not_toml(path: Path, error: Exception) -> str:
-    """What to say of a file that the TOML parser rejects."""
+def not_toml(path: Path, error: Exception, text: str) -> str:
+    """What to say of a file with this text that the TOML parser rejects: the line, and the likely cause."""
     other = {".yaml": "YAML", ".yml": "YAML", ".json": "JSON", ".xml": "XML", ".urdf": "XML", ".csv": "CSV"}
     kind = other.get(path.suffix.lower())
-    if kind is None:
+    if kind is not None:
+        return f"{path}: it is {kind}, by its name; hil's files are TOML. `hil init` writes one."
+    lines = text.splitlines()
+    place = re.search(r"at line (\d+)", str(error))
+    number = int(place[1]) if place else 0
+    if not 0 < number <= len(lines):
         return f"{path}: not valid TOML: {error}."
-    return f"{path}: it is {kind}, by its name; hil's files are TOML. `hil init` writes one."
+    line = lines[number - 1].strip()
+    cause = next((said for pattern, said in _SYNTAX if re.search(pattern, _unquoted(line))), "")
+    return f"{path}: not valid TOML: {error}:\n  {line}" + (f"\n{cause}" if cause else "")
+
+
+_NUMBER = r"[-+]?\d[\d_.]*(?:[eE][-+]?\d+)?"
+_SYNTAX = (
+    (rf"{_NUMBER}\s*(?:°|º|deg)", "Angles are numbers in rad, without a sign or unit: 90 degrees are 1.5708."),
+    (rf"=\s*{_NUMBER.replace('.', '', 1)},\d+\s*$", "The decimal sign is a point, not a comma: 4.0, not 4,0."),
+    (r"[=\[,]\s*(?:True|False|TRUE|FALSE)\b", "Write true or false in lower case."),
+    (r"[=\[,]\s*(?:yes|no|on|off|None|null|nil)\b", "Write true or false; leave out a key that has no value."),
+    (rf"[=\[,]\s*{_NUMBER}\s*[%A-Za-zµμΩ]", "Write the number without its unit; each key has one fixed unit."),
+    (r"=\s*[A-Za-z/]", "Text needs quotes."),
+    (r"=\s*$", "The value is missing."),
+    (r"^\w[\w.-]*\s*:", "Write = between key and value, not a colon."),
+    (r"[“”‘’„]", "Use straight quotes."),
+)
+"""Patterns of a rejected line without its comment and quoted texts, and the likely cause of each."""
+
+
+def _unquoted(line: str) -> str:
+    return re.sub(r"\"[^\"]*\"|'[^']*'", '""', line).partition("#")[0].strip()
 
 
 def _bound(value: float) -> str:

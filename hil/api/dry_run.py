@@ -17,6 +17,7 @@ from hil.dry_run.run import dry_run as simulate
 from hil.dry_run.summary import DryRun, dry_run_json
 from hil.errors import ConfigError
 from hil.pilot.chain_rehearsal import rehearse
+from hil.pilot.rehearsal import rehearse_in_steps
 from hil.results.display import html_table
 
 __all__ = ["Rehearsal", "dry_run"]
@@ -45,17 +46,16 @@ class Rehearsal:
 
     @property
     def largest_peak_torque(self) -> tuple[float, ...]:
-        """The largest safe peak torque of each joint [N m]."""
+        """The largest safe peak torque of each joint [N m]; empty if only the pilot can find one."""
         if isinstance(self.found, ChainDryRun):
             return self.found.peak_torque
-        return tuple(float(value) for value in self.found.largest.peak_torque)
+        largest = self.found.largest
+        return () if largest is None else tuple(float(value) for value in largest.peak_torque)
 
     @property
     def prediction(self) -> Prediction:
-        """The prediction for the configured torque; without one, for the largest safe torque."""
-        if isinstance(self.found, ChainDryRun):
-            return self.found.prediction
-        return self.found.largest.prediction if self.found.asked is None else self.found.asked
+        """The prediction for the configured torque, else for the largest safe one, else for the pilot's first run."""
+        return self.found.prediction if isinstance(self.found, ChainDryRun) else self.found.shown
 
     def to_json(self) -> dict[str, Any]:
         """The object that `hil dry-run --json` prints."""
@@ -71,10 +71,13 @@ class Rehearsal:
 
     def __repr__(self) -> str:
         torque = ", ".join(f"{value:.2f}" for value in self.largest_peak_torque)
+        largest = (
+            f"largest safe peak_torque = [{torque}] N m" if torque else "the pilot will find the largest safe torque"
+        )
         return (
             f"Dry run of {self.file} on {self.found.arms} arms drawn from the {self.found.source}: "
             f"{'safe' if self.is_safe else 'NOT SAFE'}, chance of a guard stop {100 * self.stop_chance:.2g} %; "
-            f"largest safe peak_torque = [{torque}] N m"
+            f"{largest}"
         )
 
     def _repr_html_(self) -> str:
@@ -132,4 +135,5 @@ def dry_run(
                 on_progress(Progress("simulation", f"Simulated {done} of {of} motions"))
 
         return Rehearsal(shown, checked, rehearse(checked, arms, servos, tell))
-    return Rehearsal(shown, checked, simulate(checked, former, arms, servos, executor))
+    rehearsed = rehearse_in_steps if checked.experiment.pilot else simulate
+    return Rehearsal(shown, checked, rehearsed(checked, former, arms, servos, executor))

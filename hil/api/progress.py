@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from hil.errors import StopRequested
 from hil.experiment.stream import Progress as StreamProgress
 
 __all__ = ["OnProgress", "Progress", "Stage"]
@@ -38,7 +39,10 @@ OnProgress = Callable[[Progress], None]
 
 
 def forgiving(listener: OnProgress) -> OnProgress:
-    """Wrap a callback so that its first exception is logged and it is not called again."""
+    """Wrap a callback so that its first exception is logged and it is not called again.
+
+    A signal that arrives while the callback runs is no failure of it: the stop passes through.
+    """
     failed = False
 
     def tell(progress: Progress) -> None:
@@ -47,6 +51,8 @@ def forgiving(listener: OnProgress) -> OnProgress:
             return
         try:
             listener(progress)
+        except StopRequested:
+            raise
         except Exception:
             failed = True
             log.exception("on_progress raised an exception; it will not be called again")

@@ -75,6 +75,7 @@ def record(
     from hil.api.experiment import record as record_arm
     from hil.next_step import next_step
     from hil.results.json_form import to_json
+    from hil.runs.timing import lost_samples
 
     with _watching(config, live, json_only) as follow:
         run = record_arm(config, out=out, take_over=take_over, on_progress=follow)
@@ -82,7 +83,10 @@ def record(
         recorded = {"run": str(run.path), "samples": len(run.samples), "timing": to_json(run.timing)}
         print(strict_json.dumps(recorded))
         return
-    print(f"Run folder: {run.path}, {len(run.samples)} samples.\n{next_step('estimate', run.path)}")
+    print(f"Run folder: {run.path}, {len(run.samples)} samples.")
+    if lost := lost_samples(run.samples, [joint.name for joint in run.config.joints]):
+        print(lost)
+    print(next_step("estimate", run.path))
 
 
 @contextmanager

@@ -19,6 +19,7 @@ def init(
 ) -> None:
     """Scan the bus, ask for the rest, and write a commented TOML file. Torque stays off and no setting is changed."""
     from hil.cli.terminal import Terminal
+    from hil.config.fake_url import url_for
     from hil.config.schema import parse_config, port_url
     from hil.drivers.port import open_port
     from hil.drivers.servo_model import BAUD_RATES
@@ -41,7 +42,7 @@ def init(
     try:
         with terminal.scanning() as watch:
             heard = list(scan(opened, bauds, watch))
-        answers = interview(opened, url, heard, _default if yes else _prompt, _say)
+        answers = interview(opened, url_for(url, out), heard, _default if yes else _prompt, _say)
     finally:
         opened.close()
     parse_config(arm_toml(answers), out)  # raises if the file would not be valid

@@ -123,7 +123,7 @@ def _print_difference(difference: "Difference") -> None:
     for lacking, names in (("after", difference.only_before), ("before", difference.only_after)):
         if names:
             say(console, f"Not in the model {lacking}: {', '.join(names)}.")
-    for line in _would_show(difference.detectable):
+    for line in (*difference.doubts, *_would_show(difference.detectable)):
         say(console, line)
     found = ", ".join(change.name for change in difference.changed)
     say(console, f"Significant changes: {found}." if found else "No significant changes.")

@@ -25,6 +25,7 @@ from hil.config.bundled import bundled_configs, find_config, meant
 from hil.config.chain import MOST_JOINTS, chain_slips, describes_planar
 from hil.config.clearance import ClearanceConfig
 from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
+from hil.config.fake_url import FAKE_URL, url_from
 from hil.config.joint import JointConfig
 from hil.config.known_quantities import KnownConfig
 from hil.config.plausible import implausible
@@ -50,7 +51,6 @@ __all__ = [
     "port_url",
 ]
 
-FAKE_URL = "fake://"
 LYING_RAD = 0.25
 """Largest deviation from the rest pose at the start of a spatial arm, unless arm.rest_tolerance is given [rad]."""
 
@@ -269,8 +269,8 @@ class Config(Table):
 
     @property
     def url(self) -> str:
-        """The port's URL; "fake://" is completed with the path of the file that describes the fake arm."""
-        return f"{FAKE_URL}{self.path.resolve()}" if self.port.url == FAKE_URL else self.port.url
+        """The port's URL; that of a fake arm is completed with the path of the file that describes it."""
+        return url_from(self.port.url, self.path)
 
     @property
     def bus(self) -> BusConfig:
@@ -312,7 +312,7 @@ def parse_config(text: str, path: Path) -> Config:
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(not_toml(path, error)) from error
+        raise ConfigError(not_toml(path, error, text)) from error
     if "path" in values:
         raise ConfigError(f"{path}: path is not a known key.")
     if "joints" not in values and "study" in values:
@@ -330,7 +330,9 @@ def parse_config(text: str, path: Path) -> Config:
     try:
         return Config(path=path, **values)
     except ValidationError as error:
-        raise ConfigError(describe(error, path, Config)) from error
+        joints = values.get("joints")
+        count = len(joints) if isinstance(joints, list) else None
+        raise ConfigError(describe(error, path, Config, joints=count)) from error
 
 
 def _same_length(key: str, values: list[float] | list[list[int]], count: int) -> None:

@@ -17,23 +17,54 @@ from hil.printing import print_fitting, say
 
 
 @dataclass(frozen=True)
+class FirstRun:
+    """The first run of a pilot.
+
+    peak_torque: (joints,) [N m]. prediction: peaks of the simulated arms, with the limits of that run. played: its
+    configuration, with a proposed stabiliser where the arm needs one, and with position limits close to the rest pose
+    where no torque is safe in the whole range.
+    """
+
+    peak_torque: NDArray[np.float64]
+    prediction: Prediction
+    played: Config
+
+    def is_narrowed(self, config: Config) -> bool:
+        """Whether the position limits of this run are closer than those of `config`."""
+        pairs = zip(self.played.joints, config.joints, strict=True)
+        return any(tuple(mine.position_limit) != tuple(whole.position_limit) for mine, whole in pairs)
+
+
+@dataclass(frozen=True)
 class DryRun:
     """The outcome of a dry run.
 
     source: "prior" or "result". arms: number of simulated arms. asked: prediction for the configured
-    experiment.peak_torque, None if not configured. largest: the largest safe torque with its prediction. servos:
-    messages from reading the servos.
+    experiment.peak_torque, None if not configured. largest: the largest safe torque with its prediction; None if no
+    torque is safe for all arms, so that only a pilot can find it. servos: messages from reading the servos. first: the
+    first run of the pilot, None if the torque is configured.
     """
 
     source: str
     arms: int
     asked: Prediction | None
-    largest: Amplitude
+    largest: Amplitude | None
     stopping: Stopping
     servos: tuple[str, ...]
+    first: FirstRun | None = None
+
+    @property
+    def shown(self) -> Prediction:
+        """The prediction for the configured torque, else for the largest safe torque, else for the first run."""
+        if self.asked is not None:
+            return self.asked
+        if self.largest is not None:
+            return self.largest.prediction
+        assert self.first is not None
+        return self.first.prediction
 
     def is_safe(self, config: Config) -> bool:
-        """Whether the configured torque is safe; if none is configured, whether a safe torque exists."""
+        """Whether the configured torque is safe; if none is configured, whether a safe torque or first run exists."""
         return self.asked is None or self.asked.stop_chance <= config.safety.limit_chance
 
 
@@ -46,14 +77,29 @@ def dry_run_json(config: Config, run: DryRun) -> dict[str, Any]:
         "arms": run.arms,
         "safe": run.is_safe(config),
         "limit_chance": config.safety.limit_chance,
-        "largest_peak_torque": [round(float(value), 4) for value in run.largest.peak_torque],
+        "largest_peak_torque": None if run.largest is None else _rounded(run.largest.peak_torque),
         "asked": None if run.asked is None else _prediction_json(config, run.asked),
-        "largest": _prediction_json(config, run.largest.prediction),
+        "largest": None if run.largest is None else _prediction_json(config, run.largest.prediction),
+        "first_run": None if run.first is None else _first_json(run.first),
         "stopping_distance_rad": {
             "planned": _ways_json(run.stopping.planned),
             "passed": _ways_json(run.stopping.passed),
         },
         "servos": list(run.servos),
+    }
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float]:
+    return [round(float(value), 4) for value in values]
+
+
+def _first_json(first: FirstRun) -> dict[str, Any]:
+    held = first.played.stabiliser
+    return {
+        "peak_torque": _rounded(first.peak_torque),
+        "position_limit": [list(joint.position_limit) for joint in first.played.joints],
+        "stabiliser": None if held is None else {"stiffness": list(held.stiffness), "damping": list(held.damping)},
+        **_prediction_json(first.played, first.prediction),
     }
 
 
@@ -63,9 +109,8 @@ def _ways_json(ways: dict[Way, NDArray[np.float64]]) -> dict[str, list[float]]:
 
 def print_dry_run(config: Config, run: DryRun, console: Console) -> None:
     """Print the table and the verdict."""
-    shown = run.largest.prediction if run.asked is None else run.asked
-    print_fitting(console, _table(config, shown, run))
-    for line in (*run.servos, *dry_run_lines(config, shown, run)):
+    print_fitting(console, _table(config, run.shown, run))
+    for line in (*run.servos, *dry_run_lines(config, run.shown, run)):
         say(console, line)
 
 
@@ -125,20 +170,26 @@ def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
 
 def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     """Explain the result in sentences, the verdict last."""
-    torque = ", ".join(f"{value:.2f}" for value in run.largest.peak_torque)
     planned, passed = run.stopping.planned, run.stopping.passed
     stopped = np.maximum(planned[Way.BRAKED], planned[Way.CUT])
     lines = [
-        "99 %: in 99 of 100 arms, all peaks stay within these values.",
+        "99 %: in 99 of 100 arms, all peaks stay within these values. Chance: probability that this one quantity of an "
+        "arm exceeds its limit; at a position or velocity limit the guard stops the arm, current is only clamped.",
         settling_text(config, shown),
         f"If stopped at any moment, they overshoot their limits by up to {_each(config, stopped)}; if the program is "
         f"killed or the cable unplugged, by up to {_each(config, planned[Way.SILENT])}.",
         "If something drives them past a limit at these speeds, they overshoot it by up to "
         f"{_each(config, passed[Way.BRAKED])} when braked and {_each(config, passed[Way.CUT])} when torque is cut. "
         "Keep that much space clear.",
-        f"Largest safe torque: peak_torque = [{torque}] N m.",
+        *(
+            []
+            if run.largest is None
+            else [f"Largest safe torque: peak_torque = [{_list(run.largest.peak_torque)}] N m."]
+        ),
     ]
     allowed = f"safety.limit_chance allows {100 * config.safety.limit_chance:g} %"
+    if run.first is not None:
+        return [*lines, *_first_lines(config, run.first, run.largest)]
     if run.asked is None:
         return [
             *lines,
@@ -146,6 +197,40 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
         ]
     word = "SAFE" if run.is_safe(config) else "NOT SAFE as configured"
     return [*lines, f"{word}: probability of a guard stop: {_percent(shown.stop_chance)}; {allowed}."]
+
+
+def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> list[str]:
+    """What `hil identify` does with pilot = true: stabiliser, first torque, and what may stop it."""
+    lines = []
+    held = first.played.stabiliser
+    if held is not None and config.stabiliser is None:
+        lines.append(
+            "The arm does not return to its rest pose by itself. The pilot proposes a stabiliser, simulated here: "
+            f"stiffness = [{_list(np.array(held.stiffness), 3)}] N m/rad, damping = "
+            f"[{_list(np.array(held.damping), 3)}] N m s/rad."
+        )
+    chance = _percent(first.prediction.stop_chance)
+    starts = f"the first run of the pilot starts with peak_torque = [{_list(first.peak_torque, 3)}] N m"
+    limits = "; ".join(
+        f"{joint.name} {joint.position_limit[0]:.2f} to {joint.position_limit[1]:.2f}" for joint in first.played.joints
+    )
+    closer = f" and with closer position limits ({limits} rad)" if first.is_narrowed(config) else ""
+    if largest is None:
+        return [
+            *lines,
+            "No torque is known yet that is safe for every arm; the pilot will find it.",
+            f"SAFE: {starts}{closer}. The guard stops the arm, braked, in {chance} of the simulated arms; "
+            "the pilot learns from such a stop too.",
+        ]
+    return [
+        *lines,
+        f"SAFE: {starts}{closer}: probability of a guard stop: {chance}. It then raises the torque from run to run.",
+    ]
+
+
+def _list(values: NDArray[np.float64], digits: int = 2) -> str:
+    """Values with this many decimals, small ones with two significant digits."""
+    return ", ".join(f"{value:.{digits}f}" if value > 10.0 ** (1 - digits) else f"{value:.2g}" for value in values)
 
 
 def _percent(chance: float) -> str:

@@ -39,8 +39,13 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
     if first is None or whole - first < experiment.periods:
         wanted = experiment.periods + 1
         raise RecordingCutShort(
-            f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole periods, but not "
-            f"{experiment.periods} settled ones; {wanted * count} samples are required. Record again."
+            f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole periods"
+            + (
+                f": it ended too early. {wanted} periods, {wanted * count} samples, are needed. Record again."
+                if whole < wanted
+                else f", in which the motion did not become periodic to within experiment.settle_within = "
+                f"{experiment.settle_within:g} for {experiment.periods} periods. Record again, for longer."
+            )
         )
     begin, end = first * count, (first + experiment.periods) * count
     # Includes the row before, whose goal is in effect until the first write.

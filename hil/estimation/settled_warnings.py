@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.estimation.position_jumps import jump_warnings
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
@@ -13,7 +14,7 @@ LARGE = 0.5  # of the largest goal; smaller goals say little about clipping
 SHORT = 0.85  # ratio of measured to commanded current below which the current was clipped
 OFTEN = 0.05  # fraction of the samples with large goals
 LEAST_SWING = 30.0  # encoder steps
-LOST = 0.01  # fraction of the samples
+LOST = 0.005  # fraction of the samples
 LATE = 0.25  # of the interval: a write that is later disturbs the motion visibly
 BY_LATENESS = 0.3  # of the lost samples: from this share of late ones on, the computer is the likely cause
 
@@ -21,13 +22,14 @@ BY_LATENESS = 0.3  # of the lost samples: from this share of late ones on, the c
 def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], period: SettledPeriod) -> list[str]:
     """One sentence per warning."""
     found = clipping_warnings(config, samples[samples["phase"] == Phase.PERIODIC])
+    found += jump_warnings(config, facts, samples)
     for index, joint in enumerate(config.joints):
         swing = float(np.nanmax(period.position[index]) - np.nanmin(period.position[index]))
         steps = swing / facts.position_step[index]
         if steps < LEAST_SWING:
             found.append(
-                f"{joint.name} moved by only {steps:.0f} encoder steps: rounding dominates its parameters; raise its "
-                "peak_torque."
+                f"{joint.name} moved by only {steps:.0f} encoder steps: rounding dominates its parameters; "
+                f"{more_torque(config, index)}."
             )
         lost = 1.0 - float(np.mean(period.valid[index]))
         if lost > LOST:
@@ -41,6 +43,16 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
                 f"{joint.name}: {100 * lost:.1f} % of the samples are missing or far from their neighbours; {remedy}"
             )
     return found
+
+
+def more_torque(config: Config, index: int) -> str:
+    """What to change so that a joint gets more torque; a pilot finds the torque itself, within the limits."""
+    if not config.experiment.pilot:
+        return "raise its peak_torque"
+    limit = "voltage_limit" if config.joints[index].drive_mode is Mode.PWM else "current_limit"
+    return (
+        f"the pilot chose the torque within {limit}, position_limit and velocity_limit: raise the one it came close to"
+    )
 
 
 def _late_share(config: Config, samples: NDArray[np.void]) -> float:
@@ -57,11 +69,16 @@ def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
         said
         for index, joint in enumerate(config.joints)
         if joint.drive_mode is Mode.CURRENT and not joint.joint.servo.senses_supply
-        for said in _clipped(joint.name, samples["goal_current"][:, index], samples["current"][:, index])
+        for said in _clipped(
+            joint.name,
+            samples["goal_current"][:, index],
+            samples["current"][:, index],
+            "current_limit" if config.experiment.pilot else "peak_torque",
+        )
     ]
 
 
-def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64]) -> list[str]:
+def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64], lower: str) -> list[str]:
     """Detect a motor that receives less current than commanded, from a sagging supply or its own current limit."""
     # A sample's current answers the goal of the sample before it, and a lagging current loop is not clipping either:
     # the smaller of two successive goals is what the motor has had time to follow.
@@ -77,5 +94,5 @@ def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64]
     return [
         f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
         "high-torque samples: the servo's own current limit or, at speed, the supply voltage clips it; lower "
-        "peak_torque (with pilot = true: current_limit) or raise the supply voltage."
+        f"{lower} or raise the supply voltage."
     ]

@@ -40,8 +40,12 @@ EARLY_MOTION_RAD = 0.05
 FARTHER_OUT_RAD = 0.01
 """How much farther out a joint may move if an earlier run left it beyond its limit [rad]."""
 
-MOST_OUTSIDE_RAD = 0.15
-"""How far beyond its limit a joint may start if an earlier run left it there [rad]."""
+MOST_OUTSIDE_RAD = 0.5
+"""How far beyond its limit a joint may start if an earlier run left it there [rad].
+
+A light arm that was stopped at a limit coasts on by some tenths of a radian, and friction holds it there; an upright
+one that has fallen is farther away.
+"""
 
 LONG_GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
@@ -95,7 +99,9 @@ class Guard:
         ]
         count = len(config.joints)
         self._safety = safety
-        self._safe_torque = how_to_find_torque(config)
+        # A pilot lowers the torque itself after such a stop.
+        lower = "" if config.experiment.pilot else f" Lower experiment.peak_torque. {how_to_find_torque(config)}"
+        self._lower_torque = lower
         self._commands = CommandLimits(config)
         planned = planned or _planned(config)
         self._work = Work(config, planned) if config.stabiliser is None else None
@@ -279,16 +285,15 @@ class Guard:
         self._stop(
             index,
             Cause.POSITION,
-            f"is at {position:.3f} rad, outside its position limit [{low:g}, {high:g}]. Lower experiment.peak_torque. "
-            f"{self._safe_torque}",
+            f"is at {position:.3f} rad, outside its position limit [{low:g}, {high:g}].{self._lower_torque}",
         )
 
     def _too_fast(self, index: int, velocity: float) -> NoReturn:
         self._stop(
             index,
             Cause.VELOCITY,
-            f"moves at {velocity:.2f} rad/s, more than its velocity limit {self._limits[index].velocity:g}. Lower "
-            f"experiment.peak_torque. {self._safe_torque}",
+            f"moves at {velocity:.2f} rad/s, more than its velocity limit {self._limits[index].velocity:g}."
+            f"{self._lower_torque}",
         )
 
     def _not_followed(self, index: int, off: Unfollowed) -> NoReturn:

@@ -1,5 +1,6 @@
 """The export formats by name: the function that writes each, and its default file name."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,7 +68,16 @@ def export(run: Path, name: str, out: Path | None = None, link_length: float | N
     if name not in FORMATS:
         raise ExportError(
             f"{name!r} is not a format of hil export. Possible: {', '.join((*FORMATS, *RECORDING_FORMATS))}."
+            + _each_its_own(name)
         )
     arm = FORMATS[name]
     path = out or run / arm.file_name
     return Written(name, path, arm.write(Source.open(run, link_length), path))
+
+
+def _each_its_own(name: str) -> str:
+    """How to name several formats that were given as a list."""
+    parts = [part for part in re.split(r"[,; ]+", name) if part]
+    if len(parts) < 2 or any(part not in (*FORMATS, *RECORDING_FORMATS) for part in parts):
+        return ""
+    return f" Repeat the option for each: {' '.join(f'--format {part}' for part in parts)}."

@@ -77,6 +77,10 @@ class Search:
         """The configuration, with a stabiliser if the arm is believed to need one."""
         return with_stabiliser(self.config, self.belief, self.springs)
 
+    def first_run(self) -> tuple[Config, Amplitude]:
+        """Configuration and amplitude of the first run; nothing is played. Raises NoSafeTorque."""
+        return self._pilot_amplitude(pilot_config(self.held, self.options), 0)
+
     def find(self) -> tuple[Config, Amplitude]:
         """Find the configuration and the amplitude of the full run.
 

@@ -16,7 +16,7 @@ from hil.report.section import Motion, Section, SpatialMotion, Table
 
 def write_dry_run_page(config: Config, found: DryRun | ChainDryRun, path: Path) -> None:
     """Write the page. Raises RunFolderError, ConfigError, ArmFileError."""
-    shown = found.prediction if isinstance(found, ChainDryRun) else found.asked or found.largest.prediction
+    shown = found.prediction if isinstance(found, ChainDryRun) else found.shown
     is_safe = found.is_safe(config)
     lines = chain_dry_run_lines(found) if isinstance(found, ChainDryRun) else dry_run_lines(config, shown, found)
     title = "The experiment looks safe" if is_safe else "The experiment is not safe"

@@ -1,5 +1,7 @@
 """Timing of the stream, computed from the samples' timestamps."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,6 +9,9 @@ from hil.results.parts import Quantiles, StreamTiming
 
 SERVO_CLOCK_WRAP_S = 32.768
 """The servos' Realtime Tick counts milliseconds from 0 to 32767."""
+
+LOST_SHARE = 0.005
+"""Share of lost samples of a joint from which on the summary of a run names it."""
 
 _FEWEST_READINGS = 5
 _EDGES_US = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5, 1e6)
@@ -36,6 +41,25 @@ def lateness_histogram(samples: NDArray[np.void]) -> dict[str, list[float]]:
     """Histogram of lateness: `counts[i]` writes between `edges_us[i]` and `edges_us[i + 1]`; the last bin is open."""
     counts, _ = np.histogram(_lateness_us(_sent(samples)), [*_EDGES_US, np.inf])
     return {"edges_us": list(_EDGES_US), "counts": counts.tolist()}
+
+
+def lost_samples(samples: NDArray[np.void], names: Sequence[str]) -> str:
+    """One sentence on the share of samples without a reply, by joint; "" if it is at most LOST_SHARE for each."""
+    if not len(samples):
+        return ""
+    sent = samples["time_after_read"] > samples["time_before_write"]
+    shares = np.mean(samples["missing"] | ~sent[:, None], axis=0)
+    if float(shares.max()) <= LOST_SHARE:
+        return ""
+    left_out = float(np.mean(~sent))
+    listed = ", ".join(f"{100 * share:.1f} % of {name}" for name, share in zip(names, shares.tolist(), strict=True))
+    late = (
+        f" For {100 * left_out:.1f} %, this computer was too late: close other programs, or lower experiment.rate."
+        if left_out > LOST_SHARE
+        else ""
+    )
+    cable = "" if left_out > 0.5 * shares.max() else " Check the cable, its connectors and the baud rate."
+    return f"Samples lost: {listed}.{late}{cable}"
 
 
 def _sent(samples: NDArray[np.void]) -> NDArray[np.void]:

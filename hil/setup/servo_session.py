@@ -21,7 +21,7 @@ from hil.drivers.preparation.settings import put_back, read_settings
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
 from hil.drivers.torque_off import signals_held_back
-from hil.errors import RunFolderError
+from hil.errors import RunFolderError, StopRequested
 from hil.setup import settings_file
 from hil.setup.current_limit import current_limit_ticks
 from hil.setup.others import others_on_the_bus
@@ -173,7 +173,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             raise
         return
     fakes.register_for(config.url)
-    with ServoBus.connect(config.bus) as bus:
+    with ServoBus.connect(config.bus) as bus, _telling_of_torque(bus):
         session = ServoSession(bus, say)
         token = _outermost.set(session)
         stopped: BaseException | None = None
@@ -192,6 +192,35 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
                 stopped.args = (str(bus.torque_off_report),)
             for line in left:  # behind what stopped the arm and the state of its torque, which matter more
                 stopped.add_note(line) if stopped is not None else say(line)
+
+
+@contextmanager
+def _telling_of_torque(bus: ServoBus) -> Iterator[None]:
+    """Add to whatever ends the block a note about torque, unless it has one: a stop may come between two runs."""
+    try:
+        yield
+    except TorqueNotOff:
+        raise
+    except BaseException as ended:
+        is_stop = isinstance(ended, KeyboardInterrupt | StopRequested)
+        told = any("torque" in note.lower() for note in getattr(ended, "__notes__", []))
+        if not told and (is_stop or bus.torque_off_report is not None):
+            with signals_held_back():
+                ended.add_note(_about_torque(bus))
+        raise
+
+
+def _about_torque(bus: ServoBus) -> str:
+    """A sentence about the torque of servos whose torque no run is using."""
+    if bus.torque_off_report is not None:
+        return str(bus.torque_off_report)
+    try:
+        on = [joint.title for joint, servo in bus.drives.items() if servo.read("Torque Enable")]
+    except DriverError as error:
+        return f"This command has not switched torque on; whether it is off could not be read: {error}"
+    if on:
+        return f"TORQUE IS ON at {' and '.join(on)}: it was on before this command."
+    return "Torque is off on all servos, read back; this command has not switched it on."
 
 
 def has_moved() -> bool:

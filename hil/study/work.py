@@ -217,12 +217,9 @@ def _on_arm(task: str, arm: Path, run: Path) -> Any:
 
 
 def _dry_run(arm: Path) -> Any:
-    from hil.config.schema import load_config
-    from hil.dry_run.run import dry_run
-    from hil.dry_run.summary import dry_run_json
+    from hil.api.dry_run import dry_run
 
-    config = load_config(arm)
-    return dry_run_json(config, dry_run(config))
+    return dry_run(arm).to_json()
 
 
 def _estimated(spec: Spec, folder: Path) -> Any:

@@ -9,7 +9,7 @@ noise only, and two runs of an arm with some unmodelled friction differ by a lit
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -62,11 +62,22 @@ class Difference:
     only_before: tuple[str, ...]
     only_after: tuple[str, ...]
     detectable: Mapping[str, float] = field(default_factory=dict)
+    trust: tuple[str | None, str | None] = (None, None)
 
     @property
     def changed(self) -> tuple[Change, ...]:
         """The significant changes, most significant first."""
         return tuple(sorted((each for each in self.changes if each.changed), key=lambda change: -abs(change.z)))
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """A sentence for each of the two whose model is not to be trusted as it is."""
+        return tuple(
+            f"{name}: trust this model: {trust}. Its values may be biased by more than their standard errors, so a "
+            "change may come from the model instead of the arm; the report says why."
+            for name, trust in zip((self.before, self.after), self.trust, strict=True)
+            if trust not in (None, "yes")
+        )
 
     def to_json(self) -> dict[str, Any]:
         """The changes as plain values; the JSON writer turns infinities into null."""
@@ -82,7 +93,17 @@ def diff_runs(
     if counts[0] != counts[1]:
         raise ResultError(f"{before} has {counts[0]} joints and {after} {counts[1]}: they are not the same arm.")
     rows = friction_changes(models, (_covariance(before), _covariance(after)))
-    return diff_models(*models, str(before), str(after), false_alarms, least_share, rows)
+    difference = diff_models(*models, str(before), str(after), false_alarms, least_share, rows)
+    return replace(difference, trust=(_trust(before), _trust(after)))
+
+
+def _trust(path: Path) -> str | None:
+    """The verdict of a run; None for a model that was exported without one."""
+    try:
+        verdict = read_result(path).verdict
+    except ResultError:
+        return None
+    return None if verdict is None else verdict.trust
 
 
 def _covariance(path: Path) -> Covariance | None:

@@ -32,8 +32,8 @@ LEARNS_S = 1.5
 LEARNT = frozenset({Kind.PUSHED, Kind.GRIPPED, Kind.SLIP, Kind.GOAL_FIGHT})
 """Faults that show only in the motion."""
 
-MOST_LEARNT = 4
-"""Number of these in each part; the aim is 0. Nothing else may be unsafe."""
+MOST_LEARNT = (4, 0)
+"""Number of these by part; the aim is 0. Nothing else may be unsafe."""
 
 EVERY_THIRD = 3
 
@@ -62,7 +62,7 @@ def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
     bad += [each for each in outcomes if (each.verdict.unsafe and not taught(each)) or each.beyond_limit]
     assert not bad, "\n\n".join(map(str, bad))
     learnt = [each for each in outcomes if each.verdict.unsafe]
-    assert len(learnt) <= MOST_LEARNT, "\n\n".join(map(str, learnt))
+    assert len(learnt) <= MOST_LEARNT[part], "\n\n".join(map(str, learnt))
     counted = figures(outcomes)
     assert counted["unnamed"] <= (1 - NAMED) * counted["stopped"]
     assert 0.3 * len(outcomes) < counted["stopped"] < 0.9 * len(outcomes), "it includes stops and runs that continue"

@@ -13,10 +13,11 @@ from typing import Any
 import pytest
 import serial
 
+from hil.api.progress import Progress, forgiving
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongSetting
-from hil.errors import Cause, HilError, SafetyStop
+from hil.errors import Cause, HilError, SafetyStop, StopRequested
 from hil.experiment.run import run_experiment
 from hil.fakes.bus.faults import Fault
 from hil.fakes.servo.servo import EmulatedServo
@@ -421,3 +422,33 @@ def test_a_killed_process_on_a_pty_is_put_back(arm_file: Any, tmp_path: Path) ->
     finally:
         served.terminate()
         served.wait()
+
+
+@pytest.mark.parametrize(
+    "stop", [KeyboardInterrupt(), StopRequested("Stopped by Ctrl-C.")], ids=["interrupt", "signal"]
+)
+@pytest.mark.parametrize("runs", [0, 1])
+def test_a_stop_between_two_runs_says_that_torque_is_off(
+    arm: Arm, bench: Bench, stop: BaseException, runs: int
+) -> None:
+    config = arm(SHORT)
+    stop.__notes__ = []
+    with pytest.raises(type(stop)) as raised, servo_session(config):
+        for _ in range(runs):
+            with servo_session(config) as bus, bus.torque(config.safety.watchdog):
+                pass
+        raise stop
+    (note,) = raised.value.__notes__
+    assert note.startswith("Torque is off on all") and "read back" in note
+    assert ("has not switched it on" in note) is (runs == 0)
+
+
+def test_a_stop_inside_a_progress_callback_is_a_stop(caplog: pytest.LogCaptureFixture) -> None:
+    def interrupted(_: Progress) -> None:
+        raise StopRequested("Stopped by Ctrl-C.")
+
+    tell = forgiving(interrupted)
+    for _ in range(2):
+        with pytest.raises(StopRequested):
+            tell(Progress("experiment", "THE ARM MOVES AGAIN"))
+    assert not caplog.records

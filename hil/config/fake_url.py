@@ -1,0 +1,28 @@
+"""URLs of fake arms, whose path is relative to the configuration file that names them."""
+
+import os
+from pathlib import Path
+
+FAKE_URL = "fake://"
+
+
+def url_from(url: str, file: Path) -> str:
+    """The URL with a fake arm's path made absolute, relative to the configuration `file`; other URLs are unchanged.
+
+    An empty path means the file itself. The name of a bundled arm stays a name.
+    """
+    if not url.startswith(FAKE_URL):
+        return url
+    path, query, value = url.removeprefix(FAKE_URL).partition("?")
+    beside = file.absolute().parent / path if path else file
+    is_name = path == Path(path).name and not Path(path).suffix and not beside.exists()
+    return url if path and is_name else f"{FAKE_URL}{beside.resolve()}{query}{value}"
+
+
+def url_for(url: str, file: Path) -> str:
+    """The inverse: the URL of an open port as it stands in the configuration `file`."""
+    path, query, value = url.removeprefix(FAKE_URL).partition("?")
+    if not url.startswith(FAKE_URL) or Path(path).is_absolute() or not Path(path).is_file():
+        return url
+    relative = Path(os.path.relpath(path, file.absolute().parent)).as_posix()
+    return f"{FAKE_URL}{relative}{query}{value}"

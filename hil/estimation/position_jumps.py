@@ -1,0 +1,77 @@
+"""Jumps of a position that its velocity does not explain: an encoder that slipped, or a horn that moved on its shaft.
+
+The guard stops a run at once if a position moves farther between two samples than the joint can; a smaller jump only
+shifts everything after it, and passes for an offset of the zero.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.runs.run_folder import RunFacts
+
+Array = NDArray[np.float64]
+
+LEAST_STEPS = 8.0  # encoder steps, smallest jump that is reported
+USUAL_QUANTILE = 0.995
+FAR_OUTSIDE = 4.0  # multiple of the usual difference
+AROUND_S = 0.03  # s on either side within which a delayed or filtered velocity has caught up with a real motion
+KEPT = 0.6  # fraction of a jump that remains after that time; less is one bad reading, or a real motion
+LONGEST_GAP = 5.0  # sample intervals
+FEWEST = 200  # samples
+
+
+def jump_warnings(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> list[str]:
+    """One sentence per joint whose position jumped."""
+    begin = float(samples["deadline"][0]) if len(samples) else 0.0
+    found = []
+    for index, joint in enumerate(config.joints):
+        step = facts.position_step[index]
+        jumps = position_jumps(
+            samples["deadline"] - begin,
+            samples["position"][:, index].astype(np.float64),
+            samples["velocity"][:, index].astype(np.float64),
+            step,
+        )
+        if not jumps:
+            continue
+        time, size = max(jumps, key=lambda jump: abs(jump[1]))
+        others = f" ({len(jumps)} jumps in all)" if len(jumps) > 1 else ""
+        found.append(
+            f"{joint.name}: the position jumped by {size:+.3f} rad ({abs(size) / step:.0f} encoder steps) at "
+            f"{time:.2f} s{others}, although the velocity before and after explains no such motion: everything after "
+            "it is shifted. Check the horn's screws, the encoder's magnet and the cable, then record again."
+        )
+    return found
+
+
+def position_jumps(time: Array, position: Array, velocity: Array, step: float) -> list[tuple[float, float]]:
+    """Times [s] and sizes [rad] of jumps far outside the usual differences between position and integrated velocity.
+
+    Args:
+        time: of each sample (samples,) [s].
+        position: (samples,) [rad]; NaN where a reply is missing.
+        velocity: as the servo reports it (samples,) [rad/s].
+        step: encoder step [rad].
+    """
+    read = np.isfinite(position) & np.isfinite(velocity)
+    time, position, velocity = time[read], position[read], velocity[read]
+    if len(time) < FEWEST:
+        return []
+    elapsed = np.diff(time)
+    interval = float(np.median(elapsed))
+    unexplained = np.diff(position) - 0.5 * (velocity[1:] + velocity[:-1]) * elapsed
+    unexplained[elapsed > LONGEST_GAP * interval] = 0.0
+    # A velocity that comes late by a constant time leaves a difference in proportion to its change.
+    change = np.diff(velocity)
+    unexplained -= change * float(unexplained @ change) / max(float(change @ change), 1e-12)
+    usual = float(np.quantile(np.abs(unexplained), USUAL_QUANTILE))
+    threshold = max(LEAST_STEPS * step, FAR_OUTSIDE * usual)
+    around = max(2, round(AROUND_S / interval))
+    found = []
+    for place in np.flatnonzero(np.abs(unexplained) > threshold).tolist():
+        near = slice(max(0, place - around), place + around + 1)
+        remains = float(unexplained[near].sum()) / float(unexplained[place])
+        if KEPT < remains < 2.0 - KEPT:
+            found.append((float(time[place + 1]), float(unexplained[place])))
+    return found
