@@ -21,7 +21,7 @@ def without_peak_torque(config: Config, samples: NDArray[np.void], sentences: tu
 
 def limiting_setting(config: Config, samples: NDArray[np.void], index: int | None = None) -> str:
     """The setting whose limit the joint `index`, or any joint, came closest to, and the share of it that was used."""
-    shares = {}
+    shares: dict[str, float] = {}
     for place, joint in enumerate(config.joints):
         if index not in (None, place):
             continue
