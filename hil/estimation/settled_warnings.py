@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.estimation.pilot_limit import limiting_setting
 from hil.estimation.position_jumps import jump_warnings
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.runs.recording import Phase
@@ -29,7 +30,7 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
         if steps < LEAST_SWING:
             found.append(
                 f"{joint.name} moved by only {steps:.0f} encoder steps: rounding dominates its parameters; "
-                f"{more_torque(config, index)}."
+                f"raise {_raised(config, samples, index)}."
             )
         lost = 1.0 - float(np.mean(period.valid[index]))
         if lost > LOST:
@@ -45,14 +46,8 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
     return found
 
 
-def more_torque(config: Config, index: int) -> str:
-    """What to change so that a joint gets more torque; a pilot finds the torque itself, within the limits."""
-    if not config.experiment.pilot:
-        return "raise its peak_torque"
-    limit = "voltage_limit" if config.joints[index].drive_mode is Mode.PWM else "current_limit"
-    return (
-        f"the pilot chose the torque within {limit}, position_limit and velocity_limit: raise the one it came close to"
-    )
+def _raised(config: Config, samples: NDArray[np.void], index: int) -> str:
+    return limiting_setting(config, samples, index) if config.experiment.pilot else "its peak_torque"
 
 
 def _late_share(config: Config, samples: NDArray[np.void]) -> float:

@@ -1,0 +1,39 @@
+"""What limited the torque that a pilot found: advice to raise peak_torque would be of no use there."""
+
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.drivers.servo_model import Mode
+
+_PEAK_TORQUE = re.compile(r"(?:its )?\bpeak_torque\b")
+
+
+def without_peak_torque(config: Config, samples: NDArray[np.void], sentences: tuple[str, ...]) -> tuple[str, ...]:
+    """The sentences of a verdict; after a pilot, with the setting that limited the torque in place of peak_torque."""
+    if not config.experiment.pilot or not len(samples):
+        return sentences
+    limit = limiting_setting(config, samples)
+    return tuple(_PEAK_TORQUE.sub(limit, sentence) for sentence in sentences)
+
+
+def limiting_setting(config: Config, samples: NDArray[np.void], index: int | None = None) -> str:
+    """The setting whose limit the joint `index`, or any joint, came closest to, and the share of it that was used."""
+    shares: dict[str, float] = {}
+    for place, joint in enumerate(config.joints):
+        if index not in (None, place):
+            continue
+        low, high = joint.position_limit
+        rest, position = config.arm.rest_pose[place], samples["position"][:, place]
+        goal = "voltage_limit" if joint.drive_mode is Mode.PWM else "current_limit"
+        below, above = rest - np.nanmin(position), np.nanmax(position) - rest
+        shares |= {
+            f"{goal} of {joint.name}": float(np.nanmax(np.abs(samples["goal_current"][:, place]))) / joint.goal_limit,
+            f"velocity_limit of {joint.name}": float(np.nanmax(np.abs(samples["velocity"][:, place])))
+            / joint.velocity_limit,
+            f"position_limit of {joint.name}": float(max(below / (rest - low), above / (high - rest))),
+        }
+    setting = max(shares, key=lambda name: shares[name])
+    return f"the {setting} (the pilot used {100 * shares[setting]:.0f} % of it, which limited the torque)"
