@@ -3,8 +3,12 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
+from hil.errors import DidNotMove, ExperimentError
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Watch
@@ -15,6 +19,8 @@ from hil.plan.plan import ROLES
 from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
 from hil.setup.servo_session import servo_session
+
+Array = NDArray[np.float64]
 
 
 def identify_in_steps(
@@ -60,16 +66,31 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
         unlike += played.unlike_before
         if number == options.max_full_runs or unlike == options.max_unlike_runs:
             raise played.error
-        say("Repeating with less torque.")
         run.set_aside(f"stopped-{number}", chosen)
         if played.passed_limit:
             config, plan = search.held, found.plan
         else:
-            search.cap = options.torque_after_unsettled * found.peak_torque
+            search.cap = _after_unsettled(search, found, played.error)
             search.config = _tolerant(search.config, options.max_settle_within)
             config = search.held
             plan = search.waves(config)
-        found = search.amplitude(config, 1.0, plan)
+        before, found = found.peak_torque, search.amplitude(config, 1.0, plan)
+        say("Repeating with less torque." if (found.peak_torque < before).any() else "Repeating with other waves.")
+
+
+def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -> Array:
+    """Torque (joints,) [N m] that a run may have after one that ended with `error`, without exceeding a limit.
+
+    A large motion with little friction may never settle, and less torque helps. Where torque hardly exceeds dry
+    friction it is friction that stops the joint in a different place each time, and less torque would hold it there.
+    """
+    middle, options = search.belief.middle, search.options
+    if isinstance(error, DidNotMove):
+        return np.asarray(options.breakaway_raise * found.peak_torque)
+    friction = np.array([middle.get(f"coulomb_{joint + 1}", 0.0) for joint in range(len(search.config.joints))])
+    lowered = options.torque_after_unsettled * found.peak_torque
+    least = options.torque_over_friction * friction
+    return np.maximum(lowered, np.minimum(found.peak_torque, least))
 
 
 def _tolerant(config: Config, most: float) -> Config:

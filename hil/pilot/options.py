@@ -42,6 +42,8 @@ class PilotOptions:
     """Cap on further torque, relative to the torque at which a limit was exceeded."""
     torque_after_unsettled: float = 0.85
     """The same after a run that never settled: large motion with little friction may never settle."""
+    torque_over_friction: float = 1.8
+    """Ratio of a joint's torque to its Coulomb friction up to which a run that never settled does not lower it."""
     worthwhile_raise: float = 1.15
     """Minimum ratio of torques that justifies another run if little of the range is unused."""
     worthwhile_raise_far: float = 1.03

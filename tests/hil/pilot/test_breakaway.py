@@ -181,6 +181,19 @@ def test_a_period_unlike_the_one_before_repeats_the_full_run_with_less_torque_an
     assert second[0].experiment.seed != first[0].experiment.seed
 
 
+def test_torque_that_hardly_exceeds_friction_is_not_lowered_and_a_joint_that_stood_gets_more(
+    config: Config, tmp_path: Path
+) -> None:
+    search = searched(config, tmp_path, Held([0.0, 0.0]))
+    friction = np.array([search.belief.middle["coulomb_1"], search.belief.middle["coulomb_2"]])
+    torque = friction * (1.5, 8.0)
+    found = search._with(config, search.waves(config), torque)
+    after = full._after_unsettled(search, found, NotSettled("differs"))
+    assert after == pytest.approx(torque * (1.0, OPTIONS.torque_after_unsettled))
+    after = full._after_unsettled(search, found, DidNotMove("stuck"))
+    assert after == pytest.approx(OPTIONS.breakaway_raise * torque)
+
+
 def test_motion_that_never_repeats_ends_the_identification(config: Config, tmp_path: Path) -> None:
     search = searched(config, tmp_path, Held([0.0, 0.0]))
     found = search._with(config, search.waves(config), np.array([0.3, 0.2]))
