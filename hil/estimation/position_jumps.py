@@ -61,12 +61,16 @@ def position_jumps(time: Array, position: Array, velocity: Array, step: float) -
     elapsed = np.diff(time)
     interval = float(np.median(elapsed))
     unexplained = np.diff(position) - 0.5 * (velocity[1:] + velocity[:-1]) * elapsed
+    # Across lost samples the velocity's curvature counts: the next term of the Euler-Maclaurin formula.
+    curved = elapsed**2 / 12.0 * np.diff(np.gradient(velocity, time))
+    unexplained += np.where(elapsed > 1.5 * interval, curved, 0.0)
     unexplained[elapsed > LONGEST_GAP * interval] = 0.0
     # A velocity that comes late by a constant time leaves a difference in proportion to its change.
     change = np.diff(velocity)
     unexplained -= change * float(unexplained @ change) / max(float(change @ change), 1e-12)
     usual = float(np.quantile(np.abs(unexplained), USUAL_QUANTILE))
-    threshold = max(LEAST_STEPS * step, FAR_OUTSIDE * usual)
+    # What is known of the motion across lost samples is less certain.
+    threshold = max(LEAST_STEPS * step, FAR_OUTSIDE * usual) * np.maximum(1.0, (elapsed / interval) ** 2)
     around = max(2, round(AROUND_S / interval))
     found = []
     for place in np.flatnonzero(np.abs(unexplained) > threshold).tolist():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from hil.estimation.position_jumps import position_jumps
@@ -38,6 +38,7 @@ def swing(
     place=st.floats(0.05, 0.95),
     lost=st.sampled_from([0.0, 0.03]),
 )
+@example(rate=100.0, amplitude=1.0, delay_ms=0.0, seed=314, ticks=40, place=0.5, lost=0.03)
 def test_a_jump_is_found_and_nothing_else(
     rate: float, amplitude: float, delay_ms: float, seed: int, ticks: int, place: float, lost: float
 ) -> None:
@@ -46,7 +47,9 @@ def test_a_jump_is_found_and_nothing_else(
     position[missing] = np.nan
     assert position_jumps(time, position, velocity, STEP) == []
     at = round(place * len(time))
-    position[at:] += ticks * STEP
+    missing[at - 1 : at + 1] = False  # a jump across lost samples is found only if it is large
+    whole = swing(rate, amplitude, 1e-3 * delay_ms, seed)[1]
+    position = np.where(missing, np.nan, whole + ticks * STEP * (np.arange(len(time)) >= at))
     ((found_at, size),) = position_jumps(time, position, velocity, STEP)
     assert found_at == pytest.approx(time[at], abs=4.0 / rate)
     assert size == pytest.approx(ticks * STEP, abs=max(6 * STEP, 0.2 * abs(ticks) * STEP))
