@@ -12,6 +12,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.data.fourier import cut_off, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.fit.objective import Run
 from hil.estimator.identify import Estimate
 from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import by_parameters, colour, linearised, simulated_run
@@ -91,8 +92,9 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
     finite, nothing is known of a change: its standard error is infinite.
     """
     joints = period.joints
+    later = _Later.of(period, estimate)
     change, state = np.zeros(joints), _first_state(period)
-    A, r = _linear(period, estimate, change, state)
+    A, r = later.linear(change, state)
     if not _is_finite(A, r):
         return Drift(change, np.full(joints, np.inf), seconds)
     for _ in range(ITERATIONS):
@@ -100,7 +102,7 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
         for share in SHARES:
             further = change + np.clip(share * step[:joints], -MOST, MOST)
             start = state + share * step[joints:].reshape(2, -1)
-            trial = _linear(period, estimate, further, start)
+            trial = later.linear(further, start)
             if _is_finite(*trial) and trial[1] @ trial[1] <= r @ r:
                 change, state, (A, r) = further, start, trial
                 break
@@ -114,27 +116,37 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
     return Drift(change, std, seconds)
 
 
-def _linear(period: SettledPeriod, estimate: Estimate, change: Array, state: Array) -> tuple[Array, Array]:
-    """Return the weighted residual (samples of all joints,) with friction changed by `change` (joints,), from the
-    initial state `state` (2, joints), and its derivatives (samples, joints + 2 joints).
-    """
-    joints = period.joints
-    run = simulated_run(period)
-    weight = np.where(period.valid, 1.0 / period.noise[:, None], 0.0)
-    names = [f"{name}_{joint + 1}" for joint in range(joints) for name in SCALED]
-    names = [name for name in names if name in estimate.names]
-    physics = Physics.of(Drift(change, change, 0.0).at_the_later(estimate).parameters)
-    columns, residual = [], []
-    for part, position, derivative in run.pieces(physics, state, tuple(names)):
-        columns.append(derivative * weight[:, part, None])
-        residual.append(weight[:, part] * (run.measured[:, part] - position))
-    J = np.concatenate(columns, axis=1)
-    r = np.concatenate(residual, axis=1).reshape(-1)
-    by_factor = np.zeros((*J.shape[:2], joints))
-    for i, name in enumerate(names):
-        joint = int(name.rsplit("_", 1)[1]) - 1
-        by_factor[:, :, joint] += J[:, :, i] * estimate.parameters[name]
-    return np.concatenate((by_factor, J[:, :, len(names) :]), axis=2).reshape(r.size, -1), r
+@dataclass(frozen=True)
+class _Later:
+    """The later period as predicted by an estimate; names: its parameters of friction that change."""
+
+    estimate: Estimate
+    run: Run
+    weight: Array
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, period: SettledPeriod, estimate: Estimate) -> "_Later":
+        names = (f"{name}_{joint}" for joint in range(1, period.joints + 1) for name in SCALED)
+        weight = np.where(period.valid, 1.0 / period.noise[:, None], 0.0)
+        return cls(estimate, simulated_run(period), weight, tuple(name for name in names if name in estimate.names))
+
+    def linear(self, change: Array, state: Array) -> tuple[Array, Array]:
+        """Return the derivatives (samples of all joints, joints + 2 joints) and the weighted residual (samples of all
+        joints,), with friction changed by `change` (joints,) and from the initial state `state` (2, joints).
+        """
+        physics = Physics.of(Drift(change, change, 0.0).at_the_later(self.estimate).parameters)
+        columns, residual = [], []
+        for part, position, derivative in self.run.pieces(physics, state, self.names):
+            columns.append(derivative * self.weight[:, part, None])
+            residual.append(self.weight[:, part] * (self.run.measured[:, part] - position))
+        J = np.concatenate(columns, axis=1)
+        r = np.concatenate(residual, axis=1).reshape(-1)
+        by_factor = np.zeros((*J.shape[:2], change.size))
+        for i, name in enumerate(self.names):
+            joint = int(name.rsplit("_", 1)[1]) - 1
+            by_factor[:, :, joint] += J[:, :, i] * self.estimate.parameters[name]
+        return np.concatenate((by_factor, J[:, :, len(self.names) :]), axis=2).reshape(r.size, -1), r
 
 
 def _is_finite(A: Array, r: Array) -> bool:

@@ -8,8 +8,6 @@ search may end at a wrong period, from which no fit returns. The second search s
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.ripple import WAVES, Wave
@@ -19,7 +17,8 @@ from hil.estimator.models.model import Model
 from hil.estimator.models.terms import FRICTIONS
 from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.candidates import SMOOTH
-from hil.estimator.selection.waves import ranked_cycles, wave_peaks
+from hil.estimator.selection.restarts import left_over
+from hil.estimator.selection.waves import ranked_cycles, wave_peaks, without_height
 
 DEFAULTS = SelectionOptions()
 
@@ -42,12 +41,12 @@ def fit_given(
         if not waves:
             raise
         best = None
-    if best is not None and (not waves or _left(period, best) < options.presliding_residual):
+    if best is not None and (not waves or left_over(period, best) < options.presliding_residual**2):
         return best
     found = identify(period, model.without(*waves), starts=starts, coarse=True)
     for wave in waves:
         found = _with_wave(period, found, wave, starts, options)
-    if best is not None and not _left(period, found) < _left(period, best):
+    if best is not None and not left_over(period, found) < left_over(period, best):
         return best
     return identify(period, model, near=Near(found.parameters, found.start))
 
@@ -63,29 +62,19 @@ def _with_wave(
 
     A wave is seen best where other terms explain most, even if they only imitate it; they are fitted for that alone.
     """
-    model = estimate.model.having(wave)
+    model, joints = estimate.model.having(wave), range(1, estimate.model.joints + 1)
     rich = replace(estimate.model, friction=FRICTIONS[-1]).having("zeros", *SMOOTH)
     about = identify(period, rich, starts=starts, coarse=True)
     peaks = wave_peaks(without_spikes(period), about, options.wave_cycles, (wave,))
     fits: list[Estimate] = []
     for known in ranked_cycles(peaks, options.max_wave_peaks):
-        near = Near({**estimate.parameters, **_still(wave, model.joints), **known}, estimate.start)
+        near = Near({**estimate.parameters, **without_height(wave, joints), **known}, estimate.start)
         try:
             fits.append(identify(period, model, near=near, coarse=True))
         except ConvergenceError:
             continue
-        if _left(period, fits[-1]) < options.presliding_residual:
+        if left_over(period, fits[-1]) < options.presliding_residual**2:
             break
     if not fits:
         raise ConvergenceError(f"no period of the {wave} leads to a minimum: try a simpler model")
-    return min(fits, key=lambda each: _left(period, each))
-
-
-def _still(wave: Wave, joints: int) -> dict[str, float]:
-    """Return the parameters, by name, of a wave of no height."""
-    return {f"{wave}_{part}_{joint}": 0.0 for part in ("sin", "cos") for joint in range(1, joints + 1)}
-
-
-def _left(period: SettledPeriod, estimate: Estimate) -> float:
-    """Return the RMS of the residual in units of the noise."""
-    return float(np.sqrt(np.nanmean((estimate.residual / period.noise[:, None]) ** 2)))
+    return min(fits, key=lambda each: left_over(period, each))

@@ -15,13 +15,18 @@ from hil.estimator.fit.ripple import WAVES, Wave
 from hil.estimator.identify import Estimate
 from hil.estimator.models.terms import term_of
 from hil.estimator.options import SelectionOptions
-from hil.estimator.selection.waves import wave_cycles
+from hil.estimator.selection.waves import ranked_cycles, wave_peaks, without_height
 
 ALIKE_STIFFNESS = 3.0  # ratio of two stiffnesses between which no minimum is expected
 LEAST_RISE = 0.05  # Stribeck rise below which nothing is disguised
 WIDE = 0.5  # width of the Coulomb step over the Stribeck velocity above which the two cannot be told apart
 NARROW = 1e-3  # rad/s: initial width of an undisguised step
 ALIKE_CYCLES = 0.3  # difference of two numbers of cycles per turn between which no minimum is expected
+
+
+def left_over(period: SettledPeriod, estimate: Estimate) -> float:
+    """Return the mean square of the residual, in units of the noise."""
+    return float(np.nanmean((estimate.residual / period.noise[:, None]) ** 2))
 
 
 def left_per_joint(period: SettledPeriod, estimate: Estimate) -> Array:
@@ -64,9 +69,9 @@ def _other_wave(
     name = f"{wave}_cycles_{joint}"
     if name not in estimate.names:
         return
-    found = wave_cycles(period, estimate, options.wave_cycles, (wave,), (joint,))
+    (found,) = ranked_cycles(wave_peaks(period, estimate, options.wave_cycles, (wave,), (joint,)), 1)
     if abs(found[name] - estimate.parameters[name]) > ALIKE_CYCLES:
-        yield found | {f"{wave}_sin_{joint}": 0.0, f"{wave}_cos_{joint}": 0.0}
+        yield found | without_height(wave, (joint,))
 
 
 def bristles(estimate: Estimate, bend: float) -> list[dict[str, float]]:

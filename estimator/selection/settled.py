@@ -23,7 +23,7 @@ from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.candidates import SMOOTH, Candidate, candidates, colour
 from hil.estimator.selection.drift import Drift, friction_change
 from hil.estimator.selection.pruning import removable_parts, without_nothings
-from hil.estimator.selection.restarts import bristles, restarts, undisguised
+from hil.estimator.selection.restarts import bristles, left_over, restarts, undisguised
 from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.trial import Choice, Fitting, Trial
 from hil.estimator.selection.waves import ranked_cycles, wave_peaks
@@ -360,7 +360,7 @@ class Selection:
     def _left(self, trial: Trial) -> float:
         """Return the mean square of the residual, in units of the noise."""
         assert trial.estimate is not None
-        return float(np.nanmean((trial.estimate.residual / self._periods[0].noise[:, None]) ** 2))
+        return left_over(self._periods[0], trial.estimate)
 
     def _is_explained(self, trial: Trial) -> bool:
         return self._left(trial) < self._options.explained_residual**2

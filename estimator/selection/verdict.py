@@ -29,11 +29,11 @@ NOTICEABLE = 0.005  # fraction of the residual below which what a term explains 
 NOISY = 1.25  # ratio of noise to rounding above which the noise is mentioned
 WARM_UP_TIMES, WARM_UP_ROUNDING = 4.0, 30.0  # relative to the time over which a change was observed; s
 IMPROVEMENT = {
-    "inertia": "faster motion: raise the upper edge of experiment.band or peak_torque",
-    "coupling": "faster motion of both joints together: raise peak_torque",
-    "armature": "faster motion of joint 2: raise its peak_torque or the upper edge of experiment.band",
-    "gravity": "a wider swing: raise peak_torque, or lower the lower edge of experiment.band",
-    "viscous": "higher speeds: raise peak_torque",
+    "inertia": "faster motion: raise the upper edge of experiment.band or {torque}",
+    "coupling": "faster motion of both joints together: raise {torque}",
+    "armature": "faster motion of joint 2: raise {own_torque} or the upper edge of experiment.band",
+    "gravity": "a wider swing: raise {torque}, or lower the lower edge of experiment.band",
+    "viscous": "higher speeds: raise {torque}",
     "coulomb": "more slow reversals: lower the lower edge of experiment.band, or lengthen the period",
 }
 ODD_HINT = "Its residual on odd lines indicates friction or ripple that the model lacks."
@@ -73,6 +73,8 @@ class Evidence:
     """Other findings, as sentences that cast no doubt on the values."""
     tried_all: bool = False
     """Whether the model was selected from all available terms."""
+    torque_limit: str = ""
+    """The setting that limited the torque, for advice; "" if the user chose peak_torque."""
 
 
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:
@@ -86,7 +88,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
         *_predicted(evidence.held_out, evidence.held_out_as_fitted),
         *evidence.doubts,
         *evidence.notes,
-        *_weak(validation),
+        *_weak(validation, evidence.torque_limit),
         *_alike(validation),
         *_outliers(estimate, explained),
     )
@@ -227,12 +229,19 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
     )
 
 
-def _weak(validation: Validation) -> tuple[str, ...]:
+def improvement_of(name: str, torque_limit: str = "") -> str:
+    """What would determine the parameter `name` better; torque_limit: as in `Evidence`."""
+    return IMPROVEMENT[kind_of(name)].format(
+        torque=torque_limit or "peak_torque", own_torque=torque_limit or "its peak_torque"
+    )
+
+
+def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
     name = validation.weakest
     part = validation.relative_std[name]
     if part <= WELL_KNOWN:
         return (f"The least well known parameter is {name}, to {100 * part:.2g} %.",)
-    improvement = IMPROVEMENT[kind_of(name)]
+    improvement = improvement_of(name, torque_limit)
     if part > WEAK and not _is_weak(validation, name):
         share = 100 * validation.torque_std[name]
         return (

@@ -1,6 +1,6 @@
 """Periods of torque ripple and cogging: score tests of one number of cycles per turn after the other."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -15,20 +15,6 @@ from hil.estimator.selection.candidates import columns_of, simulated_run
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 COMPARABLE = 0.3
 """Decrease of the sum of squares, relative to the best number's, at which another number of cycles is worth a fit."""
-
-
-def wave_cycles(
-    period: SettledPeriod,
-    estimate: Estimate,
-    cycles: Sequence[float],
-    waves: Sequence[Wave] = WAVES,
-    only: Sequence[int] = (),
-) -> dict[str, float]:
-    """Return the numbers of `cycles` per turn for which each wave of each joint would explain most of the residual.
-
-    The result is by parameter name. The arguments are those of `wave_peaks`.
-    """
-    return {name: peaks[0] for name, peaks in wave_peaks(period, estimate, cycles, waves, only).items()}
 
 
 def wave_peaks(
@@ -76,6 +62,11 @@ def ranked_cycles(peaks: Mapping[str, Sequence[float]], most: int) -> list[dict[
     """
     ranks = min(most, max(map(len, peaks.values()), default=0))
     return [{name: each[min(rank, len(each) - 1)] for name, each in peaks.items()} for rank in range(ranks)]
+
+
+def without_height(wave: Wave, joints: Iterable[int]) -> dict[str, float]:
+    """Return the heights of a wave that is absent from `joints`, from 1, by parameter name."""
+    return {f"{wave}_{part}_{joint}": 0.0 for part in ("sin", "cos") for joint in joints}
 
 
 def _peaks(cycles: Sequence[float], falls: Array) -> tuple[float, ...]:

@@ -273,9 +273,10 @@ class _Stops:
 
     def _moved(self, limits: Boundary, scale: Array, state: Array, pieces: list[_Piece]) -> Iterator[Response]:
         """The motion from `state`, piece by piece, as long as it may still leave the limits."""
-        for command, feedback, count in pieces:
+        for piece in pieces:
+            command, feedback, count = piece
             held = np.repeat((command * scale)[:, None], count, axis=1)
-            off = command is self._off[0] and feedback is self._none
+            off = piece is self._off
             at = [round(after * self._rate) for after in _JUDGED_AFTER_S if off]
             for part in np.split(held, [sample for sample in at if 0 < sample < count], axis=1):
                 torque = np.ascontiguousarray(part)

@@ -1,26 +1,19 @@
 """What limited the torque that a pilot found: advice to raise peak_torque would be of no use there."""
 
-import re
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 
-_PEAK_TORQUE = re.compile(r"(?:its )?\bpeak_torque\b")
 
+def torque_limit(config: Config, samples: NDArray[np.void], index: int | None = None) -> str:
+    """The setting whose limit the joint `index`, or any joint, came closest to, and the share of it that was used.
 
-def without_peak_torque(config: Config, samples: NDArray[np.void], sentences: tuple[str, ...]) -> tuple[str, ...]:
-    """The sentences of a verdict; after a pilot, with the setting that limited the torque in place of peak_torque."""
+    Without a pilot, "": then peak_torque was given.
+    """
     if not config.experiment.pilot or not len(samples):
-        return sentences
-    limit = limiting_setting(config, samples)
-    return tuple(_PEAK_TORQUE.sub(limit, sentence) for sentence in sentences)
-
-
-def limiting_setting(config: Config, samples: NDArray[np.void], index: int | None = None) -> str:
-    """The setting whose limit the joint `index`, or any joint, came closest to, and the share of it that was used."""
+        return ""
     shares: dict[str, float] = {}
     for place, joint in enumerate(config.joints):
         if index not in (None, place):

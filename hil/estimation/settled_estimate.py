@@ -13,7 +13,7 @@ from hil.errors import RecordingCutShort
 from hil.estimation.chain_estimate import estimate_chain_run
 from hil.estimation.model_from_config import lever_of, voltage_driven, wanted_model
 from hil.estimation.physical import physical_of
-from hil.estimation.pilot_limit import without_peak_torque
+from hil.estimation.pilot_limit import torque_limit
 from hil.estimation.plausibility import doubts
 from hil.estimation.result import Checks, make_result
 from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
@@ -79,9 +79,9 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     validation = validate(period, estimate)
     wrong = doubts(config, estimate, float(np.abs(period.torque).max()))
     notes = supply_notes(config, supply_sag(config, samples))
-    evidence = Evidence(held_out, as_fitted, left_out, drift, wrong, notes, tried_all=choice is not None)
+    limit = torque_limit(config, samples)
+    evidence = Evidence(held_out, as_fitted, left_out, drift, wrong, notes, choice is not None, limit)
     judged = judge(estimate, validation, evidence)
-    judged = replace(judged, sentences=without_peak_torque(config, samples, judged.sentences))
     checks = Checks(
         describe_validation(validation, held_out, as_fitted),
         describe_verdict(judged),

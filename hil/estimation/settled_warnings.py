@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
-from hil.estimation.pilot_limit import limiting_setting
+from hil.estimation.pilot_limit import torque_limit
 from hil.estimation.position_jumps import jump_warnings
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.runs.recording import Phase
@@ -30,7 +30,7 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
         if steps < LEAST_SWING:
             found.append(
                 f"{joint.name} moved by only {steps:.0f} encoder steps: rounding dominates its parameters; "
-                f"raise {_raised(config, samples, index)}."
+                f"raise {torque_limit(config, samples, index) or 'its peak_torque'}."
             )
         lost = 1.0 - float(np.mean(period.valid[index]))
         if lost > LOST:
@@ -44,10 +44,6 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
                 f"{joint.name}: {100 * lost:.1f} % of the samples are missing or far from their neighbours; {remedy}"
             )
     return found
-
-
-def _raised(config: Config, samples: NDArray[np.void], index: int) -> str:
-    return limiting_setting(config, samples, index) if config.experiment.pilot else "its peak_torque"
 
 
 def _late_share(config: Config, samples: NDArray[np.void]) -> float:

@@ -15,7 +15,7 @@ from hil.estimator.selection.drift import friction_change
 from hil.estimator.selection.settled import choose
 from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import Evidence, judge
-from hil.estimator.selection.waves import wave_cycles
+from hil.estimator.selection.waves import ranked_cycles, wave_peaks
 from hil.fakes.plants.arm import Arm, base_parameters
 
 Recorder = Callable[[Arm, Multisine], SettledPeriod]
@@ -102,7 +102,7 @@ def test_the_noise_of_an_encoder_is_measured(ideal_period: SettledPeriod) -> Non
 def test_where_ripple_repeats_is_seen_in_what_a_fit_leaves(ideal_arm: Arm, recorded: Recorder, wave: Wave) -> None:
     period = recorded(changed(ideal_arm, ripple=0.01, ripple_cycles=9.0), wave(1, PEAKS))
     estimate = identify(period, PLAIN, coarse=True)
-    found = wave_cycles(period, estimate, (3.0, 5.0, 7.0, 9.0, 11.0, 13.0), ("ripple",))
+    (found,) = ranked_cycles(wave_peaks(period, estimate, (3.0, 5.0, 7.0, 9.0, 11.0, 13.0), ("ripple",)), 1)
     assert found == {"ripple_cycles_1": 9.0, "ripple_cycles_2": 9.0}
 
 

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from hil.api import experiment
-from hil.errors import Cause, SafetyStop
+from hil.api.progress import Progress, forgiving
+from hil.errors import Cause, SafetyStop, StopRequested
 from hil.estimation import after_a_stop
 from hil.estimator.errors import RecordingError
 from hil.plan.plan import IDENTIFY
@@ -58,3 +59,14 @@ def test_a_recording_that_the_estimator_refuses_cannot_be_estimated(monkeypatch:
     monkeypatch.setattr(after_a_stop, "load_samples", lambda *_: None)
     monkeypatch.setattr(after_a_stop, "settled_period", refuse)
     assert not after_a_stop.can_be_estimated(Path("run"))
+
+
+def test_a_stop_inside_a_progress_callback_is_a_stop(caplog: pytest.LogCaptureFixture) -> None:
+    def interrupted(_: Progress) -> None:
+        raise StopRequested("Stopped by Ctrl-C.")
+
+    tell = forgiving(interrupted)
+    for _ in range(2):
+        with pytest.raises(StopRequested):
+            tell(Progress("experiment", "THE ARM MOVES AGAIN"))
+    assert not caplog.records

@@ -5,7 +5,8 @@ import pytest
 
 from hil.config.schema import load_config
 from hil.estimation.changes.diff import Difference
-from hil.estimation.pilot_limit import limiting_setting, without_peak_torque
+from hil.estimation.pilot_limit import torque_limit
+from hil.estimator.selection.verdict import improvement_of
 from hil.runs.recording import sample_type
 from hil.runs.timing import lost_samples
 from tests.support.paths import CONFIGS
@@ -37,9 +38,9 @@ def test_after_a_pilot_the_advice_names_the_limit(pilot: bool, expected: str) ->
     samples = some_samples()
     samples["position"] = config.arm.rest_pose
     samples["velocity"][5, 1] = 0.9 * config.joints[1].velocity_limit
-    (said,) = without_peak_torque(config, samples, ("To improve it: a wider swing: raise peak_torque.",))
-    assert expected in said
-    assert "90 %" in limiting_setting(config, samples)
+    limit = torque_limit(config, samples)
+    assert expected in improvement_of("gravity_1", limit)
+    assert ("90 %" in limit) is pilot
 
 
 def test_a_difference_repeats_doubtful_verdicts() -> None:

@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 import serial
 
-from hil.api.progress import Progress, forgiving
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongSetting
@@ -441,14 +440,3 @@ def test_a_stop_between_two_runs_says_that_torque_is_off(
     (note,) = raised.value.__notes__
     assert note.startswith("Torque is off on all") and "read back" in note
     assert ("has not switched it on" in note) is (runs == 0)
-
-
-def test_a_stop_inside_a_progress_callback_is_a_stop(caplog: pytest.LogCaptureFixture) -> None:
-    def interrupted(_: Progress) -> None:
-        raise StopRequested("Stopped by Ctrl-C.")
-
-    tell = forgiving(interrupted)
-    for _ in range(2):
-        with pytest.raises(StopRequested):
-            tell(Progress("experiment", "THE ARM MOVES AGAIN"))
-    assert not caplog.records
