@@ -124,6 +124,17 @@ def _status_names(mode: Mode) -> tuple[str, ...]:
     return "Bus Watchdog", goal, "Realtime Tick", _DRIVE[mode], "Present Velocity", "Present Position"
 
 
+def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans]:
+    """Return the registers that end with the goal, and those that end with Operating Mode.
+
+    They begin earlier, so that answers differ in length from those that other programs usually ask for.
+    """
+    modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
+    goals = [_status_names(own)[:2] for own in modes]
+    goal = Span.of(tables, goals[0]) if len(set(modes)) == 1 else Span.each(tables, goals)
+    return goal, Span.of(tables, ("Return Delay Time", "Drive Mode", "Operating Mode"))
+
+
 class Converter:
     """Converts replies to States and goals to ticks. drive_units: A or V per tick, with each joint's sign."""
 
