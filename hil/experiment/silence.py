@@ -39,6 +39,8 @@ class Silence:
         self._busy_until = float("-inf")
         self.counts = [0] * count
         """Replies missed in a row, by joint."""
+        self.any_missed = False
+        """Whether one of `counts` is not 0."""
 
     @property
     def is_busy(self) -> bool:
@@ -61,6 +63,11 @@ class Silence:
         self.counts[joint] = 0
         self._listened[joint] = 0.0
         self._last_heard[joint] = now
+        self.any_missed = any(self.counts)
+
+    def all_heard(self, now: float) -> None:
+        """Record replies of all joints, none of which missed the exchange before."""
+        self._last_heard = [now] * len(self.counts)
 
     def missed(self, joint: int, now: float, *, refused: bool = False, alone: bool = True) -> str | None:
         """Record a missing reply to the exchange that began at `now` [s]; return what was too long, or None.
@@ -71,6 +78,7 @@ class Silence:
         last = self._last_heard[joint]
         if last is None:
             last = self._last_heard[joint] = now
+        self.any_missed = True
         self.counts[joint] += 1
         self._listened[joint] += self._turn
         listened = max(self._listened[joint], self.counts[joint] * self._interval)
