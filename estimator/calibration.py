@@ -81,7 +81,7 @@ class Calibration:
     residual_steps: Array
     """RMS of the residual in encoder steps (runs, joints)."""
     misfit: float
-    """Weighted sum of squares per sample: 1 is noise alone."""
+    """Weighted sum of squared residuals per sample; 1 for noise alone."""
 
 
 @one_blas_thread

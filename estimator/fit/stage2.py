@@ -293,8 +293,8 @@ def _tempered(
 
     The sum of squares takes the errors of all samples as independent. Under a model error, which repeats at every
     reversal, the data determine a parameter much less well, as its standard error shows, and the error would override
-    any prior: a torque constant half of what is possible, encoder errors of several degrees. Therefore each prior's
-    precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
+    any prior: a torque constant of half the smallest plausible value, encoder errors of several degrees. Therefore each
+    prior's precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
     """
     count, prior = objective.count, objective.prior
     if objective.lever is None and not prior.precision.any():

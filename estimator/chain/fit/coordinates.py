@@ -105,7 +105,7 @@ class ChainCoordinates:
 
     @cached_property
     def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices of the parameters with a prior of their own: friction shapes and small angles.
+        """Indices of the parameters with their own prior: friction shapes and small angles.
 
         With their typical coordinates and the standard deviations of these.
         """

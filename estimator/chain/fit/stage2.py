@@ -86,7 +86,7 @@ class ChainOptions:
 
 
 DEFAULTS = ChainOptions()
-REPEATED = 4  # equal readings in a row that still count in full: a moving joint gives as many
+REPEATED = 4  # consecutive equal readings that still count in full: a moving joint produces as many
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 NEARER, LAST = MinimiserOptions(max_damping=0.1), MinimiserOptions(max_damping=1.0)
 """Options of the last iterations with coarse steps, which fine ones follow, and with fine steps.
