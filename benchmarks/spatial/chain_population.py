@@ -10,8 +10,8 @@ frames, a gripper of two prismatic fingers of which one mimics the other, a tilt
 Counted: runs that finish with a result, collisions of the recorded motion with the arm itself or the floor, exceeded
 position limits, and results that say "yes" although they are wrong: the rigid-body torque on random motions is off by
 more than 2 % and three standard errors for some joint, or more than a tenth of the parameters are off by more than four
-standard errors. True values are in units of the first joint's torque constant, as results are. A run that is refused by its dry run as unsafe
-has not finished.
+standard errors. True values are in units of the first joint's torque constant, as results are. A run that is refused by
+its dry run as unsafe has not finished.
 """
 
 import argparse
@@ -248,7 +248,7 @@ def judged(config: Config, found: hil.Identification) -> dict[str, float]:
     wrong = Y @ np.array([found.parameters[name].value for name in known.base.names]) - right
     error = wrong.std(axis=1) / right.std(axis=1)
     within = [found.covariance.names.index(name) for name in known.base.names]
-    covariance = np.array(found.covariance.matrix)[np.ix_(within, within)]
+    covariance = np.nan_to_num(found.covariance.array(), posinf=1e6)[np.ix_(within, within)]
     expected = np.sqrt(np.einsum("jsp,pq,jsq->js", Y, covariance, Y).mean(axis=1)) / right.std(axis=1)
     worst = int(np.argmax(error))
     away = np.array([abs(each.value - truth[name]) / each.std for name, each in found.parameters.items()])
