@@ -43,6 +43,8 @@ class ChainEstimate(FittedParameters):
     correlation_time: float
     softness: float
     """Natural frequency of the observer that couples the simulation to the measurements [Hz]."""
+    reached: bool
+    """Whether the fit has reached its minimum; if not, the standard errors include what remains."""
     from_prior: tuple[str, ...]
     """Base parameters that the data hardly determine, so that their values come from the prior."""
     unseen: tuple[str, ...]
@@ -90,6 +92,7 @@ def identify_chain(
         white_std=np.sqrt(np.diag(fit.white_covariance)),
         correlation_time=fit.correlation_time,
         softness=fit.softness,
+        reached=fit.remaining <= DEFAULTS.unfinished,
         from_prior=tuple(name for name, open_ in zip(model.base.names, wide, strict=True) if open_),
         unseen=tuple(
             name
