@@ -105,7 +105,7 @@ class ServoBus:
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
-        """Open the port, check that the expected servos answer and nobody holds the arm, and set every servo's mode.
+        """Open the port, check that the expected servos answer and that none has torque on, and set every servo's mode.
 
         Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting or TorqueHeld, after closing the port.
         """

@@ -312,7 +312,7 @@ class Exchange:
             self.strangers += sum(self._is_strange(packet) for packet in packets)
 
     def _is_strange(self, packet: Packet) -> bool:
-        """Whether this is an instruction, or the answer to one, of another master. A refusal has no data."""
+        """Whether this is another master's instruction, or the answer to one. A refusal has no data."""
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected

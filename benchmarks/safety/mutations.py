@@ -15,6 +15,7 @@ import json
 import os
 import signal
 import sys
+import tempfile
 import time
 import types
 from collections.abc import Callable, Iterator
@@ -22,6 +23,7 @@ from functools import partial
 from pathlib import Path
 
 import hypothesis
+import numba
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -31,6 +33,7 @@ _EXPERIMENT = "tests/hil/experiment"
 TESTS = {
     "hil/experiment/guard.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/command_limits.py": [f"{_EXPERIMENT}/test_guard.py"],
+    "hil/experiment/joint_checks.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/work.py": [f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/following.py": [f"{_EXPERIMENT}/test_following.py"],
     "hil/experiment/consistency.py": [f"{_EXPERIMENT}/test_consistency.py"],
@@ -166,7 +169,9 @@ def _test_in_child(module: str, source: str) -> None:
         mutated.__file__ = str(ROOT / module)
         sys.modules[name] = mutated
         exec(compile(source, module, "exec"), mutated.__dict__)
-        code = int(pytest.main(["-q", "-x", "-n", "0", "-p", "no:cacheprovider", *TESTS[module]]))
+        with tempfile.TemporaryDirectory() as compiled:
+            vars(numba.config)["CACHE_DIR"] = compiled  # code compiled before, without this mutation, must not be found
+            code = int(pytest.main(["-q", "-x", "-n", "0", "-p", "no:cacheprovider", *TESTS[module]]))
     except BaseException:
         code = 1
     finally:

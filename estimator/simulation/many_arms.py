@@ -36,11 +36,11 @@ class Commands:
 
 @dataclass(frozen=True)
 class SettlingRule:
-    """Rule for how many periods are played.
+    """Rule for the number of periods to simulate.
 
     within: two successive periods that differ by at most this fraction of the motion's RMS count as settled.
     most_periods: maximum number of periods after the first until that is the case.
-    periods: total number of settled periods that are then played.
+    periods: total number of settled periods that are then simulated.
     """
 
     within: float

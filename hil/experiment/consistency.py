@@ -19,13 +19,23 @@ also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` co
 
 Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, twice those
 observed by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
+
+It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). What it remembers
+of a joint is a record of the type `MEMORY`.
 """
+
+from typing import Any
+
+import numba
+import numpy as np
+
+__all__ = ["MEMORY", "begin", "look", "lost"]
 
 SHORT_S, LONG_S = 0.3, 1.2
 """Time constants of the memories [s]."""
 
 LONG_EVERY_S = 0.0099
-"""Shortest interval added to the long memory [s]: that of 100 Hz, whatever its rounding."""
+"""Shortest interval added to the long memory [s]: that of 100 Hz, regardless of rounding."""
 
 UNSURE_RAD, LONG_UNSURE_RAD = 0.02, 0.045
 """Tolerances [rad] for rounding, encoder noise, and a velocity that is rounded towards zero during each memory."""
@@ -46,176 +56,197 @@ STEP_RAD, STEP_TIMES = 0.0077, 7.0
 """Smallest jump of a position [rad], five ticks, and its smallest ratio to the RMS of the usual differences."""
 
 STEPS, STEPS_S = 4, 0.5
-"""Number of jumps that are too many, and the time within which they must follow each other [s]."""
+"""Number of jumps that counts as a fault, and the longest time between them [s]."""
 
 SCALE, MORE_SCALE = 0.06, 0.02
 CURVED = 0.35
 """Allowance for the velocity between samples, as a fraction of its change times the interval. A wave with only four
-samples per period, the fastest that is played, needs 0.27.
+samples per period, the fastest that is used, needs 0.27.
 """
 
 
-class Consistency:
-    """Compares one joint's position [rad] with its velocity [rad/s].
+_FADING = np.dtype(
+    [(name, "f8") for name in ("apart", "far", "mean", "span", "curved", "unknown", "highest", "lowest")]
+)
+"""An exponential memory.
 
-    It runs for each joint in each exchange, so it is written for speed: comparisons instead of abs and max.
+apart: position less integral of velocity [rad]. far: distance covered [rad]. mean, span: mean and range of the velocity
+[rad/s]. curved, unknown: uncertainties [rad].
+"""
+
+_STEPS = np.dtype([("square", "f8"), ("age", "f8"), ("since", "f8"), ("count", "f8")])
+"""Jumps of a position.
+
+square: mean square of the usual differences [rad^2]. age: time since the beginning [s]. count: number of jumps shortly
+after each other. since: time since the latest one [s].
+"""
+
+MEMORY = np.dtype(
+    [
+        *((name, "f8") for name in ("position", "velocity")),
+        *((name, "f8") for name in ("seconds", "moved", "difference", "unknown", "most_curved")),
+        *((name, "f8") for name in ("learnt_for", "lag_squared", "scale_squared", "crossed", "lag_product")),
+        *((name, "f8") for name in ("scale_product", "lag", "scale")),
+        ("steps", _STEPS),
+        ("short", _FADING),
+        ("long", _FADING),
+    ]
+)
+"""One joint's memory.
+
+position, velocity: latest ones [rad, rad/s]; the position is NaN before the first one and after a long gap. seconds,
+moved, difference, unknown, most_curved: sums, and the largest, of what has not been added to the long memory yet.
+learnt_for: duration of the motion learnt from [s]. lag_squared, scale_squared, crossed, lag_product, scale_product:
+sums of squares and products of the signals per lag and per scale error, and of them with `apart`. lag, scale: largest
+accepted ones [s, 1].
+"""
+
+
+def begin(memory: Any) -> None:
+    """Initialise a record of zeros."""
+    memory["position"] = np.nan
+    memory["lag"], memory["scale"] = LAG_S, SCALE
+
+
+def look(memory: Any, position: float, velocity: float, seconds: float, unsure: float) -> bool:
+    """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
+
+    unsure: excess duration of its exchange [s], by which the time of the measurement is uncertain.
     """
-
-    def __init__(self) -> None:
-        self._position: float | None = None
-        self._velocity = 0.0
-        self._short = _Memory(SHORT_S, UNSURE_RAD)
-        self._long = _Memory(LONG_S, LONG_UNSURE_RAD)
-        self._sum_seconds = self._sum_moved = self._sum_difference = self._sum_unknown = self._most_curved = 0.0
-        self._learnt_for = 0.0
-        # Sums of squares and products of the signals per lag and per scale error, and of them with `apart`.
-        self._lag_squared = self._scale_squared = self._crossed = 0.0
-        self._lag_product = self._scale_product = 0.0
-        self._lag, self._scale = LAG_S, SCALE
-        self._steps = _Steps()
-
-    def look(self, position: float, velocity: float, seconds: float, unsure: float = 0.0) -> bool:
-        """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
-
-        unsure: excess duration of its exchange [s], by which the time of the measurement is uncertain.
-        """
-        former, before = self._position, self._velocity
-        self._position, self._velocity = position, velocity
-        if former is None:
-            self._short.restart(velocity)
-            self._long.restart(velocity)
-            self._forget_sums()
-            return False
-        moved = position - former
-        turned = velocity - before if velocity > before else before - velocity
-        difference = moved - 0.5 * (before + velocity) * seconds
-        curved = CURVED * seconds * turned
-        unknown = unsure * velocity if velocity > 0.0 else -unsure * velocity
-        known = LAG_S * turned + SCALE * (moved if moved > 0.0 else -moved) + curved + unknown
-        if self._steps.look((difference if difference > 0.0 else -difference) - known, seconds):
-            return True
-        short = self._short
-        short.add(moved, difference, velocity, seconds, curved, unknown)
-        if short.is_wrong(velocity, self._lag, self._scale):
-            return True
-        # The long memory processes several intervals at once: it is slow anyway, and time is scarce.
-        self._sum_moved += moved
-        self._sum_difference += difference
-        self._sum_unknown += unknown
-        if curved > self._most_curved:
-            self._most_curved = curved
-        self._sum_seconds += seconds
-        if self._sum_seconds >= LONG_EVERY_S and self._looks_long(velocity):
-            return True
-        if self._learnt_for < LEARNT_S and short.span > _FAST_RAD_S and not unsure > seconds:
-            self._learn(velocity, seconds)
+    former, before = memory.position, memory.velocity
+    memory.position, memory.velocity = position, velocity
+    short = memory.short
+    if np.isnan(former):
+        _restart(short, velocity)
+        _restart(memory.long, velocity)
+        _forget_sums(memory)
         return False
-
-    def _looks_long(self, velocity: float) -> bool:
-        """Add the intervals since the last time to the long memory; return whether it shows a disagreement."""
-        long = self._long
-        long.add(
-            self._sum_moved, self._sum_difference, velocity, self._sum_seconds, self._most_curved, self._sum_unknown
-        )
-        self._forget_sums()
-        return long.is_wrong(velocity, self._lag, self._scale)
-
-    def _forget_sums(self) -> None:
-        self._sum_seconds = self._sum_moved = self._sum_difference = self._sum_unknown = self._most_curved = 0.0
-
-    def _learn(self, velocity: float, seconds: float) -> None:
-        apart, per_scale = self._short.apart, self._short.far
-        per_lag = velocity - self._short.mean
-        self._lag_squared += per_lag * per_lag
-        self._scale_squared += per_scale * per_scale
-        self._crossed += per_lag * per_scale
-        self._lag_product += per_lag * apart
-        self._scale_product += per_scale * apart
-        self._learnt_for += seconds
-        if self._learnt_for < LEARNT_S:
-            return
-        determinant = self._lag_squared * self._scale_squared - self._crossed * self._crossed
-        if determinant <= _SEPARATE * self._lag_squared * self._scale_squared:
-            return
-        lag = (self._lag_product * self._scale_squared - self._scale_product * self._crossed) / determinant
-        scale = (self._scale_product * self._lag_squared - self._lag_product * self._crossed) / determinant
-        self._lag = min(LAG_S, 2.0 * max(lag, 0.0) + MORE_LAG_S)
-        self._scale = min(SCALE, 2.0 * abs(scale) + MORE_SCALE)
-
-    def lost(self) -> None:
-        """Restart with the next reply: too many are missing."""
-        self._position = None
+    moved = position - former
+    turned = abs(velocity - before)
+    difference = moved - 0.5 * (before + velocity) * seconds
+    curved = CURVED * seconds * turned
+    unknown = unsure * abs(velocity)
+    known = LAG_S * turned + SCALE * abs(moved) + curved + unknown
+    if _has_jumped(memory.steps, abs(difference) - known, seconds):
+        return True
+    _add(short, SHORT_S, moved, difference, velocity, seconds, curved, unknown)
+    if _is_wrong(short, UNSURE_RAD, velocity, memory.lag, memory.scale):
+        return True
+    # The long memory processes several intervals at once, so that those of a fast rate are not lost in rounding.
+    memory.moved += moved
+    memory.difference += difference
+    memory.unknown += unknown
+    memory.most_curved = max(memory.most_curved, curved)
+    memory.seconds += seconds
+    if memory.seconds >= LONG_EVERY_S and _looks_long(memory, velocity):
+        return True
+    if memory.learnt_for < LEARNT_S and short.span > _FAST_RAD_S and not unsure > seconds:
+        _learn(memory, velocity, seconds)
+    return False
 
 
-class _Steps:
-    """Counts jumps of a position, which are differences far larger than the usual ones."""
-
-    def __init__(self) -> None:
-        self._square = self._age = self._since = 0.0
-        self._count = 0
-
-    def look(self, step: float, seconds: float) -> bool:
-        """Process the difference over one interval, beyond what its motion explains [rad]; return if it is wrong."""
-        if seconds <= 0.0:
-            return False
-        self._since += seconds
-        self._age += seconds
-        if step <= 0.0:  # nearly always
-            self._square -= seconds / (self._age if self._age < LONG_S else LONG_S) * self._square
-            return self._count >= STEPS
-        square = step * step
-        most = max(STEP_RAD * STEP_RAD, STEP_TIMES * STEP_TIMES * self._square)
-        if square > most and self._age > SHORT_S:  # before that, the usual differences are being learnt
-            self._count = self._count + 1 if self._since < STEPS_S else 1
-            self._since = 0.0
-            square = most
-        self._square += seconds / min(self._age, LONG_S) * (square - self._square)
-        return self._count >= STEPS
+def lost(memory: Any) -> None:
+    """Restart with the next reply: too many are missing."""
+    memory.position = np.nan
 
 
-class _Memory:
-    """Exponential memory with a time constant of `seconds`. unsure: its tolerance [rad].
+def _looks_long(memory: Any, velocity: float) -> bool:
+    """Add the intervals since the last time to the long memory; return whether it shows a disagreement."""
+    long = memory.long
+    moved, difference, unknown = memory.moved, memory.difference, memory.unknown
+    _add(long, LONG_S, moved, difference, velocity, memory.seconds, memory.most_curved, unknown)
+    _forget_sums(memory)
+    return _is_wrong(long, LONG_UNSURE_RAD, velocity, memory.lag, memory.scale)
 
-    apart: position less integral of velocity [rad]. far: distance covered [rad]. mean, span: mean and range of the
-    velocity [rad/s].
+
+def _forget_sums(memory: Any) -> None:
+    memory.seconds = memory.moved = memory.difference = memory.unknown = memory.most_curved = 0.0
+
+
+def _learn(memory: Any, velocity: float, seconds: float) -> None:
+    apart, per_scale = memory.short.apart, memory.short.far
+    per_lag = velocity - memory.short.mean
+    memory.lag_squared += per_lag * per_lag
+    memory.scale_squared += per_scale * per_scale
+    memory.crossed += per_lag * per_scale
+    memory.lag_product += per_lag * apart
+    memory.scale_product += per_scale * apart
+    memory.learnt_for += seconds
+    if memory.learnt_for < LEARNT_S:
+        return
+    determinant = memory.lag_squared * memory.scale_squared - memory.crossed * memory.crossed
+    if determinant <= _SEPARATE * memory.lag_squared * memory.scale_squared:
+        return
+    lag = (memory.lag_product * memory.scale_squared - memory.scale_product * memory.crossed) / determinant
+    scale = (memory.scale_product * memory.lag_squared - memory.lag_product * memory.crossed) / determinant
+    memory.lag = min(LAG_S, 2.0 * max(lag, 0.0) + MORE_LAG_S)
+    memory.scale = min(SCALE, 2.0 * abs(scale) + MORE_SCALE)
+
+
+def _has_jumped(steps: Any, step: float, seconds: float) -> bool:
+    """Process the difference over one interval, beyond what its motion explains [rad]; return whether it is wrong."""
+    if seconds <= 0.0:
+        return False
+    steps.since += seconds
+    steps.age += seconds
+    beyond = max(step, 0.0)
+    square = beyond * beyond
+    most = max(STEP_RAD * STEP_RAD, STEP_TIMES * STEP_TIMES * steps.square)
+    if square > most and steps.age > SHORT_S:  # before that, the usual differences are being learnt
+        steps.count = steps.count + 1.0 if steps.since < STEPS_S else 1.0
+        steps.since = 0.0
+        square = most
+    steps.square += seconds / min(steps.age, LONG_S) * (square - steps.square)
+    return bool(steps.count >= STEPS)
+
+
+def _restart(fading: Any, velocity: float) -> None:
+    fading.apart = fading.far = fading.span = fading.curved = fading.unknown = 0.0
+    fading.mean = fading.highest = fading.lowest = velocity
+
+
+def _add(
+    fading: Any,
+    time_constant: float,
+    moved: float,
+    difference: float,
+    velocity: float,
+    seconds: float,
+    curved: float,
+    unknown: float,
+) -> None:
+    """Add one interval of `seconds`, at the end of which the joint has `velocity`.
+
+    moved, difference: change of position, and the same less the integral of velocity [rad]. curved, unknown: their
+    uncertainty [rad], the second of which accumulates.
     """
+    kept = 1.0 - seconds / time_constant if seconds < time_constant else 0.0
+    new = 1.0 - kept
+    fading.apart = kept * fading.apart + difference
+    fading.far = kept * fading.far + moved
+    fading.unknown = kept * fading.unknown + unknown
+    fading.curved = max(kept * fading.curved, curved)
+    fading.mean += new * (velocity - fading.mean)
+    fading.highest = max(kept * fading.highest + new * velocity, velocity)
+    fading.lowest = min(kept * fading.lowest + new * velocity, velocity)
+    fading.span = fading.highest - fading.lowest
 
-    __slots__ = ("_curved", "_highest", "_lowest", "_seconds", "_unknown", "_unsure", "apart", "far", "mean", "span")
 
-    def __init__(self, seconds: float, unsure: float) -> None:
-        self._seconds, self._unsure = seconds, unsure
-        self.restart(0.0)
+def _is_wrong(fading: Any, unsure: float, velocity: float, lag: float, scale: float) -> bool:
+    """Whether position and velocity disagree.
 
-    def restart(self, velocity: float) -> None:
-        self.apart = self.far = self.span = self._curved = self._unknown = 0.0
-        self.mean = self._highest = self._lowest = velocity
+    unsure: tolerance of this memory [rad]. lag, scale: largest accepted lag [s] and scale error.
+    """
+    of_lag = lag * (velocity - fading.mean)
+    allowed = unsure + scale * abs(fading.far) + fading.curved + fading.unknown + _LAG_SHARE * lag * fading.span
+    apart = fading.apart
+    if of_lag > 0.0:
+        return bool(apart > allowed + of_lag or apart < -allowed)
+    return bool(apart > allowed or apart < of_lag - allowed)
 
-    def add(
-        self, moved: float, difference: float, velocity: float, seconds: float, curved: float, unknown: float
-    ) -> None:
-        """Add one interval of `seconds`, at the end of which the joint has `velocity`.
 
-        moved, difference: change of position, and the same less the integral of velocity [rad]. curved, unknown: their
-        uncertainty [rad], the second of which accumulates.
-        """
-        kept = 1.0 - seconds / self._seconds if seconds < self._seconds else 0.0
-        new = 1.0 - kept
-        self.apart = kept * self.apart + difference
-        self.far = kept * self.far + moved
-        self._unknown = kept * self._unknown + unknown
-        faded = kept * self._curved
-        self._curved = curved if curved > faded else faded
-        self.mean += new * (velocity - self.mean)
-        highest, lowest = kept * self._highest + new * velocity, kept * self._lowest + new * velocity
-        self._highest = highest = velocity if velocity > highest else highest
-        self._lowest = lowest = velocity if velocity < lowest else lowest
-        self.span = highest - lowest
-
-    def is_wrong(self, velocity: float, lag: float, scale: float) -> bool:
-        """Whether position and velocity disagree, given the largest accepted lag [s] and scale error."""
-        of_lag = lag * (velocity - self.mean)
-        allowed = self._unsure + scale * abs(self.far) + self._curved + self._unknown + _LAG_SHARE * lag * self.span
-        apart = self.apart
-        if of_lag > 0.0:
-            return apart > allowed + of_lag or apart < -allowed
-        return apart > allowed or apart < of_lag - allowed
+_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
+_restart, _add, _is_wrong, _has_jumped, _forget_sums = map(
+    _inner, (_restart, _add, _is_wrong, _has_jumped, _forget_sums)
+)
+_looks_long, _learn, look, lost = map(_inner, (_looks_long, _learn, look, lost))

@@ -13,11 +13,19 @@ deviation sigma, grows by
 per sample. The step is bounded so that no single reply decides, and the sum is kept at or above zero. Each sample is
 weighted by the time that it represents. The commanded current is any value between the last two goals,
 because a reply may be measured before or after the motor follows the latest goal.
+
+It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). What it remembers
+of a joint is a record of the type `MEMORY`.
 """
 
-from typing import NamedTuple
+from typing import Any
+
+import numba
+import numpy as np
 
 from hil.config.joint import JointConfig
+
+__all__ = ["MEMORY", "begin", "look"]
 
 SIGMA_SHARE = 0.1
 """Standard deviation of ordinary sensor and current-loop errors, relative to the planned peak."""
@@ -34,60 +42,57 @@ _FULL_WEIGHT = 2.0
 _FEWEST = 2
 """Minimum number of samples, however low the rate."""
 
+MEMORY = np.dtype(
+    [
+        *((name, "f8") for name in ("per_square", "allowed", "share", "follow_time")),
+        *((name, "f8") for name in ("former_goal", "evidence", "count", "differs_for", "differs")),
+    ]
+)
+"""One joint's constants and memory.
 
-class Unfollowed(NamedTuple):
-    """A motor that does not carry the commanded value: goal and measured value [A or V], and duration [s]."""
-
-    goal: float
-    carried: float
-    seconds: float
+per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V], and share, relative to the goal; follow_time: how
+long a larger one may last [s]. evidence, count: sum of the likelihood ratios times seconds, and its number of samples.
+differs_for, differs: duration [s] and samples of a deviation.
+"""
 
 
-class Following:
-    """Compares one joint's current with its goals. planned: largest goal of the plan [A, or V under PWM]."""
+def begin(memory: Any, joint: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
+    """Initialise a record of zeros. planned: the joint's largest goal [A, or V under PWM]."""
+    tick = abs(joint.joint.drive_unit(12.0))
+    sigma = max(SIGMA_SHARE * planned, SIGMA_TICKS * tick)
+    memory["per_square"] = 0.5 / sigma**2
+    memory["allowed"] = max(follow_share * planned, SIGMA_TICKS * tick)
+    memory["share"] = follow_share
+    memory["follow_time"] = follow_time
 
-    def __init__(self, joint: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
-        tick = abs(joint.joint.drive_unit(12.0))
-        sigma = max(SIGMA_SHARE * planned, SIGMA_TICKS * tick)
-        self._per_square = 0.5 / sigma**2
-        self._allowed = max(follow_share * planned, SIGMA_TICKS * tick)
-        self._share = follow_share
-        self._follow_time = follow_time
-        self._former_goal = 0.0
-        self._evidence = 0.0
-        self._count = 0
-        self._differs_for = 0.0
-        self._differs = 0
 
-    def look(self, goal: float, carried: float, seconds: float) -> Unfollowed | None:
-        """Process a reply; return the deviation once it has lasted too long.
+def look(memory: Any, goal: float, carried: float, seconds: float) -> float:
+    """Process a reply; return the duration of a deviation once it has lasted too long [s], otherwise -1.
 
-        goal: latest goal [A or V]. carried: measured value in the reply [A or V]. seconds: time since the last reply
-        [s].
-        """
-        former, self._former_goal = self._former_goal, goal
-        low, high = (goal, former) if goal < former else (former, goal)
-        off = low - carried if carried < low else carried - high if carried > high else 0.0
-        gain = (off * off - carried * carried) * self._per_square
-        if gain > _FULL_WEIGHT:
-            gain = _FULL_WEIGHT
-        elif gain < -_FULL_WEIGHT:
-            gain = -_FULL_WEIGHT
-        evidence = self._evidence + gain * seconds
-        if evidence > 0.0:
-            self._evidence = evidence
-            self._count += 1
-            if evidence >= _FULL_WEIGHT * LOST_AFTER_S and self._count >= _FEWEST:
-                return Unfollowed(goal, carried, self._count * seconds)
-        else:
-            self._evidence = 0.0
-            self._count = 0
-        # A stabiliser may command more than was planned.
-        if off <= self._allowed or off <= self._share * abs(goal):
-            self._differs_for, self._differs = 0.0, 0
-            return None
-        self._differs_for += seconds
-        self._differs += 1
-        if self._differs_for >= self._follow_time and self._differs >= _FEWEST:
-            return Unfollowed(goal, carried, self._differs_for)
-        return None
+    goal: latest goal [A or V]. carried: measured value in the reply [A or V]. seconds: time since the last reply [s].
+    """
+    former, memory.former_goal = memory.former_goal, goal
+    low, high = min(goal, former), max(goal, former)
+    off = max(low - carried, carried - high, 0.0)
+    gain = (off * off - carried * carried) * memory.per_square
+    gain = max(min(gain, _FULL_WEIGHT), -_FULL_WEIGHT)
+    evidence = memory.evidence + gain * seconds
+    if evidence > 0.0:
+        memory.evidence = evidence
+        memory.count += 1.0
+        if evidence >= _FULL_WEIGHT * LOST_AFTER_S and memory.count >= _FEWEST:
+            return float(memory.count * seconds)
+    else:
+        memory.evidence = memory.count = 0.0
+    # A stabiliser may command more than was planned.
+    if off <= memory.allowed or off <= memory.share * abs(goal):
+        memory.differs_for = memory.differs = 0.0
+        return -1.0
+    memory.differs_for += seconds
+    memory.differs += 1.0
+    if memory.differs_for >= memory.follow_time and memory.differs >= _FEWEST:
+        return float(memory.differs_for)
+    return -1.0
+
+
+look = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(look)  # type: ignore[call-overload]

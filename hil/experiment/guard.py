@@ -1,14 +1,16 @@
 """Checks every sample and stops the arm when a limit is exceeded or a reply is inconsistent.
 
-The checks take a few us per sample for two joints: plain floats, one pass over the joints, constants precomputed.
-What needs more than one sample is in separate modules: `following` (does the motor carry the commanded current),
-`consistency` (do position and velocity agree), `work` (does the motor turn as commanded), `status_check` (status
-registers), `deadlines` and `silence` (time without commands or replies); `command_limits` clamps what is sent.
+The checks take a few us per sample: those of every joint are one compiled loop (`joint_checks`), which also applies
+`following` (does the motor carry the commanded current), `consistency` (do position and velocity agree) and `work`
+(does the motor turn as commanded). Other modules check the status registers (`status_check`) and the time without
+commands or replies (`deadlines` and `silence`); `command_limits` clamps what is sent.
 """
 
 from collections.abc import Sequence
 from math import isnan
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
+
+import numpy as np
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
@@ -16,14 +18,13 @@ from hil.drivers.packet import ALERT, StatusError
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
+from hil.experiment import following, joint_checks, work
 from hil.experiment.apart import Apart
 from hil.experiment.command_limits import CommandLimits
-from hil.experiment.consistency import Consistency
 from hil.experiment.deadlines import Deadlines
-from hil.experiment.following import Following, Unfollowed
+from hil.experiment.joint_checks import JOINT, MOST_OUTSIDE_RAD, JointChecks
 from hil.experiment.silence import Silence
 from hil.experiment.status_check import StatusCheck
-from hil.experiment.work import Work
 from hil.plan.find_torque import how_to_find_torque
 
 __all__ = ["MOST_OUTSIDE_RAD", "Guard"]
@@ -31,36 +32,11 @@ __all__ = ["MOST_OUTSIDE_RAD", "Guard"]
 JUMP_FACTOR = 1.5
 """Ratio of the distance a joint may appear to move between two samples to the distance its velocity limit allows."""
 
-JUMP_ALLOWANCE_RAD = 0.01
-"""Allowance for rounding and the noise of a worn encoder [rad]."""
-
 EARLY_MOTION_RAD = 0.05
 """Largest motion allowed while resting before the start [rad]."""
 
-FARTHER_OUT_RAD = 0.01
-"""How much farther out a joint may move if an earlier run left it beyond its limit [rad]."""
-
-MOST_OUTSIDE_RAD = 0.5
-"""How far beyond its limit a joint may start if an earlier run left it there [rad].
-
-A light arm that was stopped at a limit coasts on by some tenths of a radian, and friction holds it there; an upright
-one that has fallen is farther away.
-"""
-
-LONG_GAP = 3.0
-"""Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
-
 NONE_HEARD = "No servo was heard"
 """Beginning of the message of a stop because all replies are missing."""
-
-
-class _Limits(NamedTuple):
-    """One joint's limits, in order of use."""
-
-    low: float
-    high: float
-    velocity: float
-    farthest: float
 
 
 class Guard:
@@ -72,7 +48,7 @@ class Guard:
     for missing replies [s].
 
     left_by_a_run: whether the arm stands where a run just before this one left it. One that was stopped at a limit may
-    have come to rest a little beyond it: a joint found there may move back in, and no farther out.
+    have come to rest a little beyond it: such a joint may move back in, but no farther out.
     """
 
     def __init__(
@@ -88,40 +64,22 @@ class Guard:
         safety = config.safety
         self._seconds = [[second.id for second in joint.joint.seconds] for joint in config.joints]
         self._names = [str(joint.joint) for joint in config.joints]
-        self._limits = [
-            _Limits(
-                joint.position_limit[0],
-                joint.position_limit[1],
-                joint.velocity_limit,
-                JUMP_FACTOR * joint.velocity_limit,
-            )
-            for joint in config.joints
-        ]
-        count = len(config.joints)
         self._safety = safety
         # A pilot lowers the torque itself after such a stop.
         lower = "" if config.experiment.pilot else f" Lower experiment.peak_torque. {how_to_find_torque(config)}"
         self._lower_torque = lower
         self._commands = CommandLimits(config)
         planned = planned or _planned(config)
-        self._work = Work(config, planned) if config.stabiliser is None else None
         self._interval = 1.0 / rate if interval is None else interval
         self._silence = Silence(config, self._interval, patience)
         self._patience = patience or float("inf")
         self._deadlines = Deadlines(config)
-        self._following = [
-            None if _measures_supply(joint) else Following(joint, peak, safety.follow_share, safety.follow_time)
-            for joint, peak in zip(config.joints, planned, strict=True)
-        ]
+        self._joints = _joint_records(config, planned, left_by_a_run)
+        self._checks = JointChecks(self._joints, self._interval)
         self._apart = Apart()
-        self._consistency = [Consistency() for _ in config.joints]
         self._status = StatusCheck(config)
-        self._position: list[float | None] = [None] * count
-        self._seen_at = [0.0] * count
         self._missing = self._silence.counts
         self._resting: tuple[float, ...] | None = None
-        self._may_start_outside = left_by_a_run
-        self._found_outside: dict[int, float] = {}
         self._shortest = float("inf")
         self._unsure = 0.0
 
@@ -153,19 +111,16 @@ class Guard:
         self._silence.woke_up(now, took - self._patience)
         if took < self._shortest:
             self._shortest = took
-        self._unsure = took - self._shortest
+        unsure = took - self._shortest
         if not between:
             self._deadlines.met()
-        missing, error = state.missing, state.error
-        for index, limits in enumerate(self._limits):
-            if error[index] & ALERT:
-                self._stop(
-                    index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, then reboot it."
-                )
-            if missing[index]:
-                self._count_missing(index, error[index], now, alone=not all(missing))
-            else:
-                self._look_at_joint(index, limits, state, now)
+        if any(state.error) or True in state.missing or self._silence.any_missed:
+            self._look_one_by_one(state, now, unsure)
+        else:
+            fault = self._checks.look(state, unsure)
+            if fault != joint_checks.FINE:
+                self._stop_for(fault, state)
+            self._silence.all_heard(now)
         if state.apart is not None and (turned := self._apart.look(state.apart)) is not None:
             self._not_together(*turned)
         if state.slow is not None:
@@ -179,42 +134,34 @@ class Guard:
         """Whether the servos' status should be read again in the next exchange."""
         return self._status.is_in_doubt
 
-    def _look_at_joint(self, index: int, limits: _Limits, state: State, now: float) -> None:
-        low, high, fastest, farthest = limits
-        position, velocity, goal = state.position[index], state.velocity[index], state.goal_current[index]
-        interval = self._interval
-        elapsed = now - self._seen_at[index]
-        # A punctual sample after a late one still represents a whole interval.
-        missed = self._missing[index]
-        seconds = interval * (1 + missed)
-        if elapsed > seconds:
-            seconds = elapsed
-        former = self._position[index]
-        if former is not None:
-            most = farthest * (seconds + state.time_after_read - now) + JUMP_ALLOWANCE_RAD
-            if not -most <= position - former <= most:
-                self._jumped(index, position - former, seconds, most)
-        if not low <= position <= high:
-            self._outside(index, position)
-        if not -fastest <= velocity <= fastest:
-            self._too_fast(index, velocity)
-        self._position[index] = position
-        self._seen_at[index] = now
-        self._silence.heard(index, now)
-        following = self._following[index]
-        if following is not None and (off := following.look(goal, state.current[index], seconds)) is not None:
-            self._not_followed(index, off)
-        consistency = self._consistency[index]
-        if elapsed > LONG_GAP * interval:
-            consistency.lost()
-        if consistency.look(position, velocity, elapsed, self._unsure):
-            self._disagree(index, position, velocity)
-        if self._work is not None:
-            # If other goals may have been in effect since the last sample, the work done is unknown.
-            is_known = former is not None and elapsed < LONG_GAP * interval and not missed
-            taken = self._work.look(index, goal, position - former if is_known and former is not None else None)
-            if taken is not None:
-                self._turns_the_wrong_way(index, taken)
+    def _look_one_by_one(self, state: State, now: float, unsure: float) -> None:
+        """Check an exchange in which replies are missing or report an error, or that follows a missing reply."""
+        missing, error = state.missing, state.error
+        for index in range(len(missing)):
+            if error[index] & ALERT:
+                self._stop(
+                    index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, then reboot it."
+                )
+            if missing[index]:
+                self._count_missing(index, error[index], now, alone=not all(missing))
+                continue
+            fault = self._checks.look_at(index, state, unsure, self._missing[index])
+            if fault != joint_checks.FINE:
+                self._stop_for(fault, state)
+            self._silence.heard(index, now)
+
+    def _stop_for(self, fault: int, state: State) -> NoReturn:
+        """Raise SafetyStop for a fault found by the joint checks."""
+        index, check = divmod(fault, joint_checks.CHECKS)
+        said = (
+            self._jumped,
+            self._outside,
+            self._too_fast,
+            self._not_followed,
+            self._disagree,
+            self._turns_the_wrong_way,
+        )
+        said[check](index, state)
 
     def look_at_rest(self, state: State) -> None:
         """Raise SafetyStop when a joint moves before anything has been commanded."""
@@ -232,8 +179,9 @@ class Guard:
                 )
 
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
-        if self._missing[index] == 0 and self._position[index] is None:
-            self._seen_at[index] = now
+        joint = self._joints[index]
+        if self._missing[index] == 0 and isnan(joint["position"]):
+            joint["seen_at"] = now
         # An error with a valid checksum is an answer, not a lost packet: one is enough, unless it reports that the
         # request was damaged.
         refused = bool(error) and error != StatusError.CRC
@@ -262,47 +210,39 @@ class Guard:
             return f"{shared}, and whether other programs keep this computer busy: this program was late just before."
         return f"{shared}."
 
-    def _jumped(self, index: int, moved: float, seconds: float, most: float) -> NoReturn:
+    def _jumped(self, index: int, _: State) -> NoReturn:
+        joint = self._joints[index]
         self._stop(
             index,
             Cause.JUMP,
-            f"reports an angle that changed by {moved:+.3f} rad within {1e3 * seconds:.0f} ms; its velocity limit "
-            f"allows at most {most:.3f}. Check the encoder, its magnet and the supply.",
+            f"reports an angle that changed by {joint['moved']:+.3f} rad within {1e3 * joint['seconds']:.0f} ms; its "
+            f"velocity limit allows at most {joint['most']:.3f}. Check the encoder, its magnet and the supply.",
         )
 
-    def _outside(self, index: int, position: float) -> None:
-        low, high = self._limits[index][:2]
-        former = self._position[index]
-        beyond = max(low - position, position - high)
-        if former is None and self._may_start_outside and beyond <= MOST_OUTSIDE_RAD:
-            self._found_outside[index] = position
-        found = self._found_outside.get(index)
-        was_inside = former is not None and low <= former <= high
-        if found is not None and not was_inside:
-            farthest = min(low, found - FARTHER_OUT_RAD), max(high, found + FARTHER_OUT_RAD)
-            if farthest[0] <= position <= farthest[1]:
-                return
+    def _outside(self, index: int, state: State) -> NoReturn:
+        joint = self._joints[index]
         self._stop(
             index,
             Cause.POSITION,
-            f"is at {position:.3f} rad, outside its position limit [{low:g}, {high:g}].{self._lower_torque}",
-        )
-
-    def _too_fast(self, index: int, velocity: float) -> NoReturn:
-        self._stop(
-            index,
-            Cause.VELOCITY,
-            f"moves at {velocity:.2f} rad/s, more than its velocity limit {self._limits[index].velocity:g}."
+            f"is at {state.position[index]:.3f} rad, outside its position limit [{joint['low']:g}, {joint['high']:g}]."
             f"{self._lower_torque}",
         )
 
-    def _not_followed(self, index: int, off: Unfollowed) -> NoReturn:
+    def _too_fast(self, index: int, state: State) -> NoReturn:
+        self._stop(
+            index,
+            Cause.VELOCITY,
+            f"moves at {state.velocity[index]:.2f} rad/s, more than its velocity limit "
+            f"{self._joints[index]['fastest']:g}.{self._lower_torque}",
+        )
+
+    def _not_followed(self, index: int, state: State) -> NoReturn:
         self._stop(
             index,
             Cause.NOT_FOLLOWING,
-            f"carries {off.carried:.3f} where {off.goal:.3f} is commanded, for {1e3 * off.seconds:.0f} ms. Its torque "
-            "is off, it was rebooted, its watchdog acted, or it cannot deliver this much at its speed and supply "
-            "voltage (safety.follow_share).",
+            f"carries {state.current[index]:.3f} where {state.goal_current[index]:.3f} is commanded, for "
+            f"{1e3 * self._joints[index]['found']:.0f} ms. Its torque is off, it was rebooted, its watchdog acted, or "
+            "it cannot deliver this much at its speed and supply voltage (safety.follow_share).",
         )
 
     def _not_together(self, index: int, servo: int, turned: float) -> NoReturn:
@@ -314,12 +254,13 @@ class Guard:
             "first one since the start. Its horn slips, a screw is loose, or one of their encoders is wrong.",
         )
 
-    def _disagree(self, index: int, position: float, velocity: float) -> NoReturn:
+    def _disagree(self, index: int, state: State) -> NoReturn:
         self._stop(
             index,
             Cause.FROZEN,
-            f"reports a velocity of {velocity:+.2f} rad/s that does not fit its position, {position:.3f} rad: one of "
-            "the two readings is frozen or wrong. Check the encoder and its magnet; replace the servo if necessary.",
+            f"reports a velocity of {state.velocity[index]:+.2f} rad/s that does not fit its position, "
+            f"{state.position[index]:.3f} rad: one of the two readings is frozen or wrong. Check the encoder and its "
+            "magnet; replace the servo if necessary.",
         )
 
     def _look_at_clocks(self, slow: Slow, now: float) -> None:
@@ -335,12 +276,12 @@ class Guard:
             if wrong is not None:
                 self._stop(index, *wrong)
 
-    def _turns_the_wrong_way(self, index: int, taken: float) -> NoReturn:
+    def _turns_the_wrong_way(self, index: int, _: State) -> NoReturn:
         self._stop(
             index,
             Cause.WRONG_SIGN,
-            f"moves against its command: its motor has taken {taken:.2f} J out of the arm, more than friction can "
-            "account for. Is its direction reversed, or does something else drive the arm?",
+            f"moves against its command: its motor has taken {self._joints[index]['found']:.2f} J out of the arm, more "
+            "than friction can account for. Is its direction reversed, or does something else drive the arm?",
         )
 
     def _look_slow(self, slow: Slow) -> None:
@@ -364,6 +305,21 @@ class Guard:
     def _stop(self, index: int, cause: Cause, what: str) -> NoReturn:
         name = self._names[index]
         raise SafetyStop(f"{name[0].upper()}{name[1:]} {what}", cause)
+
+
+def _joint_records(config: Config, planned: Sequence[float], left_by_a_run: bool) -> np.ndarray:
+    """What `joint_checks` needs to know of each joint."""
+    joints = np.zeros(len(config.joints), JOINT)
+    safety = config.safety
+    for record, joint, peak in zip(joints, config.joints, planned, strict=True):
+        record["low"], record["high"] = joint.position_limit
+        record["fastest"], record["farthest"] = joint.velocity_limit, JUMP_FACTOR * joint.velocity_limit
+        record["may_start_outside"] = left_by_a_run
+        record["is_followed"] = not _measures_supply(joint)
+        record["is_worked"] = config.stabiliser is None
+        following.begin(record["following"], joint, peak, safety.follow_share, safety.follow_time)
+        work.begin(record["work"], joint.torque_per_goal, peak)
+    return joints
 
 
 def _measures_supply(joint: JointConfig) -> bool:

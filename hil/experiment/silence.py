@@ -1,12 +1,12 @@
 """How long servos have not replied, counting only the time during which this program listened to them.
 
-While a computer stalls it hears nothing and sends nothing, which says nothing about the servos. That time is limited as
+A stalled computer neither receives nor sends anything, which reveals nothing about the servos. That time is limited as
 missed deadlines are (`hil.experiment.deadlines`); silence proper is time in which a reply was awaited in vain.
 
-A busy computer also delays what it has received: the kernel hands the bytes of a serial port on in a thread of its own,
+A busy computer also delays what it has received: the kernel passes on the bytes of a serial port in a separate thread,
 which has to wait for a core like any other program, for 4 to 10 ms at a time. So while this program itself wakes up
 late, silence of all servos may be the computer's, and is limited as missed deadlines are, too. If some servos are heard
-and one is not, it is that servo's.
+and one is not, the silence is that servo's.
 """
 
 from hil.config.schema import Config
@@ -39,6 +39,8 @@ class Silence:
         self._busy_until = float("-inf")
         self.counts = [0] * count
         """Replies missed in a row, by joint."""
+        self.any_missed = False
+        """Whether one of `counts` is not 0."""
 
     @property
     def is_busy(self) -> bool:
@@ -61,6 +63,11 @@ class Silence:
         self.counts[joint] = 0
         self._listened[joint] = 0.0
         self._last_heard[joint] = now
+        self.any_missed = any(self.counts)
+
+    def all_heard(self, now: float) -> None:
+        """Record replies of all joints, none of which missed the exchange before."""
+        self._last_heard = [now] * len(self.counts)
 
     def missed(self, joint: int, now: float, *, refused: bool = False, alone: bool = True) -> str | None:
         """Record a missing reply to the exchange that began at `now` [s]; return what was too long, or None.
@@ -71,6 +78,7 @@ class Silence:
         last = self._last_heard[joint]
         if last is None:
             last = self._last_heard[joint] = now
+        self.any_missed = True
         self.counts[joint] += 1
         self._listened[joint] += self._turn
         listened = max(self._listened[joint], self.counts[joint] * self._interval)

@@ -175,7 +175,7 @@ class Stream:
             self._play(segment.period_current, Phase.WARM_UP)
 
     def _play_periods(self, segment: Segment) -> None:
-        """Play periods until one matches its predecessor; it is the first settled one. Then play the other periods to
+        """Run periods until one matches its predecessor; it is the first settled one. Then run the other periods to
         record.
         """
         samples = len(segment.period_current)
@@ -206,7 +206,7 @@ class Stream:
         """What to do about periods of `samples` samples that differ from each other by `differences`."""
         further = periods_of_drift(differences, self._plan.settle_within)
         if further is None:
-            return "Check for play, a dragging cable or a slipping joint; or raise max_settling_periods."
+            return "Check for backlash, a dragging cable or a slipping joint; or raise max_settling_periods."
         seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
         return (
             f"The change falls slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), as "

@@ -2,11 +2,17 @@
 
 It is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot return more work than was
 put in, so a motor that continually takes work out of it turns the wrong way.
+
+It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). What it remembers
+of a joint is a record of the type `MEMORY`.
 """
 
-from collections.abc import Sequence
+from typing import Any
 
-from hil.config.schema import Config
+import numba
+import numpy as np
+
+__all__ = ["MEMORY", "TOLERANCE_RAD", "begin", "look"]
 
 TOLERANCE_RAD = 0.04
 """Tolerance before a joint's sign is called wrong [rad]: work returned, divided by the joint's largest planned torque.
@@ -17,27 +23,37 @@ A healthy motor returns some because of delays: a heavy arm at 20 Hz up to 0.02 
 _OF_OTHERS = 0.5
 """Share of the work put in by the other joints' motors that may come out at this joint."""
 
+MEMORY = np.dtype([("scale", "f8"), ("least", "f8"), ("done", "f8"), ("held", "f8")])
+"""One joint's constants and memory.
 
-class Work:
-    """Sums the work of each joint's motor. planned: largest planned goal of each joint [A, or V under PWM]."""
+scale: torque per goal [N m/A or N m/V]. least: work below which the sign is in doubt [J]. done: work done so far [J].
+held: latest goal [A or V].
+"""
 
-    def __init__(self, config: Config, planned: Sequence[float]) -> None:
-        self._scales = [joint.torque_per_goal for joint in config.joints]
-        self._least = [-TOLERANCE_RAD * goal * scale for goal, scale in zip(planned, self._scales, strict=True)]
-        self._done = [0.0] * len(config.joints)
-        self._held = [0.0] * len(config.joints)
 
-    def look(self, joint: int, goal: float, moved: float | None) -> float | None:
-        """Add the work done by the previous goal; return the work taken out of the arm [J] if it is too much.
+def begin(memory: Any, scale: float, planned: float) -> None:
+    """Initialise a record of zeros. scale: torque per goal [N m/A or N m/V]. planned: largest planned goal [A or V]."""
+    memory["scale"] = scale
+    memory["least"] = -TOLERANCE_RAD * planned * scale
 
-        goal: the new goal [A or V]. moved: displacement since the previous sample [rad], None if it is unknown what the
-        servo did meanwhile.
-        """
-        held, self._held[joint] = self._held[joint], goal
-        if moved is not None:
-            self._done[joint] += self._scales[joint] * held * moved
-        done = self._done[joint]
-        if done >= self._least[joint]:
-            return None
-        others = sum(work for other, work in enumerate(self._done) if other != joint and work > 0.0)
-        return -done if done < self._least[joint] - _OF_OTHERS * others else None
+
+def look(joints: Any, joint: int, goal: float, moved: float) -> float:
+    """Add the work done by the previous goal; return the work taken out of the arm [J] if it is too much, otherwise -1.
+
+    joints: records of all joints, with this memory in their field `work`. goal: the new goal [A or V]. moved:
+    displacement since the previous sample [rad], 0 if it is unknown what the servo did meanwhile.
+    """
+    memory = joints[joint].work
+    held, memory.held = memory.held, goal
+    memory.done += memory.scale * held * moved
+    done = memory.done
+    if done >= memory.least:
+        return -1.0
+    others = 0.0
+    for other in range(len(joints)):
+        if other != joint and joints[other].work.done > 0.0:
+            others += joints[other].work.done
+    return float(-done) if done < memory.least - _OF_OTHERS * others else -1.0
+
+
+look = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(look)  # type: ignore[call-overload]

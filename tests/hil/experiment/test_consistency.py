@@ -19,9 +19,8 @@ from hil.experiment.consistency import (
     MORE_SCALE,
     SCALE,
     SHORT_S,
-    Consistency,
-    _Memory,
 )
+from tests.support.one_joint import Consistency
 
 RATES = (20, 100, 400, 1000)
 STEP = math.tau / 4096
@@ -69,7 +68,7 @@ def test_a_velocity_that_is_scaled_turned_round_or_old(rate: int, scale: float, 
         return speed(now) if now < 2.0 else scale * speed(now - lag)
 
     when = seen_after(rate, lambda now: -4.0 / math.tau * math.cos(math.tau * now), felt)
-    assert 0.0 <= when - 2.0 <= 0.25 + 2 / rate, "a sine at its zero: it takes a while until there is something to see"
+    assert 0.0 <= when - 2.0 <= 0.25 + 2 / rate, "a sine at its zero: nothing can be seen at once"
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -102,7 +101,7 @@ def test_after_a_lost_reply_it_begins_anew() -> None:
     for index in range(400):
         assert not look.look(0.01 * index, 4.0, 0.0025)
     look.lost()
-    assert not look.look(9.0, 4.0, 0.0025), "the way over lost replies is not its affair"
+    assert not look.look(9.0, 4.0, 0.0025), "the motion during lost replies is not checked here"
     for index in range(400):
         assert not look.look(9.0 + 0.01 * (index + 1), 4.0, 0.0025)
 
@@ -176,7 +175,9 @@ def test_a_creep_slower_than_a_tick_of_velocity_is_taken_for_rounding() -> None:
 
 @pytest.mark.parametrize(("jumps", "seen"), [((0.4, 0.5, 0.6), False), ((0.4, 0.5, 0.6, 0.7), True)])
 def test_four_jumps_are_too_many(jumps: tuple[float, ...], seen: bool) -> None:
-    """To and fro, so that nothing accumulates; each there-and-back is one jump, its return half of the next."""
+    """Back and forth, so that nothing accumulates; each pair of steps is one jump, the return being half of the
+    next.
+    """
     times = [round(400 * jump) for jump in jumps]
 
     def position(now: float) -> float:
@@ -186,7 +187,7 @@ def test_four_jumps_are_too_many(jumps: tuple[float, ...], seen: bool) -> None:
 
 
 class _Reference:
-    """The memory of one time constant, computed anew from everything that was ever added."""
+    """The memory of one time constant, recomputed from everything added so far."""
 
     def __init__(self, seconds: float, first: float) -> None:
         self.seconds, self.first = seconds, first
@@ -204,8 +205,8 @@ class _Reference:
             "far": weight @ moved,
             "mean": (weight * (1 - kept)) @ velocity + weight[0] * kept[0] * self.first,
             "span": high - low,
-            "_curved": (weight * curved).max(),
-            "_unknown": weight @ unknown,
+            "curved": (weight * curved).max(),
+            "unknown": weight @ unknown,
         }
 
 
@@ -234,55 +235,63 @@ def test_both_memories_and_what_is_learnt_are_what_their_definitions_say() -> No
                 sums = [sum(each[place] for each in waiting) for place in (0, 1, 3, 5)]
                 long.rows.append((*sums[:2], velocity, sums[2], max(each[4] for each in waiting), sums[3]))
                 waiting = []
-            memory = look._short
-            if memory.span > 2.0 and sum(each[2] for each in lessons) < LEARNT_S:
-                lessons.append((velocity - memory.mean, memory.far, seconds, memory.apart))
+            memory = look.memory["short"]
+            if memory["span"] > 2.0 and sum(each[2] for each in lessons) < LEARNT_S:
+                lessons.append(
+                    tuple(float(each) for each in (velocity - memory["mean"], memory["far"], seconds, memory["apart"]))
+                )
         before, former = velocity, position
-    for memory, reference in ((look._short, short), (look._long, long)):
+    for memory, reference in ((look.memory["short"], short), (look.memory["long"], long)):
         for name, value in reference.of().items():
-            assert getattr(memory, name) == pytest.approx(value, rel=1e-9, abs=1e-12), name
+            assert memory[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
     assert sum(each[2] for each in lessons) >= LEARNT_S
     signals = np.array(lessons)
     (lag, scale), *_ = np.linalg.lstsq(signals[:, :2], signals[:, 3], rcond=None)
-    assert look._lag == pytest.approx(2 * lag + MORE_LAG_S) and look._scale == pytest.approx(2 * scale + MORE_SCALE)
-    assert look._lag < LAG_S and look._scale < SCALE
+    assert look.memory["lag"] == pytest.approx(2 * lag + MORE_LAG_S)
+    assert look.memory["scale"] == pytest.approx(2 * scale + MORE_SCALE)
+    assert look.memory["lag"] < LAG_S and look.memory["scale"] < SCALE
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_the_tolerance_is_the_sum_of_its_parts(sign: float) -> None:
-    memory = _Memory(SHORT_S, 0.02)
-    memory.far, memory.span, memory.mean = -2.0, 3.0, 1.0
-    memory._curved, memory._unknown = 0.003, 0.002
+    """After an interval of no duration, which changes nothing in the short memory but `apart`."""
     allowed = 0.02 + 0.05 * 2.0 + 0.003 + 0.002 + 0.25 * 0.01 * 3.0
-    of_lag = 0.01 * (1.0 + sign * 1.5 - 1.0)
+    velocity = 1.0 + sign * 1.5
+    of_lag = 0.01 * (velocity - 1.0)
     for apart, wrong in (
         (sign * (allowed + abs(of_lag)) * 0.999, False),
         (sign * (allowed + abs(of_lag)) * 1.001, True),
         (-sign * allowed * 0.999, False),
         (-sign * allowed * 1.001, True),
     ):
-        memory.apart = apart
-        assert memory.is_wrong(1.0 + sign * 1.5, 0.01, 0.05) is wrong
+        look = Consistency()
+        look.look(0.0, velocity, 0.0)
+        short = look.memory["short"]
+        short["far"], short["mean"], short["curved"], short["unknown"] = -2.0, 1.0, 0.003, 0.002
+        short["highest"], short["lowest"] = 2.5, -0.5
+        look.memory["lag"], look.memory["scale"] = 0.01, 0.05
+        short["apart"] = apart
+        assert look.look(0.0, velocity, 0.0) is wrong
 
 
-@pytest.mark.parametrize(("moved", "velocities"), [(0.045, (0.0, 1.5)), (-0.09, (0.0, 0.0))])
+@pytest.mark.parametrize(("moved", "velocities"), [(0.12, (0.0, 1.5)), (-0.09, (0.0, 0.0))])
 def test_lag_and_scale_explain_part_of_a_jump(moved: float, velocities: tuple[float, float]) -> None:
-    """A velocity that changes may lag; of a way that was covered, the scale's share may be wrong."""
+    """A changing velocity may lag; a distance covered may be wrong by the scale error's share."""
     look = Consistency()
-    steps: list[tuple[float, float]] = []
-    look._steps.look = lambda step, seconds: bool(steps.append((step, seconds)))  # type: ignore[method-assign]
     look.look(0.0, velocities[0], 0.0)
     look.look(moved, velocities[1], 0.01, 0.001)
     change = abs(velocities[1] - velocities[0])
     known = LAG_S * change + SCALE * abs(moved) + CURVED * 0.01 * change + 0.001 * abs(velocities[1])
-    assert steps == [(pytest.approx(abs(moved - 0.005 * sum(velocities)) - known), 0.01)]
+    steps = look.memory["steps"]
+    assert steps["square"] == pytest.approx((abs(moved - 0.005 * sum(velocities)) - known) ** 2), "the first of them"
+    assert steps["age"] == 0.01
 
 
 def test_the_long_memory_takes_every_sample_of_100_hz() -> None:
     look = Consistency()
     for index in range(3):
         look.look(0.01 * index, 1.0, 0.01)
-        assert look._long.far == pytest.approx(0.01 * index, rel=0.02)
+        assert look.memory["long"]["far"] == pytest.approx(0.01 * index, rel=0.02)
 
 
 def test_a_velocity_that_was_always_a_tenth_too_high_is_more_than_a_servo_s_error() -> None:
@@ -290,7 +299,10 @@ def test_a_velocity_that_was_always_a_tenth_too_high_is_more_than_a_servo_s_erro
 
 
 def test_an_interval_longer_than_a_memory_leaves_nothing_of_what_was_before() -> None:
-    memory = _Memory(SHORT_S, 0.02)
-    memory.add(1.0, 0.5, 2.0, 0.1, 0.3, 0.2)
-    memory.add(0.25, 0.125, 3.0, 2 * SHORT_S, 0.0, 0.0)
-    assert (memory.far, memory.apart, memory.mean, memory._unknown) == (0.25, 0.125, 3.0, 0.0)
+    look = Consistency()
+    look.look(0.0, 2.0, 0.0)
+    look.look(0.2, 2.0, 0.1, 0.01)
+    look.look(1.8, 3.0, 2 * SHORT_S, 0.0)
+    short = look.memory["short"]
+    assert short["far"] == pytest.approx(1.6) and short["apart"] == pytest.approx(1.6 - 2.5 * 2 * SHORT_S)
+    assert (short["mean"], short["unknown"]) == (3.0, 0.0)

@@ -103,7 +103,7 @@ def test_silence_on_a_computer_that_was_late_before_names_it_too(arm: Arm) -> No
     with pytest.raises(SafetyStop, match=r"Check its cable and its supply.$"):
         for number in range(31, 60):
             guard.look(at(number, MISSING))
-    assert number == 36, "one servo among others is silent itself"
+    assert number == 36, "a single servo is itself silent"
 
 
 def test_a_current_that_does_not_follow(arm: Arm) -> None:
@@ -295,59 +295,46 @@ def test_a_joint_that_a_run_left_beyond_its_limit_may_move_in_and_no_farther_out
     assert look(Guard(config, left_by_a_run=True), *at(0.6)) is Cause.POSITION, "an arm that fell"
 
 
-class Heard:
-    """In place of a check of one joint: keeps what it is given."""
-
-    def __init__(self) -> None:
-        self.told: list[tuple[Any, ...]] = []
-        self.begun_anew = 0
-
-    def look(self, *told: Any) -> None:
-        self.told.append(told)
-
-    def lost(self) -> None:
-        self.begun_anew += 1
-
-
-def checks(guard: Guard) -> tuple[Heard, Heard]:
-    """The first joint's comparisons of current with goal and of position with velocity, replaced."""
-    following, consistency = Heard(), Heard()
-    guard._following[0], guard._consistency[0] = following, consistency  # type: ignore[call-overload]
-    return following, consistency
+def memory(guard: Guard, check: str) -> Any:
+    """What a check remembers of the first joint."""
+    return guard._joints[0][check]
 
 
 def test_how_long_an_exchange_took_beyond_the_shortest_is_how_unsure_its_time_is(arm: Arm) -> None:
+    """A joint at 1 rad/s: its position is unsure by as many radians."""
     guard = Guard(arm())
-    _, consistency = checks(guard)
+    moving = STILL._replace(velocity=(1.0, 0.0))
+    unsure = []
     for number, took in enumerate((0.001, 0.0015, 0.0008, 0.0009)):
-        guard.look(STILL._replace(time_before_write=number / 400, time_after_read=number / 400 + took))
-    assert [told[3] for told in consistency.told] == pytest.approx([0.0, 0.0005, 0.0, 0.0001])
+        now = number / 400
+        position = (STILL.position[0] + now, 0.0)
+        guard.look(moving._replace(position=position, time_before_write=now, time_after_read=now + took))
+        unsure.append(float(memory(guard, "consistency")["unknown"]))
+    assert unsure == pytest.approx([0.0, 0.0005, 0.0005, 0.0006])
 
 
-@pytest.mark.parametrize(("gap", "begun_anew"), [(2.9, 0), (3.1, 1)])
-def test_after_three_intervals_position_and_velocity_are_compared_anew(arm: Arm, gap: float, begun_anew: int) -> None:
+@pytest.mark.parametrize(("gap", "compared"), [(2.9, 1), (3.1, 0)])
+def test_after_three_intervals_position_and_velocity_are_compared_anew(arm: Arm, gap: float, compared: int) -> None:
     guard = Guard(arm())
     guard.look(at(1, STILL))
-    _, consistency = checks(guard)
     guard.look(at(1, STILL)._replace(time_before_write=(1 + gap) / 400, time_after_read=(1 + gap) / 400 + 0.001))
-    assert consistency.begun_anew == begun_anew
+    assert memory(guard, "consistency")["steps"]["age"] == pytest.approx(compared * gap / 400)
 
 
 def test_a_punctual_reply_after_a_late_one_and_a_missing_one_stands_for_both_intervals(arm: Arm) -> None:
     guard = Guard(arm())
-    following, _ = checks(guard)
+    off = STILL._replace(goal_current=(0.5, 0.0))
     silent = MISSING._replace(missing=(True, True))
-    for when, state in ((0.9, STILL), (1.0, silent), (2.0, STILL)):
+    for when, state in ((0.9, off), (1.0, silent), (2.0, off)):
         guard.look(state._replace(time_before_write=when / 400, time_after_read=when / 400 + 0.001))
-    assert following.told[-1][2] == pytest.approx(2 / 400)
+    assert memory(guard, "following")["differs_for"] == pytest.approx(2 / 400)
 
 
 def test_a_joint_whose_first_reply_is_missing_counts_from_then(arm: Arm) -> None:
     guard = Guard(arm())
-    following, _ = checks(guard)
     guard.look(at(400_000, MISSING._replace(missing=(True, True))))
-    guard.look(at(400_001, STILL))
-    assert following.told == [(0.0, 0.0, pytest.approx(2 / 400))]
+    guard.look(at(400_001, STILL._replace(current=(0.5, 0.0))))
+    assert memory(guard, "following")["differs_for"] == pytest.approx(2 / 400)
 
 
 def test_the_status_of_one_joint_among_others_without_one(arm: Arm) -> None:

@@ -1,0 +1,176 @@
+"""The checks that every joint undergoes in every exchange, in one compiled loop: time is scarce between two samples.
+
+They are, in this order: a jump of the position, the limits of position and velocity, whether the motor carries the
+commanded current (`following`), whether position and velocity agree (`consistency`), and whether the motor turns as
+commanded (`work`). All that is known of a joint is one record of the type `JOINT`.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from struct import Struct
+from typing import Any
+
+import numba
+import numpy as np
+
+from hil.drivers.state import State
+from hil.estimator.compiled import compiled
+from hil.experiment import consistency, following, work
+
+FINE = -1
+CHECKS = 6
+JUMP, POSITION, VELOCITY, FOLLOWING, CONSISTENCY, WORK = range(CHECKS)
+
+JUMP_ALLOWANCE_RAD = 0.01
+"""Allowance for rounding and the noise of a worn encoder [rad]."""
+
+FARTHER_OUT_RAD = 0.01
+"""How much farther out a joint may move if an earlier run left it beyond its limit [rad]."""
+
+MOST_OUTSIDE_RAD = 0.5
+"""How far beyond its limit a joint may start if an earlier run left it there [rad].
+
+A light arm that was stopped at a limit coasts on by some tenths of a radian, and friction holds it there; an upright
+one that has fallen is farther away.
+"""
+
+LONG_GAP = 3.0
+"""Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
+
+JOINT = np.dtype(
+    [
+        *((name, "f8") for name in ("low", "high", "fastest", "farthest")),
+        *((name, "?") for name in ("may_start_outside", "is_followed", "is_worked")),
+        *((name, "f8") for name in ("position", "seen_at", "found_outside")),
+        *((name, "f8") for name in ("moved", "seconds", "most", "found")),
+        ("following", following.MEMORY),
+        ("consistency", consistency.MEMORY),
+        ("work", work.MEMORY),
+    ],
+    align=True,
+)
+"""One joint: limits, latest state, what the latest check found, and the memories of the checks.
+
+low, high: position limits [rad]. fastest: velocity limit, and farthest, the fastest change of a reported position
+[rad/s]. may_start_outside, is_followed, is_worked: whether it may be found outside its limits at first, and whether
+`following` and `work` are checked. position, seen_at: latest position [rad], NaN before the first one, and its time
+[s]. found_outside: position at which it was found outside at first [rad], NaN if it was not. moved, seconds, most:
+change of the position [rad], the time that it represents [s], and the largest possible one [rad]. found: duration of a
+deviation from the goal [s], or work taken out of the arm [J].
+"""
+
+
+class JointChecks:
+    """The records of the joints, an array of the type `JOINT`, and their latest sample.
+
+    interval: time between two exchanges [s].
+    """
+
+    def __init__(self, joints: np.ndarray, interval: float) -> None:
+        self.joints = joints
+        self.interval = interval
+        self._count = len(joints)
+        self._sample = np.zeros((4, self._count))
+        self._pack = Struct(f"{4 * self._count}d").pack_into
+        self._bytes = memoryview(self._sample.data).cast("B")
+        joints["position"] = joints["found_outside"] = np.nan
+        for joint in joints:
+            consistency.begin(joint["consistency"])
+        _look(joints, self._sample, 0, 0, 0.0, 0.0, interval, 0.0, 0)  # compile
+
+    def look(self, state: State, unsure: float) -> int:
+        """Check all joints, none of which missed this reply or the one before; return FINE or CHECKS * joint + check.
+
+        unsure: excess duration of the exchange [s]. Joints behind the first one with a fault are not checked.
+        """
+        self._pack(self._bytes, 0, *state.position, *state.velocity, *state.goal_current, *state.current)
+        before, after = state.time_before_write, state.time_after_read
+        return _look(self.joints, self._sample, 0, self._count, before, after, self.interval, unsure, 0)
+
+    def look_at(self, joint: int, state: State, unsure: float, missed: int) -> int:
+        """Check one joint, `missed` of whose replies in a row were missing before; return as `look` does."""
+        self._pack(self._bytes, 0, *state.position, *state.velocity, *state.goal_current, *state.current)
+        before, after = state.time_before_write, state.time_after_read
+        return _look(self.joints, self._sample, joint, joint + 1, before, after, self.interval, unsure, missed)
+
+
+def _may_be_outside(joint: Any, position: float) -> bool:
+    """Whether a position outside the limits is accepted, because an earlier run left the joint there."""
+    former = joint.position
+    beyond = max(joint.low - position, position - joint.high)
+    if np.isnan(former) and joint.may_start_outside and beyond <= MOST_OUTSIDE_RAD:
+        joint.found_outside = position
+    found = joint.found_outside
+    if np.isnan(found) or joint.low <= former <= joint.high:
+        return False
+    return bool(min(joint.low, found - FARTHER_OUT_RAD) <= position <= max(joint.high, found + FARTHER_OUT_RAD))
+
+
+def _fault(
+    joints: Any,
+    index: int,
+    sample: Any,
+    now: float,
+    after: float,
+    interval: float,
+    unsure: float,
+    missed: int,
+) -> int:
+    """Return the check that a joint fails, or FINE."""
+    joint = joints[index]
+    position, velocity, goal, current = sample[0, index], sample[1, index], sample[2, index], sample[3, index]
+    elapsed = now - joint.seen_at
+    # A punctual sample after a late one still represents a whole interval.
+    seconds = max(interval * (1 + missed), elapsed)
+    former = joint.position
+    is_first = np.isnan(former)
+    if not is_first:
+        joint.moved, joint.seconds = position - former, seconds
+        joint.most = joint.farthest * (seconds + after - now) + JUMP_ALLOWANCE_RAD
+        if not -joint.most <= joint.moved <= joint.most:
+            return JUMP
+    if not joint.low <= position <= joint.high and not _may_be_outside(joint, position):
+        return POSITION
+    if not -joint.fastest <= velocity <= joint.fastest:
+        return VELOCITY
+    joint.position, joint.seen_at = position, now
+    if joint.is_followed:
+        joint.found = following.look(joint.following, goal, current, seconds)
+        if joint.found >= 0.0:
+            return FOLLOWING
+    is_long = elapsed > LONG_GAP * interval
+    if is_long:
+        consistency.lost(joint.consistency)
+    if consistency.look(joint.consistency, position, velocity, elapsed, unsure):
+        return CONSISTENCY
+    if joint.is_worked:
+        # If other goals may have been in effect since the last sample, the work done is unknown.
+        is_known = not is_first and elapsed < LONG_GAP * interval and missed == 0
+        joint.found = work.look(joints, index, goal, joint.moved if is_known else 0.0)
+        if joint.found >= 0.0:
+            return WORK
+    return FINE
+
+
+def _look_loop(
+    joints: Any,
+    sample: Any,
+    first: int,
+    end: int,
+    now: float,
+    after: float,
+    interval: float,
+    unsure: float,
+    missed: int,
+) -> int:
+    for index in range(first, end):
+        check = _fault(joints, index, sample, now, after, interval, unsure, missed)
+        if check != FINE:
+            return CHECKS * index + check
+    return FINE
+
+
+_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
+_may_be_outside, _fault = map(_inner, (_may_be_outside, _fault))
+_SOURCES = [Path(__file__).with_name(f"{name}.py") for name in ("consistency", "following", "work")]
+_look: Callable[..., int] = compiled(_look_loop, sources=_SOURCES)

@@ -1,0 +1,60 @@
+"""One joint in the guard's compiled checks, all of which but one are given nothing to find."""
+
+import numpy as np
+
+from hil.config.joint import JointConfig
+from hil.drivers.state import State
+from hil.experiment import following
+from hil.experiment.joint_checks import CONSISTENCY, FINE, FOLLOWING, JOINT, JointChecks
+
+ANY = 1e9
+"""A limit that is never reached."""
+
+
+def _joint() -> np.ndarray:
+    joint = np.zeros(1, JOINT)
+    joint["low"], joint["high"], joint["fastest"], joint["farthest"] = -ANY, ANY, ANY, ANY
+    return joint
+
+
+def _state(now: float, position: float = 0.0, velocity: float = 0.0, goal: float = 0.0, current: float = 0.0) -> State:
+    return State(now, now, (goal,), (current,), (velocity,), (position,), (0,), (False,))
+
+
+class Consistency:
+    """Compares one joint's position [rad] with its velocity [rad/s]."""
+
+    def __init__(self) -> None:
+        self._joint = _joint()
+        self._checks = JointChecks(self._joint, ANY)
+        self.memory = self._joint[0]["consistency"]
+
+    def look(self, position: float, velocity: float, seconds: float, unsure: float = 0.0) -> bool:
+        """Process a sample, `seconds` after the previous one; return whether it is inconsistent."""
+        self._joint["seen_at"] = 0.0
+        found = self._checks.look(_state(seconds, position, velocity), unsure)
+        self._checks.interval = ANY
+        assert found in (FINE, CONSISTENCY)
+        return found == CONSISTENCY
+
+    def lost(self) -> None:
+        """Let the next sample follow a gap that is too long."""
+        self._checks.interval = 0.0
+
+
+class Following:
+    """Compares one joint's current with its goals."""
+
+    def __init__(self, config: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
+        self._joint = _joint()
+        self._joint["is_followed"] = True
+        following.begin(self._joint[0]["following"], config, planned, follow_share, follow_time)
+        self._checks = JointChecks(self._joint, ANY)
+
+    def look(self, goal: float, carried: float, seconds: float) -> float | None:
+        """Process a reply, `seconds` after the previous one; return the duration of a deviation [s] if too long."""
+        self._joint["seen_at"] = 0.0
+        self._checks.interval = seconds
+        found = self._checks.look(_state(0.0, goal=goal, current=carried), 0.0)
+        assert found in (FINE, FOLLOWING)
+        return float(self._joint["found"][0]) if found == FOLLOWING else None
