@@ -115,3 +115,17 @@ def test_a_servo_that_does_not_answer_is_left_to_the_next_cycle(fake_config: Mak
         assert state.missing == (False, True)
         bus.port._serial.bus.servos[2].connected = True
         assert bus.exchange([0.1, 0.1]).missing == (False, False)
+
+
+def test_a_program_that_overwrites_every_third_goal_is_found_within_a_third_of_a_second(fake_config: Make) -> None:
+    times = iter(range(10_000))
+
+    def sometimes(servos: Any) -> None:
+        if next(times) % 3 == 0:
+            servos[2].write(102, b"\xf9\xff")
+
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        start = bus.port.clock.now()
+        with pytest.raises(BusShared, match="Goal Current reads -7"):
+            after_each(bus, sometimes, 100)
+        assert bus.port.clock.now() - start < 0.33
