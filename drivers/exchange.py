@@ -14,6 +14,7 @@ still on. Every span must include what the control loop needs.
 import math
 import struct
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 from fastcrc import crc16
@@ -52,6 +53,9 @@ class Reply(NamedTuple):
     time_after_read: float
     span: int
     servos: Sequence[Answer]
+
+
+_reply = partial(tuple.__new__, Reply)  # half the time of Reply(...)
 
 
 class Exchange:
@@ -179,7 +183,7 @@ class Exchange:
                 self._late_possible, self._lost = True, span
         elif self._doubts and self._now() - before < self._soonest[span]:
             servos = self._latest(read, servos, before + timeout)
-        return Reply(before, self._now(), span, servos)
+        return _reply((before, self._now(), span, servos))
 
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
         """Handle replies that arrive sooner than the wire allows: they may belong to an earlier request.

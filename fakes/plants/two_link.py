@@ -42,7 +42,7 @@ class TwoLink:
         beyond = second.mass + arm.drives[1].mass
         inertia_first = _about_joint(first) + beyond * first.length**2
         inertia_second = _about_joint(second)
-        self._arm = (
+        self._terms = (
             second.mass * first.length * second.centre,
             inertia_second,
             inertia_first + armature(arm.drives[0]),
@@ -93,10 +93,10 @@ class TwoLink:
         command_1, command_2 = float(current[0]), float(current[1])
         drives = (*motor_1.plain, *motor_2.plain)
         if motor_1.is_plain and motor_2.is_plain:
-            state = self._run(remaining, longest, command_1, command_2, self._state, self._arm, drives, None)
+            state = self._run(remaining, longest, command_1, command_2, self._state, self._terms, drives, None)
             motor_1.current, motor_2.current = state[6:]
         else:
-            state = _run(remaining, longest, command_1, command_2, self._state, self._arm, drives, self._motors)
+            state = _run(remaining, longest, command_1, command_2, self._state, self._terms, drives, self._motors)
         self._state = state
 
 
@@ -115,7 +115,7 @@ def _run(  # noqa: PLR0915
     This is one long loop on local floats because a fake arm spends most of its time here: with a function call per step
     it takes 1.5 times as long. A step in which a joint's velocity changes sign is first taken up to that point (`cut`).
 
-    arm: `TwoLink._arm`. drives: `Motor.plain` of both motors. motors: None if both are plain; only this is compiled.
+    arm: `TwoLink._terms`. drives: `Motor.plain` of both motors. motors: None if both are plain; only this is compiled.
     """
     swing, inertia_second, turned_first, turned_second, weight_first, weight_second = arm
     kt_1, offset_1, coulomb_1, rise_1, per_v1, viscous_1, lag_1 = drives[:7]
