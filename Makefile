@@ -1,4 +1,4 @@
-# `make demo` and `make test` are all a fresh machine needs; each makes the environment first.
+# `make demo` and `make test` are all a fresh machine needs; each creates the environment first.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin

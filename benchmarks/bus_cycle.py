@@ -85,8 +85,8 @@ def make_exchange(port: Any, servos: int, *, fast: bool = False) -> Exchange:
 
 @contextmanager
 def whole_sample(name: str, servos: int) -> Iterator[Cycle]:
-    """The complete work of an experiment for one sample: exchange in SI units, recorder, guard, and the model that
-    runs beside the experiment, which exists for up to two joints.
+    """The complete work of an experiment for one sample: exchange in SI units, recorder, guard, and the model watch,
+    which supports up to two joints.
 
     The responder's arm hangs still, under currents too small to move it: nothing that the guard has to stop.
     """

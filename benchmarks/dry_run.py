@@ -2,9 +2,9 @@
 
     python benchmarks/dry_run.py [--json] [--arms N] [--pilots N]
 
-`--arms` arms are drawn from a prior with 30 % spread; each plays, in virtual time, the largest experiment that a dry
-run of that prior allows. The arm of configs/first_time.toml is then identified from joint limits and link lengths
-only, with pilot and full run; with --pilots N, so are N - 1 more arms drawn from the prior; the smallest value counts.
+`--arms` arms are drawn from a prior with 30 % spread; each runs, in virtual time, the largest experiment that a dry run
+of that prior allows. The arm of configs/first_time.toml is then identified from joint limits and link lengths only,
+with pilot and full run; with --pilots N, so are N - 1 more arms drawn from the prior; the smallest value counts.
 
 within_quantile       share of arms whose measured peaks all stay within the predicted 99 %
 limit_touched         arms that the guard had to stop

@@ -43,7 +43,7 @@ RATE = 1000
 
 
 def streams(config_path: Path, runs: int) -> dict[str, float]:
-    """Play the configuration's experiment `runs` times; return the best figures."""
+    """Run the configuration's experiment `runs` times; return the best figures."""
     config = load_config(config_path)
     best: dict[str, float] = {}
     for _ in range(runs):

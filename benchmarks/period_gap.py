@@ -5,9 +5,9 @@
 The stream runs for two periods at 1 kHz, including guard, model, recorder and comparison of periods, on a substitute
 for the bus that answers immediately. The measured time is the processor time of the stream's thread from the end of an
 exchange to the beginning of the next; it excludes other programs but would include any work on a complete period.
-Printed are the longest time, the longest time at the ends of periods, and how much of it exceeds the interval minus the
-wire time of an exchange. Because stalls of a virtual machine count as processor time too, the longest iteration of a
-counting loop with the same median time and number of iterations is printed for comparison.
+The output gives the longest time, the longest time at the ends of periods, and how much of it exceeds the interval
+minus the wire time of an exchange. Because stalls of a virtual machine count as processor time too, the longest
+iteration of a counting loop with the same median time and number of iterations is printed for comparison.
 """
 
 import argparse

@@ -2,7 +2,7 @@
 
     python benchmarks/population.py [--arms N | --seeds A..B] [--quick] [--others] [--jobs N] [--json] [--keep DIR]
 
-The distribution is described in benchmarks/drawn_arms/population_arms.py, with --others in population_others.py beside
+The distribution is described in benchmarks/drawn_arms/population_arms.py, with --others in population_others.py next to
 it. Each arm is identified by `hil identify` in a separate process, in virtual time, and judged by the true parameters
 of the fake arm. --quick: friction = "stribeck" instead of "auto" and half the rate, for tests.
 

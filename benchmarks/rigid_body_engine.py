@@ -4,9 +4,9 @@
 
 The links, servos and friction of the fake arm are MuJoCo bodies; dry friction is a constraint there (frictionloss), not
 a function of velocity. Positions are rounded to encoder steps and currents to current steps. The friction model is
-chosen by hil. Printed are the worst of N seeds, and how many of the N x 12 parameters lie outside their 99 % intervals
-(1 % is expected). Seeds whose phases swing the arm over the top, in the fitted or the held-out period, are counted and
-skipped, because the motion is then not periodic.
+chosen by hil. The output gives the worst of N seeds, and how many of the N x 12 parameters lie outside their 99 %
+intervals (1 % is expected). Seeds whose phases swing the arm over the top, in the fitted or the held-out period, are
+counted and skipped, because the motion is then not periodic.
 """
 
 import argparse

@@ -144,7 +144,9 @@ def empty_runs(folder: Path, runs: int) -> dict[str, Any]:
 
 
 def killed(folder: Path, runs: int) -> dict[str, Any]:
-    """Rows lost or doubled when workers are killed `KILLS` times and then the engine itself, and the study resumed."""
+    """Rows lost or duplicated when workers are killed `KILLS` times and then the engine itself, and the study
+    resumed.
+    """
     path = study_file(folder, IDENTIFY.format(runs=runs))
     out = folder / "out"
     command = [sys.executable, "-m", "hil", "study", str(path), "--out", str(out), "--workers", "2", "--quiet"]

@@ -1,37 +1,35 @@
 """The servos of one arm on one port: preparation, the control cycle, and torque off afterwards."""
 
-import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from hil.drivers.control_table import ControlTable, load_control_table, model_names
+from hil.drivers.control_table import load_control_table, model_names
 from hil.drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel
-from hil.drivers.exchange import HOST_S, Exchange
+from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
 from hil.drivers.packet import ALERT, HardwareError
 from hil.drivers.port import Port, open_port
+from hil.drivers.preparation.cadence import CHECK_S, cadence
 from hil.drivers.preparation.hold import let_sink, refuse_held
-from hil.drivers.preparation.prepare import check_quiet, fault_text, learn_latency, prepare_servo, shared
+from hil.drivers.preparation.prepare import (
+    check_quiet,
+    fault_text,
+    learn_latency,
+    overruled,
+    prepare_servo,
+    shared,
+)
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
-from hil.drivers.state import NAN, Converter, Spans, State, fold, spans, status_span
-from hil.drivers.sync_read import Answer, one_each
+from hil.drivers.state import NAN, Converter, State, fold, read_back_spans, spans
+from hil.drivers.sync_read import Answer
 from hil.drivers.torque_off import TorqueOff, cut_again, cut_torque, disarm_watchdogs, signals_held_back, was_rebooted
 
 __all__ = ["CHECK_S", "BusConfig", "ServoBus"]
 
 _PROBES = 3
 """Unanswered Fast Sync Reads after which Sync Read is used instead."""
-
-CHECK_S = 0.01
-"""Longest time between two exchanges [s], if the bus allows: faults must not go unnoticed because samples are rare."""
-
-STATUS_S = 0.035
-"""Time between two status reads [s]."""
-
-_SHARE, _MOST_SHARE = 0.6, 0.9
-"""Fraction of a control cycle that a status read may take on the wire; the rest is for the adapter and the computer."""
 
 _RECENT_S = 0.1
 MOST_STRANGERS = 2
@@ -107,7 +105,7 @@ class ServoBus:
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
-        """Open the port, check that the expected servos answer and nobody holds the arm, and set every servo's mode.
+        """Open the port, check that the expected servos answer and that none has torque on, and set every servo's mode.
 
         Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting or TorqueHeld, after closing the port.
         """
@@ -216,6 +214,8 @@ class ServoBus:
         nothing = [0] * len(self._drives)
         if fast and all(None in exchange.cycle(nothing).servos for _ in range(_PROBES)):
             exchange = self.make_exchange(fast=False, one_write=one_write)
+        modes = [drive.mode for drive in self._drives]
+        exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in self._servos.values()]), modes)
         self._exchange = exchange
 
     def knows_fast_sync_read(self) -> bool:
@@ -243,7 +243,9 @@ class ServoBus:
         tables = [servo.table for servo in servos]
         modes = [drive.mode for drive in self._drives]
         return_delay = max(RETURN_DELAY_UNIT * servo.read("Return Delay Time") for servo in servos)
-        every, span, status_every = self._cadence(tables, return_delay) if status else (1, None, 0)
+        every, span, status_every = (
+            cadence(self.config.interval, self.port, self._drives, tables, return_delay) if status else (1, None, 0)
+        )
         self.exchanges_per_sample = every
         return Exchange(
             self.port,
@@ -262,30 +264,6 @@ class ServoBus:
             interval=self.config.interval / every,
             patience=patience,
         )
-
-    def _cadence(self, tables: Sequence[ControlTable], return_delay: float) -> tuple[int, Spans | None, int]:
-        """Return the exchanges per sample, the status registers to read, and the exchanges between two status reads.
-
-        The registers are None if there is no time to read them.
-        """
-        if not self.config.interval:
-            return 1, None, 0
-        modes, count = [drive.mode for drive in self._drives], len(self._drives)
-        # Without a current sensor in the motor, a loss of torque shows first in Torque Enable: worth a late sample.
-        share = _MOST_SHARE if any(joint.servo.senses_supply for joint in self.joints) else _SHARE
-        goals = 14 * len(set(modes)) + 3 * count
-        every, interval = 1, self.config.interval
-        for whole in (True, False):
-            span = status_span(modes, tables, whole=whole)
-            taken = self.port.wire_time(goals + 14 + count + count * (11 + one_each(span, count)[0].size))
-            taken += return_delay * count
-            if whole:
-                least = max(CHECK_S, taken / share + HOST_S)
-                every = max(1, math.floor(self.config.interval / least + 1e-6))
-                interval /= every
-            if taken < share * interval:
-                return every, span, max(1, round(STATUS_S / interval))
-        return every, None, 0
 
     @property
     def prepared(self) -> Exchange:
@@ -318,6 +296,17 @@ class ServoBus:
         if exchange.strangers > MOST_STRANGERS:
             raise shared(f"has sent {exchange.strangers} packets, or made servos send them,")
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
+
+    def check_not_overruled(self, due: float) -> None:
+        """Check that the servos hold this program's goals and modes, if that is due and possible before `due` [s].
+
+        Raises PortLost; BusShared if another master has written to a servo.
+        """
+        exchange = self.prepared
+        if (found := exchange.overruled(due)) is not None:
+            raise overruled(self._drives[found.place], found)
+        if exchange.is_in_doubt:
+            exchange.read_status_next()  # it tells goals that are lost from those of another master
 
     @property
     def heard_instead(self) -> str:

@@ -88,8 +88,8 @@ class WrongSetting(DriverError):
 
 
 class TorqueHeld(WrongSetting):
-    """A servo already has torque on. Example: another program holds the arm up."""
+    """A servo's torque is already on. Example: another program holds the arm up."""
 
 
 class TorqueNotOff(DriverError):
-    """Torque off could not be confirmed for every servo. Example: the cable was unplugged: cut the supply."""
+    """Torque off could not be confirmed for every servo: cut the supply. Example: the cable was unplugged."""

@@ -13,6 +13,7 @@ still on. Every span must include what the control loop needs.
 
 import math
 import struct
+from collections import deque
 from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
@@ -22,7 +23,7 @@ from fastcrc import crc16
 from hil.drivers.control_table import Register
 from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction, Packet
 from hil.drivers.port import Port
-from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
+from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
 
 HOST_S = 0.75e-3
 """Time allowed for the computer itself, including USB frames, on top of wire, servos and adapter [s]."""
@@ -34,6 +35,23 @@ MOST_PATIENCE_S = 0.02
 """Upper limit of the minimum reply timeout [s]: in slow cycles too, a silent servo must not delay the others."""
 
 _NEVER = 1 << 62
+_READ_BACK_S = 0.025
+"""Time between two read-backs [s]: of the goals and of the operating modes, in turn."""
+
+_REMEMBERED = 4
+"""Number of latest goals that a servo may still hold if writes are lost; more are a matter of the status."""
+
+_GOAL_SIGHTINGS, _MODE_SIGHTINGS, _SIGHTED_S = 3, 2, 0.5
+"""Read-backs of a foreign goal or mode that prove another writer, and the time within which they must be made [s].
+
+With three, goals that are lost are noticed first, by the status.
+"""
+
+_TRY_AGAIN_S = 0.005
+_FADES = 0.98
+_IN_DOUBT_S = 0.1
+"""Time after a sighting during which every cycle is followed by a read-back [s]."""
+
 _DOUBTS = 3
 _PART_OF_A_REPLY = 8  # bytes; the header of a fast answer whose first servos were heard
 
@@ -56,6 +74,15 @@ class Reply(NamedTuple):
 
 
 _reply = partial(tuple.__new__, Reply)  # half the time of Reply(...)
+
+
+class Overruled(NamedTuple):
+    """A servo (by its place among the IDs) that holds a goal or an operating mode that this program did not write."""
+
+    place: int
+    register: str
+    value: int
+    written: int
 
 
 class Exchange:
@@ -121,6 +148,11 @@ class Exchange:
         self._slow = 0
         self._lost = 0
         self._late_possible = False
+        self._sent: deque[Sequence[int]] = deque(maxlen=_REMEMBERED)
+        self._lasted = math.inf
+        self._read_back: _ReadBack | None = None
+        self.read_back_at = math.inf
+        """When `overruled` should be called again, before the next cycle [s on the port's clock]."""
 
     @property
     def command_to_sample(self) -> float:
@@ -145,6 +177,47 @@ class Exchange:
         if self._status_every < _NEVER:
             self._until_status = min(self._until_status, 1)
 
+    def add_read_back(self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[int]) -> None:
+        """Prepare `overruled`. goal, mode: spans that end with the goal, and with Operating Mode. modes: those set."""
+        self._read_back = _ReadBack(self.ids, goal, mode, modes, fast=self.fast)
+        self._expected = self._expected.union(*(read.expected for read in self._read_back.reads))
+        self.read_back_at = -math.inf
+
+    @property
+    def is_in_doubt(self) -> bool:
+        """Whether the latest read-back found something that was not written here."""
+        return self._read_back is not None and self._read_back.is_in_doubt
+
+    def overruled(self, due: float) -> Overruled | None:
+        """Read goals or operating modes back if there is time before the next cycle, which is due at `due` [s].
+
+        Goals of another master are overwritten by the next cycle, whose own answers come after that. Only what the
+        servos hold right before it shows who commands them. Missing answers are left to the next cycle to notice.
+
+        Raises PortLost.
+        """
+        back, port = self._read_back, self._port
+        if back is None or not self._sent:
+            return None
+        now, read = self._now(), back.read
+        asked = read.reply_size + (len(read.request) if self._echoes else 0)
+        takes = max(self._lasted - port.wire_time(self._bytes(self._reads[0]) - self._bytes(read)), back.longest)
+        if now + takes > due or self._late_possible:
+            self.read_back_at = now + _TRY_AGAIN_S
+            return None
+        port.clock.wait_until(due - takes - HOST_S)
+        before = self._now()
+        received = port.ask(read.request, asked, max(due - before, takes), before)
+        servos, _ = read.search(received.removeprefix(read.request))
+        now = self._now()
+        if None in servos:
+            self._late_possible, self._lost = True, 1
+        else:
+            back.took(now - before)
+        found = back.look(servos, self._sent, now)
+        self.read_back_at = back.due
+        return found
+
     def cycle(self, goal_ticks: Sequence[int], *, between: bool = False) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.
 
@@ -164,6 +237,7 @@ class Exchange:
                 goals += write.pack(goal_ticks)
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
+        self._sent.append(goal_ticks)
         timeout = self._timeouts[span]
         before = self._now()
         if self._echoes:
@@ -183,7 +257,9 @@ class Exchange:
                 self._late_possible, self._lost = True, span
         elif self._doubts and self._now() - before < self._soonest[span]:
             servos = self._latest(read, servos, before + timeout)
-        return _reply((before, self._now(), span, servos))
+        after = self._now()
+        self._lasted = after - before
+        return _reply((before, after, span, servos))
 
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
         """Handle replies that arrive sooner than the wire allows: they may belong to an earlier request.
@@ -240,7 +316,7 @@ class Exchange:
             self.strangers += sum(self._is_strange(packet) for packet in packets)
 
     def _is_strange(self, packet: Packet) -> bool:
-        """Whether this is an instruction, or the answer to one, of another master. A refusal has no data."""
+        """Whether this is another master's instruction, or the answer to one. A refusal has no data."""
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
@@ -269,6 +345,71 @@ class Exchange:
 
     def _bytes(self, read: GroupRead) -> int:
         return sum(write.size for write in (self._write, *self._more_writes)) + len(read.request) + read.reply_size
+
+
+class _ReadBack:
+    """Looks in turn at the goals and at the operating modes that the servos hold right before a cycle."""
+
+    def __init__(
+        self,
+        ids: Sequence[int],
+        goal: Span | Sequence[Span],
+        mode: Span | Sequence[Span],
+        modes: Sequence[int],
+        *,
+        fast: bool,
+    ) -> None:
+        kind = FastSyncRead if fast else SyncRead
+        self.reads: tuple[GroupRead, GroupRead] = kind(ids, goal), kind(ids, mode)
+        self.due = -math.inf
+        self.longest = 0.0
+        """Duration of the longest read-back, which fades from memory [s]."""
+        self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
+        self._modes = tuple(modes)
+        self._is_of_modes = True
+        self._goals_sighted: list[deque[float]] = [deque() for _ in ids]
+        self._modes_sighted: list[deque[float]] = [deque() for _ in ids]
+        self._doubts_until = -math.inf
+
+    @property
+    def is_in_doubt(self) -> bool:
+        return self.due < self._doubts_until
+
+    @property
+    def read(self) -> GroupRead:
+        """The next group read."""
+        return self.reads[self._is_of_modes]
+
+    def took(self, seconds: float) -> None:
+        self.longest = max(_FADES * self.longest, seconds)
+
+    def look(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float) -> Overruled | None:
+        """Compare the answers with what was written; return what only another master can have written."""
+        # A servo that was given its neighbour's goal is not one that another master commands.
+        own = {tick for goals in sent for tick in goals}
+        of_modes = self._is_of_modes
+        is_nearly_sure = False
+        for place, answer in enumerate(servos):
+            if answer is None or len(answer) == 1:
+                continue
+            value = answer[-1]
+            if value == self._modes[place] if of_modes else value in own:
+                continue
+            times = (self._modes_sighted if of_modes else self._goals_sighted)[place]
+            while times and now - times[0] > _SIGHTED_S:
+                times.popleft()
+            times.append(now)
+            most = _MODE_SIGHTINGS if of_modes else _GOAL_SIGHTINGS
+            if len(times) >= most:
+                if of_modes:
+                    return Overruled(place, "Operating Mode", value, self._modes[place])
+                return Overruled(place, self._goals[place], value, sent[-1][place])
+            self._doubts_until = now + _IN_DOUBT_S
+            is_nearly_sure |= len(times) == most - 1
+        # A change of mode resets the goal, so a foreign goal may be the first that is seen of it.
+        self._is_of_modes = of_modes == is_nearly_sure
+        self.due = now if now < self._doubts_until else now + _READ_BACK_S
+        return None
 
 
 class _GoalWrite:

@@ -56,7 +56,8 @@ class State(NamedTuple):
     missing: whether the servo returned no values.
     slow, status: values that are only read in some cycles, otherwise None.
     apart: for each joint, the angles of its further servos minus the first's [rad], NaN if one did not reply; None on
-    an arm with one servo per joint. Horns are mounted at any angle, so only a change means something.
+    an arm with one servo per joint. Horns are mounted at any angle, so only a change is
+    meaningful.
     """
 
     time_before_write: float
@@ -125,6 +126,17 @@ def status_span(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable], *, 
 def _status_names(mode: Mode) -> tuple[str, ...]:
     goal = "Goal Current" if mode is Mode.CURRENT else "Goal PWM"
     return "Bus Watchdog", goal, "Realtime Tick", _DRIVE[mode], "Present Velocity", "Present Position"
+
+
+def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans]:
+    """Return the registers that end with the goal, and those that end with Operating Mode.
+
+    They begin earlier, so that answers differ in length from those that other programs usually ask for.
+    """
+    modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
+    goals = [_status_names(own)[:2] for own in modes]
+    goal = Span.of(tables, goals[0]) if len(set(modes)) == 1 else Span.each(tables, goals)
+    return goal, Span.of(tables, ("Return Delay Time", "Drive Mode", "Operating Mode"))
 
 
 class Converter:

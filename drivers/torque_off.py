@@ -172,7 +172,7 @@ def cut_again(servo: Servo, *, armed: bool) -> bool:
 
 
 def was_rebooted(servo: Servo) -> bool:
-    """Whether a servo has lost the watchdog that it was armed with; False if it does not answer.
+    """Whether a servo's watchdog, once armed, is no longer armed; False if it does not answer.
 
     A late reply to an earlier question would be taken for the answer, so another register is read before and after.
     """

@@ -22,6 +22,7 @@ from hil.estimator.errors import ModelError
 from hil.estimator.fit.levenberg_marquardt import Quadratic, minimise
 from hil.estimator.fit.normal_equations import normal_equations
 from hil.estimator.fit.reparametrisation import Coordinates
+from hil.estimator.fit.resolved_widths import resolved_widths
 from hil.estimator.identify import Estimate
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
@@ -80,7 +81,7 @@ class Calibration:
     residual_steps: Array
     """RMS of the residual in encoder steps (runs, joints)."""
     misfit: float
-    """Weighted sum of squares per sample: 1 is noise alone."""
+    """Weighted sum of squared residuals per sample; 1 for noise alone."""
 
 
 @one_blas_thread
@@ -158,7 +159,9 @@ class _TwoRuns:
         scales = np.maximum(np.abs(first.value), 1e-6)
         either = [term_of(name).range == "any" for name in first.names]
         scales[either] = np.maximum(scales[either], 1e-3)
-        self.coordinates = Coordinates(first.names, scales, options.coordinates)
+        step = 1.0 / (periods[0].rate * steps_per_sample(periods[0].rate))
+        resolved = resolved_widths(first.names, first.parameters, step, options.coordinates.widths_per_substep)
+        self.coordinates = Coordinates(first.names, scales, options.coordinates, resolved)
         velocity = float(np.sqrt(np.mean(np.gradient(first.position, 1.0 / periods[0].rate, axis=1) ** 2)))
         self._state_scale = np.repeat([options.angle_scale, velocity], periods[0].joints)
 

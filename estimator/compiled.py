@@ -20,7 +20,8 @@ def compiled(function: Callable[..., Any], sources: Sequence[Path] = (), **optio
     """Compile `function` without the GIL, cached on disk until `sources` or a file in FOLDERS change."""
     dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
     own = [hashlib.sha256(path.read_bytes()).hexdigest() for path in sources]
-    # numba has no public name for this; without it the cache would only check the date of one file, as numba's does.
+    # numba has no public name for this; without it the cache would only check the date of one file, as numba's own
+    # cache does.
     on_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if on_file is not None:
         on_file._source_stamp = (on_file._source_stamp, sources_digest(Path(__file__).parent), *own)

@@ -1,7 +1,7 @@
 """pytest fixtures with fake Dynamixel arms. pytest finds this plugin automatically if hil is installed.
 
     def test_my_driver(fake_arm):
-        port = fake_arm()                          # a pyserial port onto two XM430-W350, IDs 1 and 2, in virtual time
+        port = fake_arm()                          # a pyserial port onto two XM430-W350s, IDs 1 and 2, in virtual time
         my_driver(port).ping(1)
         assert not port.bus.servos[1].torque_enabled
 
@@ -51,7 +51,7 @@ _DEFAULT = {
 
 
 def default_arm() -> "FakeArm":
-    """Return a two-link arm hanging at rest, driven by two XM430-W350 with IDs 1 and 2 at 1 MBd."""
+    """Return a two-link arm hanging at rest, driven by two XM430-W350s with IDs 1 and 2 at 1 MBd."""
     from hil.fakes.description import FakeArm
 
     return FakeArm.model_validate(_DEFAULT)

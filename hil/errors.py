@@ -57,7 +57,7 @@ class Cause(Enum):
     NOT_FOLLOWING = "current does not follow"
     TORQUE_OFF = "torque lost"
     WATCHDOG = "servo's watchdog"
-    GOALS_LOST = "goals not taken"
+    GOALS_LOST = "goals not accepted"
     STALE = "old replies"
     FROZEN = "position and velocity disagree"
     UNEXPECTED = "motion unlike the model"

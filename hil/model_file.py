@@ -152,7 +152,7 @@ def _file(path: Path) -> Path:
 def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
     """Check that every term is present and known: a model without one of its terms would be silently wrong."""
     if joints not in RIGID_BODY:
-        raise ResultError(f"{path}: an arm of {joints} joints; this version of hil has models of one and two.")
+        raise ResultError(f"{path}: an arm of {joints} joints; this version of hil supports one or two.")
     needed = set(base_names(joints))
     possible = {*needed, *extra_names(joints)}
     missing, unknown = sorted(needed - values.keys()), sorted(values.keys() - possible)
@@ -160,7 +160,7 @@ def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
         raise ResultError(f"{path}: is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
     if unknown:
         raise ResultError(
-            f"{path}: has {', '.join(unknown)}, which this version of hil does not know; a newer one wrote it."
+            f"{path}: has {', '.join(unknown)}, which this version of hil does not know; it was written by a newer one."
         )
     bad = [name for name, value in values.items() if not math.isfinite(value)]
     if bad:

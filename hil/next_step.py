@@ -12,5 +12,5 @@ def next_step(*words: object) -> str:
 
 
 def command(*words: object) -> str:
-    """A `hil` command as it is typed, with every word quoted that a shell would split or expand."""
+    """A `hil` command as typed in a shell, with every word quoted that the shell would split or expand."""
     return shlex.join(["hil", *map(str, words)])

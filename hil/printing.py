@@ -1,4 +1,4 @@
-"""Text and tables on standard output that lose nothing in a narrow terminal."""
+"""Text and tables on standard output that are never truncated in a narrow terminal."""
 
 from collections.abc import Iterator
 
@@ -73,7 +73,7 @@ def _paragraphs(table: Table) -> Iterator[tuple[str, list[str]]]:
     title = ""
     for row in zip(*(column.cells for column in table.columns), strict=True):
         first, *others = map(str, row)
-        if not any((first, *others)):  # an empty row only sets two parts of a table apart
+        if not any((first, *others)):  # an empty row only separates two parts of a table
             continue
         title = f"{headings[0]} {first}".strip() if first else title
         yield title, [f"{heading} {cell}".strip() for heading, cell in zip(headings[1:], others, strict=True) if cell]

@@ -31,13 +31,13 @@ _BOUNDS = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}
 class _PlainErrors(type(BaseModel)):  # type: ignore[misc]  # pydantic's metaclass has no public name
     """Raises errors with the text of `describe`, not pydantic's own, when an instance is created in Python.
 
-    Tables that are read from a file are not created by a call, so that their errors keep their place in the file.
+    Tables read from a file are not created by a call, so their errors keep their location in the file.
     """
 
     def __call__(cls, *values: Any, **keys: Any) -> Any:
         if values:
             known = ", ".join(cls.model_fields)
-            raise TypeError(f"{cls.__name__} takes keyword arguments: {known}; not {_shown(values[0])} without one.")
+            raise TypeError(f"{cls.__name__} takes keyword arguments: {known}; {_shown(values[0])} has no keyword.")
         try:
             return super().__call__(**keys)
         except ValidationError as error:
@@ -49,7 +49,9 @@ if TYPE_CHECKING:
 else:
 
     class _Table(BaseModel, metaclass=_PlainErrors):
-        """What `Described` is at run time; type checkers do not follow a metaclass without a name."""
+        """The base of `Described` at run time; it has a name because type checkers do not support an unnamed
+        metaclass.
+        """
 
 
 class Described(_Table):
@@ -117,7 +119,7 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
 
 
 def _as_list(detail: Any, joints: int | None) -> str:
-    """For a number in place of a list with one entry per joint: what to write."""
+    """For a number given where a list with one entry per joint is expected: what to write instead."""
     value = detail["input"]
     if joints is None or detail["type"] != "list_type" or isinstance(value, bool) or not isinstance(value, int | float):
         return ""
@@ -191,11 +193,11 @@ def _in_thousands(expected: str, value: object) -> str:
 
 
 def not_toml(path: Path, error: Exception, text: str) -> str:
-    """What to say of a file with this text that the TOML parser rejects: the line, and the likely cause."""
+    """The error message for a file with this text, which the TOML parser rejects: the line, and the likely cause."""
     other = {".yaml": "YAML", ".yml": "YAML", ".json": "JSON", ".xml": "XML", ".urdf": "XML", ".csv": "CSV"}
     kind = other.get(path.suffix.lower())
     if kind is not None:
-        return f"{path}: it is {kind}, by its name; hil's files are TOML. `hil init` writes one."
+        return f"{path}: judging by its name, it is {kind}; hil's files are TOML. `hil init` writes one."
     lines = text.splitlines()
     place = re.search(r"at line (\d+)", str(error))
     number = int(place[1]) if place else 0
@@ -252,12 +254,12 @@ def _allowed_keys(location: Sequence[str | int], root: type[BaseModel]) -> str:
 
 
 def fields_of(model: Any) -> dict[str, Any]:
-    """The fields of a table by the keys that stand in the file."""
+    """The fields of a table, by the keys used in the file."""
     return {field.alias or name: field for name, field in model.model_fields.items()}
 
 
 def _table(location: Sequence[str | int], root: type[BaseModel]) -> Any:
-    """Return the model of the table in which the last part of a location stands."""
+    """Return the model of the table that contains the last part of a location."""
     keys = [place for place, part in enumerate(location) if isinstance(part, str) and not part.startswith(UNSAID)]
     last = max(keys, default=0)
     model: Any = root

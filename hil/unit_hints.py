@@ -47,7 +47,7 @@ proposed; the groups are different quantities (a torque in newton metres, or in 
 """
 
 _LEAST = {"m/s^2": 1.5, "m": 1e-2, "samples per second": 1.0}
-"""Magnitude below which nobody means a quantity of that unit, unless it is 0: proposals below it mislead."""
+"""Smallest plausible magnitude in that unit, apart from 0: proposals below it would be misleading."""
 
 _BY_LENGTH = sorted((re.escape(unit) for unit in OTHER_UNITS if unit != FRACTION), key=len, reverse=True)
 _IN_DESCRIPTION = re.compile(rf"(?:^|\[|, )(?:C\b|({'|'.join(_BY_LENGTH)}))(?! per N m)(?=$|[\],;: ])")
@@ -68,7 +68,7 @@ def in_other_units(
     """Return "If it is in ms, write 10" for the other units in which every value makes sense; "" if there are none.
 
     Args:
-        values: what was given, as a number or as a list, which is written like one.
+        values: the given number or list; for a list, the proposal is a list too.
         unit: the expected unit.
         makes_sense: whether a value in that unit is allowed and plausible.
         most: largest number of proposals.
@@ -97,7 +97,7 @@ def _fitting(
 
 
 def allowed_by(field: FieldInfo) -> Callable[[float], bool]:
-    """Return whether a number keeps the bounds of a field, or of the entries of its list."""
+    """Return whether a number is within the bounds of a field, or of the entries of its list."""
     bounds = list(_bounds(field))
 
     def keeps(value: float) -> bool:

@@ -1,11 +1,11 @@
-"""From nothing to the first green test of somebody else's driver: a fresh environment, hil's wheel, four lines.
+"""From nothing to the first green test of a third party's driver: a fresh environment, hil's wheel, four lines.
 
     python benchmarks/bus/first_test.py [--from wheel|clone|git] [--json]
 
-The driver is ROBOTIS' own SDK, as a stand-in for one written by somebody else. `pip` uses the package index that it is
+The driver is ROBOTIS' own SDK, as a stand-in for a third party's. `pip` uses the package index that it is
 configured for. The test runs twice; after installation, the first run compiles Python's bytecode.
 
-lines             of the test, imports of the driver aside
+lines             of the test, excluding imports of the driver
 install_seconds   a fresh environment with hil and pytest: what the index and the disk allow
 first_seconds     the first run of pytest
 seconds           both together: the wait until the first green test; wheel_seconds: time for building the

@@ -359,7 +359,7 @@ class Client:
 
 
 def servos() -> FakeArm:
-    """Servos of two models and several firmwares, each with a joint of its own."""
+    """Servos of two models and several firmwares, each with its own joint."""
     arm = load_fake(CONFIGS / "fake_pendulum.toml")
     several = tuple(
         FakeServo(id=servo_id, model=model, firmware=firmware, zero_ticks=2048, baud=1_000_000)

@@ -56,7 +56,7 @@ _CHECKED_CYCLES = 8
 
 
 class DoesNotRun(Exception):
-    """A configuration cannot be played at this rate even without faults, so it cannot be tested."""
+    """A configuration cannot be run at this rate even without faults, so it cannot be tested."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Ready:
 def prepare(
     setting: Setting, period: float = PERIOD_S, make_document: Callable[[Setting, float], Document] = arms.make_document
 ) -> Ready:
-    """Play the configuration once without faults. Raises DoesNotRun if that fails."""
+    """Run the configuration once without faults. Raises DoesNotRun if that fails."""
     if _PACKAGE not in serial.protocol_handler_packages:
         serial.protocol_handler_packages.append(_PACKAGE)
     folder = Path(tempfile.mkdtemp(prefix="campaign-"))
@@ -247,7 +247,7 @@ def _designed(rate: float, period: float, lines: Any, peaks: Any, seed: int) -> 
 
 @contextlib.contextmanager
 def _quick() -> Iterator[None]:
-    """Play with cached waves, whose design takes as long as the run, and with a short measurement of the bus."""
+    """Run with cached waves, whose design takes as long as the run, and with a short measurement of the bus."""
 
     def remembered(
         rate: float, period: float, lines: Sequence[Sequence[int]], peak_torque: Sequence[float], seed: int

@@ -15,7 +15,7 @@ TOGETHER_S = 0.3
 """Half of the pairs follow each other within this time [s]."""
 
 OFTEN = 0.25
-"""Share of the faults that meet the phase that is to be met often."""
+"""Share of the faults that occur in the phase that is to be tested often."""
 
 SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "cable", "torque", "reboot"
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
@@ -160,7 +160,7 @@ UNHEARD = _INSTRUCTIONS | {
 """Faults during which the program cannot reach a servo, so that the watchdog's timeout applies."""
 
 SHIFTED = frozenset({Kind.HOLD, Kind.STALL, Kind.SUSPENDED, Kind.HICCUPS, Kind.SPLIT, FaultKind.LATE_REPLY})
-"""Faults after which the program may play its plan later than in an undisturbed run."""
+"""Faults after which the program may run its plan later than in an undisturbed run."""
 
 HARMLESS = frozenset({Kind.CLOCK_WRAP, Kind.CLOCK_SET, Kind.RAISED_LIMIT})
 """Faults after which a run ends as if undisturbed."""
@@ -204,7 +204,7 @@ class Drawn:
 def draw(seed: object, until: float, ids: Sequence[int], often_since: float | None = None) -> Drawn:
     """Draw one or two faults for a run that lasts `until` [s] undisturbed; the same seed gives the same faults.
 
-    often_since: beginning of a phase that a quarter of the faults meet, although it is short [s].
+    often_since: beginning of a phase in which a quarter of the faults occur, although it is short [s].
     """
     random = Random(f"drawn {seed}")
     first = random.uniform(0.0, until)

@@ -321,7 +321,7 @@ def _astray(
 def _same_plan(own: NDArray[Any], undisturbed: NDArray[Any]) -> int:
     """For how many milliseconds a servo was given the goals of the undisturbed run.
 
-    Later another plan is played: a disturbed period is no repetition of the one before, so one more is needed.
+    Later a different plan is run: a disturbed period does not repeat the one before, so one more is needed.
     """
     largest = np.abs(undisturbed["goal"][undisturbed["driven"]]).max(initial=1)
     other = np.abs(own["goal"] - undisturbed["goal"]) > OBEYED * largest

@@ -148,7 +148,7 @@ def _stick(arm: Arm) -> Arm:
 
 
 def _differences(arm: Arm, parameters: Array, told: Heard) -> Array:
-    """Differences of angles, then of velocities, relative to those that are ordinary (2 n joints,)."""
+    """Differences of angles, then of velocities, relative to ordinary ones (2 n joints,)."""
     angle, velocity = _played(arm, parameters, told)
     return np.concatenate(((angle - told.angle).ravel() / SAME_RAD, (velocity - told.velocity).ravel() / SAME_RAD_S))
 

@@ -170,8 +170,7 @@ def _test_in_child(module: str, source: str) -> None:
         sys.modules[name] = mutated
         exec(compile(source, module, "exec"), mutated.__dict__)
         with tempfile.TemporaryDirectory() as compiled:
-            # Code compiled before, without this mutation, must not be found.
-            numba.config.CACHE_DIR = compiled  # type: ignore[attr-defined]
+            vars(numba.config)["CACHE_DIR"] = compiled  # code compiled before, without this mutation, must not be found
             code = int(pytest.main(["-q", "-x", "-n", "0", "-p", "no:cacheprovider", *TESTS[module]]))
     except BaseException:
         code = 1

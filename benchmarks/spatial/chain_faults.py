@@ -7,10 +7,10 @@ The faults are those of benchmarks/faults.py, injected into the whole command on
 "current must end within 100 ms" holds only where the servos cannot be commanded any more. The emulated servos' own
 record, which the program never sees, decides:
 
-can command     the faults are of kinds that leave commands and readings true (`COMMANDABLE`), the record shows no
+can command     the faults are of kinds that leave commands and readings intact (`COMMANDABLE`), the record shows no
                 servo that was silent, disobeyed or reported something false, and nothing held the arm by force
 unsafe          judged by what the program can do: servos that obey may be driven until the arm is lowered, since
-                nothing else lays it down; a motor whose current the program does not decide must be off within 100 ms;
+                nothing else lowers it; a motor whose current the program does not control must be off within 100 ms;
                 one that hears nothing can only be stopped by its watchdog. So: a motor that carried a current that was
                 not commanded for more than 100 ms (the watchdog's time where a servo hears nothing), also while the
                 arm was lowered; current for longer than that after a servo was silent or the cable unplugged; after
@@ -77,7 +77,7 @@ COMMANDABLE = _BY_FORCE | {
 """Kinds after which every servo still receives, obeys and reports true values."""
 
 WEAKER = 0.3
-"""Force relative to the largest motor torque of the run that a motor overcomes on the way home in any pose."""
+"""Force relative to the largest motor torque of the run that a motor overcomes on the path home in any pose."""
 
 SETTLES_S = 1.0
 """Time beyond the predicted lowering that a stop may take [s]."""
@@ -213,7 +213,7 @@ def _owed(reasons: list[Reason], unreached: list[Reason], cut_ms: float, lower_m
 
 @cache
 def longest_lowering(path: Path) -> float:
-    """Longest way home [s] from any point of the planned path."""
+    """Longest path home [s] from any point of the planned path."""
     from hil.config.schema import parse_config
     from hil.plan.chain_plan import make_chain_plan
 
@@ -228,7 +228,7 @@ def longest_lowering(path: Path) -> float:
 
 
 def _leaves_command(drawn: Drawn, ended: float) -> bool:
-    """Whether all faults are of kinds that leave the arm to be commanded, and no force held it at the end.
+    """Whether all faults are of kinds after which the arm can still be commanded, and no force held it at the end.
 
     A second request to stop asks for torque to be cut at once, so it does not.
     """

@@ -3,6 +3,7 @@
 from contextlib import suppress
 
 from hil.drivers.errors import BusShared, NoReply, ServoFault, WrongReply, WrongSetting
+from hil.drivers.exchange import Overruled
 from hil.drivers.joint import Joint
 from hil.drivers.packet import Framer, HardwareError
 from hil.drivers.port import Port
@@ -69,6 +70,14 @@ def shared(what: str) -> BusShared:
     return BusShared(
         f"Another master {what} on this bus, or the adapter echoes what this program sends. Two masters corrupt each "
         "other's packets, and the other's goals would move the arm too: end that program, or unplug that controller."
+    )
+
+
+def overruled(joint: Joint, found: Overruled) -> BusShared:
+    """Return the error for a servo that holds a goal or a mode that this program did not write."""
+    return BusShared(
+        f"{joint.title[0].upper()}{joint.title[1:]} is commanded by another program: its {found.register} reads "
+        f"{found.value}, but {found.written} was written. End that program, or unplug its controller."
     )
 
 

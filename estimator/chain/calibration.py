@@ -107,7 +107,7 @@ def calibrate_chain(
 
 
 def _std(rows: Array, covariance: Array) -> Array:
-    """Standard errors of linear combinations; infinite where one of an undetermined parameter is used."""
+    """Standard errors of linear combinations; infinite for those that include an undetermined parameter."""
     known = np.isfinite(np.diag(covariance))
     variance = np.einsum("ij,jk,ik->i", rows[:, known], covariance[np.ix_(known, known)], rows[:, known])
     unknown = np.any(rows[:, ~known] != 0.0, axis=1)

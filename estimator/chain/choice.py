@@ -67,7 +67,7 @@ def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, 
 
 
 def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) -> float:
-    """Return the rise of twice the log likelihood, beyond what chance explains; each joint's noise is unknown.
+    """Return the increase of twice the log likelihood beyond that due to chance; each joint's noise level is unknown.
 
     The residual's correlation is that of the richer model: what the simpler one leaves out is not noise.
     """

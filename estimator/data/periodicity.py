@@ -57,7 +57,7 @@ def periods_of_drift(differences: Sequence[float], within: float) -> int | None:
     """Return how many more periods a slow drift takes until successive periods differ by at most `within`.
 
     As grease warms up, the change from period to period decreases slowly and steadily. None if the changes do not look
-    like that: play or a dragging cable make them irregular, and a transient dies out faster.
+    like that: backlash or a dragging cable make them irregular, and a transient dies out faster.
 
     differences: relative differences of successive periods, in the order of time; the first may contain a transient.
     """

@@ -1,1 +1,1 @@
-"""Multisine excitation, and its optimisation for the largest relative standard error."""
+"""Multisine excitation, and its optimisation to minimise the largest relative standard error."""

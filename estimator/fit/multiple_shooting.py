@@ -26,6 +26,7 @@ from hil.estimator.data.segments import Grid, RecordingSegment, cut, grid_torque
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.covariance import by_parameters
 from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Sizes, scales_of
+from hil.estimator.fit.resolved_widths import resolved_widths
 from hil.estimator.fit.segmented_least_squares import Expected, Segmented, minimise_segmented
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
@@ -118,10 +119,12 @@ class Shooting:
         self._trust = np.ones((len(self.segments), model.joints))
         self._driven: dict[tuple[float, float], list[tuple[Array, Array]]] = {}
 
-    def coordinates(self, inertia: float) -> Coordinates:
-        """Return the parameters' coordinates; `inertia` [kg m^2]: typical inertia of the arm."""
-        scales = scales_of(self._model.names, Sizes(*self._scales, inertia))
-        return Coordinates(self._model.names, scales, self._options.coordinates)
+    def coordinates(self, base: Mapping[str, float]) -> Coordinates:
+        """Return the parameters' coordinates; `base`: approximate base parameters by name [SI]."""
+        names, options = self._model.names, self._options
+        scales = scales_of(names, Sizes(*self._scales, max(base["inertia_1"], 1e-6)))
+        resolved = resolved_widths(names, base, options.max_step, options.coordinates.widths_per_substep)
+        return Coordinates(names, scales, options.coordinates, resolved)
 
     def position(self, segment: RecordingSegment, physics: Physics, state: Array) -> Array:
         """Return the simulated positions at a segment's samples (joints, samples) [rad] from `state` (2, joints)."""
@@ -311,7 +314,7 @@ def estimate_by_shooting(
         return Shooting(recordings, model, part * length, zeros=zeros, of=of, most=most, step=step, options=options)
 
     coarse = posed(1.0, None, options.coarse_step)
-    coordinates = coarse.coordinates(max(float(start[0]), 1e-6))
+    coordinates = coarse.coordinates(dict(zip(model.base_names, start.tolist(), strict=True)))
     if near is None:
         short = posed(options.short, options.start_segments, options.coarse_step)
         long = posed(1.0, options.start_segments, options.coarse_step)

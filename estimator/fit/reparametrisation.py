@@ -17,7 +17,7 @@ from hil.estimator.models.terms import Scale, joint_of, term_of
 from hil.estimator.options import CoordinateOptions
 
 TYPICAL_SATURATION = 0.02  # typical fraction of the RMS torque lost; only a scale
-LEAST_WEIGHT = 0.02  # least gravity_2 that gives a scale, as a fraction of the RMS torque
+LEAST_WEIGHT = 0.02  # minimum gravity_2 to be used as a scale, as a fraction of the RMS torque
 TYPICAL_CABLE = 0.15  # stiffness of a stiff cable, as a fraction of the RMS torque per radian
 TYPICAL_COGGING = 0.01  # typical cogging, as a fraction of the RMS torque; only a scale
 TYPICAL_BEND = 0.01  # rad: typical presliding deflection; only a scale

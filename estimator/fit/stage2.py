@@ -24,13 +24,13 @@ from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.multistart import Refined, Search
 from hil.estimator.fit.objective import Objective, Run
 from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Lever, Sizes, scales_of
+from hil.estimator.fit.resolved_widths import resolved_widths
 from hil.estimator.fit.ripple import WAVES, find_waves
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.fit.stage1 import LinearEstimate
 from hil.estimator.models.model import Model
-from hil.estimator.models.parameters import Physics
-from hil.estimator.models.terms import FRICTIONS, joint_of, term_of
+from hil.estimator.models.terms import FRICTIONS, term_of
 from hil.estimator.options import LikelihoodOptions
 
 DEFAULTS = LikelihoodOptions()
@@ -157,21 +157,13 @@ def _objective(
 
 
 def _resolved_widths(model: Model, linear: LinearEstimate, options: LikelihoodOptions) -> Array:
-    """Return the narrowest Coulomb steps that the simulation resolves [rad/s], 0 for other parameters (parameters,).
-
-    On a light arm, friction stops a joint within microseconds: narrower steps look the same in any recording, but their
-    simulation is chaotic.
-    """
-    values = dict(zip(linear.names, np.abs(linear.value).tolist(), strict=True))
-    inertias = Physics.of(values).free_inertias()
-    shortest = options.integration.max_step / options.integration.max_substeps
-    widths = np.zeros(len(model.names))
-    for index, name in enumerate(model.names):
-        if term_of(name).range == "floor":
-            joint = joint_of(name) or 1
-            reversal = 2.0 * values[f"coulomb_{joint}"] / max(inertias[joint - 1], 1e-12)
-            widths[index] = reversal * shortest / options.coordinates.widths_per_substep
-    return widths
+    return resolved_widths(
+        model.names,
+        dict(zip(linear.names, linear.value.tolist(), strict=True)),
+        options.integration.max_step,
+        options.coordinates.widths_per_substep,
+        options.integration.max_substeps,
+    )
 
 
 def _simulated(period: SettledPeriod, options: LikelihoodOptions) -> Run:
@@ -301,8 +293,8 @@ def _tempered(
 
     The sum of squares takes the errors of all samples as independent. Under a model error, which repeats at every
     reversal, the data determine a parameter much less well, as its standard error shows, and the error would override
-    any prior: a torque constant half of what is possible, encoder errors of several degrees. Therefore each prior's
-    precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
+    any prior: a torque constant of half the smallest plausible value, encoder errors of several degrees. Therefore each
+    prior's precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
     """
     count, prior = objective.count, objective.prior
     if objective.lever is None and not prior.precision.any():

@@ -18,8 +18,8 @@ model lacks (Stribeck friction, backlash, flexibility) widen the admissible rang
 enters that estimate only once it has ended without one; otherwise a joint that is held for long would widen the range
 until nothing exceeds it. While a joint stands still its noise is lower, since most of it needs motion.
 
-Errors of the model last longer than a lesson, and so does the rounding of a velocity that stays below one tick: they
-are not new information each time. The parameters therefore learn from each lesson as if it were a fraction of one.
+Errors of the model last longer than the interval between two updates, and so does the rounding of a velocity that stays
+below one tick: they are not new information each time. Therefore each update counts only as a fraction of one.
 """
 
 import math
@@ -39,7 +39,7 @@ NAMES = (
 
 FILTER_S = 0.02
 HOLD_S = 0.05
-"""Time for which the missing torque must exceed its thresholds [s]: longer than a gear takes to cross its play."""
+"""Time for which the missing torque must exceed its thresholds [s]: longer than a gear takes to cross its backlash."""
 
 TIMES = 4.0
 FLOOR_SHARE = 0.25
@@ -53,7 +53,7 @@ _FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned t
 _NOISE_S = 1.0  # time constant of the noise estimate
 _CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in variances of the noise
 _STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
-_LESSONS = 2.0  # number of lessons in a row that share an error of the model
+_LESSONS = 2.0  # number of successive updates that share an error of the model
 _STANDING_LESSONS = 28.0  # the same, for the rounding of velocities that stay below a tick while a joint hardly moves
 _DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # drift of a parameter per second, relative to its value and to its initial deviation
 _MOST_WEIGHT = 6.0  # maximum weight of a sample whose missing torque exceeds the threshold by far
@@ -208,7 +208,7 @@ def _second_moment(m: Any, weight_1: float, coupling: float, weight_2: float, ar
 def _of_rounding(m: Any, j: int, slope: float, cos_2: float) -> float:
     """Return the variance of the missing torque due to the rounding of both velocities to ticks.
 
-    As long as the inertias are not known, this counts each as large as it may be.
+    As long as the inertias are unknown, each counts with its largest possible value.
     """
     across = _second_moment(m, 0.0, cos_2, 1.0, 0.0)
     own = _second_moment(m, 1.0, 2.0 * cos_2, 1.0, 0.0) if j == 0 else _second_moment(m, 0.0, 0.0, 1.0, 1.0)

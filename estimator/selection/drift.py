@@ -60,8 +60,9 @@ def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
     """Return the covariance (parameters, parameters) including that friction changed while `period` was recorded.
 
     The fit assumes constant friction. Where friction changes at the rate of `drift`, other parameters follow the slow
-    change of torque, above all those that act slowly too, such as gravity of an arm that hardly feels it. The motion is
-    assumed to follow the instantaneous friction, which holds if transients decay within a small part of the period.
+    change of torque, above all those that also act slowly, such as gravity on an arm that is hardly affected by it. The
+    motion is assumed to follow the instantaneous friction, which holds if transients decay within a small part of the
+    period.
     """
     about = linearised(period, estimate, (), {})
     derivative = by_parameters(period, estimate)
@@ -88,8 +89,8 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
     """Return the change of friction from `estimate` to `period`, which is `seconds` [s] later.
 
     It is found by Gauss-Newton iterations on one factor per joint and the initial state; all other parameters are
-    fixed. A step that does not improve the prediction is shortened. Where no simulation from the period's start stays
-    finite, nothing is known of a change: its standard error is infinite.
+    fixed. A step that does not improve the prediction is shortened. If no simulation from the period's start stays
+    finite, nothing is known about a change: its standard error is infinite.
     """
     joints = period.joints
     later = _Later.of(period, estimate)

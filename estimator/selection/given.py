@@ -1,8 +1,8 @@
 """Fit of a model whose terms are given, with the periods of its ripple and cogging searched twice.
 
-The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period as long as it explains the rest of
+The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period provided that it explains the rest of
 the motion. Encoder errors, cables and narrow Stribeck friction are not linear in its lines, and if they matter, the
-search may end at a wrong period, from which no fit returns. The second search starts from a fit of all other terms.
+search may end at a wrong period, from which no fit recovers. The second search starts from a fit of all other terms.
 """
 
 from collections.abc import Mapping, Sequence
@@ -60,7 +60,7 @@ def _with_wave(
 ) -> Estimate:
     """Return the best fit of the estimate's model with a wave, from its most likely numbers of cycles.
 
-    A wave is seen best where other terms explain most, even if they only imitate it; they are fitted for that alone.
+    A wave is most visible where other terms explain most, even if they only imitate it; they are fitted only for that.
     """
     model, joints = estimate.model.having(wave), range(1, estimate.model.joints + 1)
     rich = replace(estimate.model, friction=FRICTIONS[-1]).having("zeros", *SMOOTH)

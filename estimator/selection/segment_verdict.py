@@ -69,7 +69,7 @@ def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, 
     left, held_out = float(estimate.residual_over_noise.max()), evidence.held_out
     weakest = max(relative, key=lambda name: relative[name])
     sentences = (
-        *(("Do not use these numbers: the warnings say why.",) if evidence.faulty else ()),
+        *(("Do not use these numbers: the warnings give the reasons.",) if evidence.faulty else ()),
         _left(estimate, evidence),
         _predicted(held_out, estimate.segment_length),
         *evidence.doubts,

@@ -62,7 +62,7 @@ def choose(
         drive: drive model of all candidates.
         torque_scale: whether the ratio of the torque constants is kept in any case.
         by_voltage: joints, from 1, that are driven by voltage.
-        lever: as of `hil.estimator.models.model.Model`.
+        lever: as for `hil.estimator.models.model.Model`.
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
         seconds: time from the middle of `periods` to that of `held_out` [s], if known.
         options: thresholds.
@@ -186,7 +186,7 @@ class Selection:
         return best
 
     def _closest(self) -> list[Trial]:
-        """Return the trials that explain most, with and without presliding, the best first.
+        """Return the trials that explain most, with and without presliding, best first.
 
         Ripple is most visible where other terms explain most, whether or not they are significant yet; but bristles may
         have absorbed part of it.

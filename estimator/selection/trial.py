@@ -23,7 +23,7 @@ QUICK = LikelihoodOptions(
     integration=IntegrationOptions(max_substeps=16),
     coarse_integration=IntegrationOptions(max_step=2.6e-3, max_substeps=8),
 )
-"""With these limits, bristles that become extremely stiff do not take many substeps without benefit."""
+"""With these limits, no substeps are wasted on bristles that become extremely stiff."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Periods of torque ripple and cogging: score tests of one number of cycles per turn after the other."""
+"""Periods of torque ripple and cogging: score tests of each number of cycles per turn."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -24,7 +24,7 @@ def wave_peaks(
     waves: Sequence[Wave] = WAVES,
     only: Sequence[int] = (),
 ) -> dict[str, tuple[float, ...]]:
-    """Return the numbers of `cycles` per turn at which a wave explains more than at neighbouring ones, the best first.
+    """Return the numbers of `cycles` per turn at which a wave explains more than at neighbouring ones, best first.
 
     What the fitted parameters explain is removed first. The result is by parameter name. Waves that the estimate's
     model includes are left out where they are sought. While other terms have absorbed part of a wave, the best number
@@ -56,7 +56,7 @@ def wave_peaks(
 
 
 def ranked_cycles(peaks: Mapping[str, Sequence[float]], most: int) -> list[dict[str, float]]:
-    """Return at most `most` choices of cycles from the result of `wave_peaks`, by parameter name, the best first.
+    """Return at most `most` choices of cycles from the result of `wave_peaks`, by parameter name, best first.
 
     Later choices take the next number of every wave that has one.
     """
@@ -65,7 +65,7 @@ def ranked_cycles(peaks: Mapping[str, Sequence[float]], most: int) -> list[dict[
 
 
 def without_height(wave: Wave, joints: Iterable[int]) -> dict[str, float]:
-    """Return the heights of a wave that is absent from `joints`, from 1, by parameter name."""
+    """Return zero amplitudes of a wave for `joints`, from 1, by parameter name."""
     return {f"{wave}_{part}_{joint}": 0.0 for part in ("sin", "cos") for joint in joints}
 
 

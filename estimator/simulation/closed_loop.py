@@ -15,7 +15,8 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled
 from hil.estimator.models.parameters import Physics
-from hil.estimator.simulation.arm import finer_pieces, pieces_now, step_bent, steps_per_sample
+from hil.estimator.options import IntegrationOptions
+from hil.estimator.simulation.arm import INTEGRATION, finer_pieces, pieces_now, step_bent, steps_per_sample
 from hil.estimator.simulation.bristles import first_bend, has_bristles, without_dry_friction
 from hil.estimator.simulation.encoder import measured
 
@@ -110,13 +111,20 @@ def resting(pose: Array) -> Array:
     return np.stack((pose, nothing, nothing, pose, nothing, nothing))
 
 
-def respond(physics: Physics, state: Array, command: Array, rate: float, feedback: Feedback) -> Response:
+def respond(
+    physics: Physics,
+    state: Array,
+    command: Array,
+    rate: float,
+    feedback: Feedback,
+    integration: IntegrationOptions = INTEGRATION,
+) -> Response:
     """Simulate the samples of `command` (joints, samples) [N m] at `rate` [1/s] from `state`.
 
     `state` is as in `Response.state`; without its last row, the bristles are deflected as in sliding joints.
     """
     joints, samples = command.shape
-    steps = steps_per_sample(rate)
+    steps = steps_per_sample(rate, integration.max_step)
     step = 1.0 / (rate * steps)
     gains = np.zeros((4, 2))
     gains[:, :joints] = feedback.stiffness, feedback.damping, feedback.pose, feedback.limit
@@ -130,7 +138,7 @@ def respond(physics: Physics, state: Array, command: Array, rate: float, feedbac
     moving = without_dry_friction(physics.vector)
     respond_compiled(
         *(physics.vector, has_bristles(physics), moving, full, both, gains, physics.encoder),
-        *(physics.late, step, steps, finer_pieces(physics, step), position, velocity, torque),
+        *(physics.late, step, steps, finer_pieces(physics, step, integration.max_substeps), position, velocity, torque),
     )
     return Response(position[:joints], velocity[:joints], torque[:joints], full[:, :joints])
 

@@ -1,7 +1,6 @@
 """Simulation of many arms under the same commands in one call of compiled code, as needed by a dry run.
 
-Equations, integration and feedback are those of `hil.estimator.simulation.closed_loop` with longer steps: peaks are
-accurate to a few milliradians, in a tenth of the time.
+Equations, integration and feedback are those of `hil.estimator.simulation.closed_loop` with longer steps.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,11 +14,13 @@ import numpy.typing as npt
 from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled
 from hil.estimator.models.parameters import Physics
+from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.arm import finer_pieces, steps_per_sample
 from hil.estimator.simulation.bristles import has_bristles, without_dry_friction
 from hil.estimator.simulation.closed_loop import Feedback, respond_compiled
 
-ROUGH_STEP, ROUGH_PIECES = 2.6e-3, 4  # s; substeps near standstill
+COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=4)
+"""Integration for peaks and overshoots: accurate to a few milliradians, in a tenth of the time."""
 LOWEST, HIGHEST, VELOCITY, TORQUE, POWER = range(5)
 """Rows of the peak values."""
 
@@ -35,11 +36,11 @@ class Commands:
 
 @dataclass(frozen=True)
 class SettlingRule:
-    """Rule for how many periods are played.
+    """Rule for the number of periods to simulate.
 
     within: two successive periods that differ by at most this fraction of the motion's RMS count as settled.
     most_periods: maximum number of periods after the first until that is the case.
-    periods: total number of settled periods that are then played.
+    periods: total number of settled periods that are then simulated.
     """
 
     within: float
@@ -98,7 +99,7 @@ class ManyArms:
 
     def _arguments(self, rate: float) -> tuple[Any, ...]:
         count, joints = self.scale.shape
-        steps = steps_per_sample(rate, ROUGH_STEP)
+        steps = steps_per_sample(rate, COARSE.max_step)
         step = 1.0 / (rate * steps)
         feedback = self.feedback
         gains, scale, pose = np.zeros((4, 2)), np.ones((count, 2)), np.zeros((count, 2))
@@ -109,7 +110,7 @@ class ManyArms:
             np.array([has_bristles(each) for each in self.physics]),
             np.stack([without_dry_friction(each.vector) for each in self.physics]),
             np.stack([each.late for each in self.physics]),
-            np.array([finer_pieces(each, step, ROUGH_PIECES) for each in self.physics]),
+            np.array([finer_pieces(each, step, COARSE.max_substeps) for each in self.physics]),
             *(scale, pose, gains, step, steps),
         )
 

@@ -210,7 +210,7 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
     if at[SATURATION + joint] != NOWHERE:
         lost = -cube * shape
         rows[f + at[SATURATION + joint]], rows[s + at[SATURATION + joint]] = lost * passed, lost * loaded * bent
-    # By the torque before saturation and ripple, which back-EMF is a part of.
+    # By the torque before saturation and ripple, which includes the back-EMF.
     driven, driven_slope = eased * shape * passed, eased * shape * loaded * bent
     if at[GENERATED + joint] != NOWHERE:
         rows[f + at[GENERATED + joint]], rows[s + at[GENERATED + joint]] = v - v * driven, -v * driven_slope

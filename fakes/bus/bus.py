@@ -165,7 +165,7 @@ class FakeBus:
         deadline = now + timeout_s
         if timeout_s > 0 and deadline <= now:
             # Advance time even when the timeout is too small to change the sum, so that a client polling in a loop
-            # until its timeout expires does get there.
+            # until its timeout expires does not loop forever.
             deadline = math.nextafter(now, math.inf)
         taken = b""
         while True:

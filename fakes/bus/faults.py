@@ -6,7 +6,7 @@ Faults can also be given in TOML, as `[[fake.faults]]` with the same keys, and o
 lost_reply:servo=2,at=3`. `FAULTS` describes each kind. Times are seconds since the bus was created (`bus.time`).
 
 Faults of packets (replies, instructions, noise) affect each packet while they last, with their probability. The others
-happen once, at their time; with their probability, or not at all. The same seed gives the same faults.
+happen at most once, at their time, with their probability. The same seed gives the same faults.
 """
 
 import difflib
@@ -189,7 +189,7 @@ class Faults:
 
     @property
     def lasting(self) -> tuple[Fault, ...]:
-        """The faults that have begun and not ended."""
+        """The faults that have begun but not ended."""
         return tuple(self._lasting)
 
     def change(self, now: float) -> None:
@@ -266,7 +266,7 @@ def parse_fault(text: str) -> Fault:
     if kind not in set(FaultKind):
         near = difflib.get_close_matches(kind, list(FaultKind), 1)
         meant = f" Did you mean {near[0]}?" if near else ""
-        raise ValueError(f'fault "{text}": there is no kind {kind!r}.{meant} Its kinds: {", ".join(FaultKind)}')
+        raise ValueError(f'fault "{text}": there is no kind {kind!r}.{meant} Available kinds: {", ".join(FaultKind)}')
     keys = [name for name in Fault.model_fields if name != "kind"]
     values: dict[str, object] = {"kind": kind}
     for part in filter(None, rest.split(",")):

@@ -26,7 +26,7 @@ class Thermal(Described):
 
 
 class Overload(Described):
-    """Shutdown after too long a time at a high current."""
+    """Shutdown after the current has been high for too long."""
 
     current_a: Annotated[
         float, Field(gt=0, le=100, allow_inf_nan=False, description="motor current above which the timer runs [A]")

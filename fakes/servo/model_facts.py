@@ -8,7 +8,7 @@ the sister models. Protocol Type only accepts 2, because a fake servo does not s
 Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
 tens of percent, which is enough to make a position move look right. The XC330-T288's stall current is uncertain.
 
-A model without facts of its own uses those of a sister model, named in `STANDS_FOR`: its factory values and ranges are
+A model without its own facts uses those of a sister model, named in `STANDS_FOR`: its factory values and ranges are
 uncertain.
 """
 
@@ -235,7 +235,7 @@ STANDS_FOR: Mapping[str, str] = {
     "XC430-W150": "XL430-W250",
     "XC430-W240": "XL430-W250",
 }
-"""Models without facts of their own, and the sister model whose factory values and ranges they assume."""
+"""Models without their own facts, and the sister model whose factory values and ranges they assume."""
 
 _STRENGTH = (0, 1023)
 

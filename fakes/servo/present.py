@@ -172,7 +172,7 @@ class Present:
         return current
 
     def _measure_other(self, now: float, position: float) -> None:
-        """Update a model of another series: its position, in ticks of an X-series encoder, if it has the register."""
+        """Update the position of a model of another series, in ticks of an X-series encoder, if it has the register."""
         register = self._model.registers.get("Present Position")
         if register is not None and register.size == 4:
             self._memory.store(register, round(self.ticks(position)))

@@ -143,7 +143,7 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
         yield
     except BaseException as stopped:
         if not run.discard_if_unused():
-            with suppress(Exception):  # a hint must never take the place of what stopped the arm, and of its torque
+            with suppress(Exception):  # a failing hint must not hide what stopped the arm, or its torque state
                 for line in _how_to_go_on(stopped, run, command, shown):
                     stopped.add_note(line)
         raise

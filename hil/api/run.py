@@ -114,7 +114,7 @@ class Estimation(ShootingResult):
 class Run:
     """A recorded run.
 
-    config: the configuration, with the experiment as it was actually played. record: the contents of run.json. samples:
+    config: the configuration, with the experiment that was actually run. record: the contents of run.json. samples:
     every sample taken (dtype: hil.runs.recording.sample_type). events: (time on the port's clock [s], what happened).
     periods: after an estimate, the settled periods by role, as measured and as predicted by the model. result: None
     before an estimate.
@@ -135,7 +135,7 @@ class Run:
 
     @property
     def model(self) -> ArmModel:
-        """The identified arm. Raises ResultError before an estimate from settled periods."""
+        """The identified arm. Raises ResultError if there is no estimate from settled periods yet."""
         if not isinstance(self.result, Identification):
             raise ResultError(f"{self.path} has no estimate from settled periods yet; run hil.estimate first.")
         return self.result.model

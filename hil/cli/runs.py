@@ -39,7 +39,7 @@ def runs(
 
 
 def _print_runs(found: "list[RunSummary]") -> None:
-    """A table; if the terminal is too narrow for it, each run's path on a line of its own, so that it can be copied."""
+    """A table; if the terminal is too narrow for it, each run's path on a separate line, so that it can be copied."""
     from rich.markup import escape
     from rich.table import Table
 

@@ -42,18 +42,18 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 def how_to_go_on(stopped: BaseException) -> list[str]:
-    """The notes about what was stopped, and the next command."""
+    """The notes attached to the interrupted call, and the next command."""
     return [*getattr(stopped, "__notes__", []), *same_again(stopped)]
 
 
 def same_again(stopped: BaseException) -> list[str]:
-    """The same command as the next one, if the notes about what was stopped name none."""
+    """The same command as the next one, if the notes attached to the interrupted call name none."""
     notes = getattr(stopped, "__notes__", [])
     return [] if any("hil " in note for note in notes) else [next_step(*sys.argv[1:])]
 
 
 def _catch() -> dict[signal.Signals, Any]:
-    """Catch signals that would end the program silently; leaves those that are handled or ignored (nohup)."""
+    """Catch signals that would end the program silently; leave those that are already handled or ignored (nohup)."""
     caught = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) == signal.SIG_DFL]
     return {each: signal.signal(each, _raise) for each in caught}
 

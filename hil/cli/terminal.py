@@ -33,13 +33,13 @@ _PHASES = {
 }
 
 _NARROW = 76
-"""Columns below which the bar would not fit."""
+"""Smallest terminal width into which the bar fits [columns]."""
 
 _QUIET_S = 0.7
-"""Time without a report after the arm has come to rest, from which on the display says what goes on [s]."""
+"""Time without a report, once the arm is at rest, after which the display says what is being computed [s]."""
 
 _CELLS = 3
-"""Number of cells from which on a line is a row of a table."""
+"""Smallest number of cells for a line to count as a row of a table."""
 
 
 class Terminal:
@@ -53,7 +53,7 @@ class Terminal:
 
     @contextmanager
     def busy(self, text: str) -> Iterator[None]:
-        """Show a spinner beside `text` while the block runs."""
+        """Show a spinner next to `text` while the block runs."""
         with self.console.status(f"{text} ..."):
             yield
 
@@ -106,7 +106,7 @@ class Terminal:
         task = bar.add_task("", total=1.0)
         rate = config.experiment.rate
         view = LiveView(config, self.console.width)
-        computing = Spinner("dots", "Computing with what was recorded ...")
+        computing = Spinner("dots", "Processing the recording ...")
         shown: Group | Progress = bar
         told_at, is_over = 0.0, False
 
@@ -127,7 +127,7 @@ class Terminal:
 
 
 def _bar(console: Console) -> Progress:
-    """The line above the joints, in as many words as the terminal is wide."""
+    """The line above the joints, as detailed as the terminal's width allows."""
     if console.width < _NARROW:
         return Progress(
             TextColumn("{task.description}"),
@@ -145,7 +145,7 @@ def _bar(console: Console) -> Progress:
 
 
 def rows_below(text: str, width: int) -> str:
-    """The text, with each row of a table in it as lines of their own where the table is wider than `width`.
+    """The text, with each row of a table on separate lines if the table is wider than `width`.
 
     A row's cells are two spaces or more apart; the first row holds the headings.
     """

@@ -54,7 +54,7 @@ class Columns(_Table):
     """`[columns]`: the meaning and unit of each column. Anything omitted is taken from the column headers."""
 
     time: Column | None = None
-    rate: PositiveFloat | None = Field(None, le=1e5, description="samples per second, where there is no column of time")
+    rate: PositiveFloat | None = Field(None, le=1e5, description="samples per second, if there is no time column")
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
     position: list[Column] | None = Field(
         None, min_length=1, max_length=7, description="one column per joint, from the base outwards"

@@ -92,7 +92,7 @@ class ArmConfig(Table):
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
     urdf: str | None = Field(
-        None, description="URDF or MJCF of a spatial arm: a file beside this one; [[joints]] use its joint names"
+        None, description="URDF or MJCF of a spatial arm: a file next to this one; [[joints]] use its joint names"
     )
     base: Annotated[list[Turned], Field(min_length=3, max_length=3)] = Field(
         [0.0, 0.0, 0.0], description="with urdf: roll, pitch and yaw of the base, rad"

@@ -1,4 +1,4 @@
-"""An arm from a file, URDF or MJCF, as its root element says."""
+"""Reads an arm from a URDF or MJCF file, which are told apart by their root element."""
 
 import re
 from collections.abc import Sequence

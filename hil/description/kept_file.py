@@ -1,4 +1,4 @@
-"""The copy of an arm's file that a run folder keeps: it must be readable without the files beside the original."""
+"""The copy of an arm's file that a run folder keeps: it must be readable without the files next to the original."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def kept_bytes(path: Path) -> bytes:
 
 
 def _self_contained(path: Path) -> str:
-    """The MJCF without other files; "" if it needs none as it is."""
+    """The MJCF as a self-contained text; "" if the file already is self-contained."""
     import mujoco
 
     try:

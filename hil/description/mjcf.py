@@ -74,7 +74,7 @@ class Geom:
 def read_geoms(path: Path, joints: Sequence[str]) -> list[Geom]:
     """The shapes of the arm of these joints and of what is fixed to the world, without planes.
 
-    Shapes that touch nothing, such as those for pictures, count only for links that have no others. Raises
+    Shapes without contacts, such as visual ones, are used only for links that have no others. Raises
     ArmFileError.
     """
     tree = _Tree(_compiled(path), path)
@@ -140,7 +140,7 @@ class _Tree:
             if before not in (WORLD, *self._way(body)) or loose:
                 where = self.name(loose[0]) if loose else name
                 raise ArmFileError(
-                    f'{self.path}: before "{name}" lies a joint that is not among the arm\'s, at "{where}": name all, '
+                    f'{self.path}: a joint before "{name}", at "{where}", is not among the arm\'s joints: name all, '
                     "in order from the base"
                 )
         return moved
@@ -157,7 +157,7 @@ class _Tree:
         body = int(self.model.jnt_bodyid[found[0]])
         if self.model.body_jntnum[body] != 1:
             raise ArmFileError(
-                f'{self.path}: body "{self.name(body)}" has several joints: give each a body of its own, without mass'
+                f'{self.path}: body "{self.name(body)}" has several joints: give each its own body, without mass'
             )
         return body
 
@@ -176,7 +176,7 @@ class _Tree:
                 )
 
     def _way(self, body: int) -> list[int]:
-        """Bodies from this one towards the world, which is not included."""
+        """Bodies on the path from this one to the world, which is not included."""
         way = []
         while body != WORLD:
             way.append(body)

@@ -5,8 +5,8 @@ import numpy as np
 from hil.description.arm import ArmDescription, Array
 
 DIRECTIONS = (("forwards (+x)", "backwards (-x)"), ("to the left (+y)", "to the right (-y)"), ("up (+z)", "down (-z)"))
-"""Of the base's x, y and z axis."""
-LEAST_LEVER = 0.01  # m: an end nearer to an axis than this has no direction of motion
+"""For the base's x, y and z axes: names of the positive and the negative direction."""
+LEAST_LEVER = 0.01  # m: an end closer to an axis than this has no direction of motion
 
 
 def end_point(arm: ArmDescription, angles: Array) -> Array:
@@ -28,7 +28,7 @@ def moves(arm: ArmDescription, angles: Array, joint: int) -> str:
     place, direction = axis_of(arm, angles, joint)
     velocity = np.cross(direction, end_point(arm, angles) - place)
     if float(np.linalg.norm(velocity)) < LEAST_LEVER:
-        return f"turns the end about its own axis, {_towards(direction)}, counter-clockwise seen from where that points"
+        return f"turns the end about its own axis, {_towards(direction)}, counter-clockwise as seen from that side"
     return f"moves the end {_towards(velocity)}"
 
 
@@ -38,7 +38,7 @@ def _towards(vector: Array) -> str:
 
 
 def _frames(arm: ArmDescription, angles: Array) -> list[tuple[Array, Array]]:
-    """Of each link: the place of its joint [m] and its rotation, in the base's frame."""
+    """For each link: the position of its joint [m] and its rotation, in the base's frame."""
     place, turn, found = np.zeros(3), np.eye(3), []
     for joint, angle in zip(arm.joints, angles.tolist(), strict=True):
         place = place + turn @ joint.translation

@@ -5,13 +5,15 @@ import numpy as np
 from hil.description.arm import ArmDescription, Array
 
 PLANAR_JOINTS = 2
-ALIGNED = 1e-3  # rad: directions nearer than this are the same
+ALIGNED = 1e-3  # rad: directions closer than this count as the same
 
 
 def is_planar(arm: ArmDescription, gravity: Array) -> bool:
-    """Whether the arm moves as the planar model's: one or two joints with parallel axes, without gravity or across it,
-    and then at angle zero a horizontal first link, which positive angles lift. `gravity`: in the base's
-    frame (3,) [m/s^2]."""
+    """Whether the planar model applies to the arm: one or two joints with parallel axes.
+
+    With gravity, the axes must also be horizontal, and at angle zero the first link must be horizontal and be lifted by
+    positive angles. `gravity`: in the base's frame (3,) [m/s^2].
+    """
     if len(arm.joints) > PLANAR_JOINTS:
         return False
     turn, axes, offsets = np.eye(3), [], []
@@ -30,13 +32,15 @@ def is_planar(arm: ArmDescription, gravity: Array) -> bool:
 
 
 def _first_link(arm: ArmDescription, offsets: list[Array]) -> Array:
-    """From joint 1 to joint 2, or to the centre of mass of the only link (3,) [m], in the base's directions."""
+    """From joint 1 to joint 2, or to the centre of mass of the only link (3,) [m], in the base's frame."""
     first = arm.joints[0]
     return offsets[1] if len(offsets) > 1 else np.asarray(first.rotation @ first.body.centre)
 
 
 def _level(axis: Array, link: Array, down: Array) -> bool:
-    """Whether `link` lies across `axis` and `down`, and turning about the axis lifts it."""
+    """Whether the part of `link` normal to `axis` is also normal to `down`, and positive rotation about the axis
+    lifts it.
+    """
     across = link - axis * float(axis @ link)
     length = float(np.linalg.norm(across))
     if length == 0.0:

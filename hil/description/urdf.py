@@ -240,7 +240,7 @@ def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) ->
 
 
 def _way_to(tree: dict[str, _Joint], base: str, name: str, path: Path) -> list[_Joint]:
-    """All joints from the base to the one of this name."""
+    """All joints from the base to the one with this name."""
     parent_joint = {joint.child: joint for joint in tree.values()}
     way = [tree[name]]
     while way[0].parent != base:

@@ -32,7 +32,7 @@ class AmplitudeOptions:
     max_polishing_rounds: int = 4
     """Maximum number of final raises of single joints."""
     close: float = 0.94
-    """Fraction of the limits, at the required probability, from which on they count as reached."""
+    """Fraction of the limits, at the required probability, at which they count as reached."""
     over: float = 0.97
     """Fraction of the limits that an iteration aims at if the last torque was too large."""
     under: float = 0.99
@@ -56,7 +56,7 @@ class AmplitudeOptions:
 
 DEFAULTS = AmplitudeOptions()
 
-AT_MOST = 0.999  # fraction of the largest torque from which on it counts as reached, whatever the rounding
+AT_MOST = 0.999  # fraction of the largest torque at which it counts as reached despite rounding
 
 
 @dataclass(frozen=True)

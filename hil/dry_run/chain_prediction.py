@@ -1,6 +1,6 @@
 """Simulation of a spatial arm's experiment on an ensemble of possible arms: peaks versus limits, and clearance.
 
-Each arm plays every path in full: the transition from the rest pose, two periods, and the transition back.
+Each arm follows every path in full: the transition from the rest pose, two periods, and the transition back.
 """
 
 from collections.abc import Callable
@@ -108,7 +108,7 @@ def predict_chain(
 
 
 def loop_of(config: Config, segment: PathSegment, rate: float) -> Loop:
-    """Commands and feedback of the control loop while a segment is played."""
+    """Commands and feedback of the control loop during a segment."""
     assert config.stabiliser is not None  # checked with the configuration
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     goals = np.concatenate((segment.ramp_in, *[segment.period_current] * PERIODS, segment.ramp_out))

@@ -1,6 +1,6 @@
 """Simulated stops of a spatial arm: lowered if its servos still accept commands, falling if they do not.
 
-Stops are simulated from times spread over the planned path, on arms of the ensemble: the way home as the stream would
+Stops are simulated from times spread over the planned path, on arms of the ensemble: the path home as the stream would
 command it, and the fall without torque until the first collision.
 """
 
@@ -63,7 +63,7 @@ class ChainStops:
 
     @property
     def unsafe(self) -> str:
-        """Explain why a stop would not lay the arm down safely; "" if it would."""
+        """Explain why a stop would not lower the arm safely; "" if it would."""
         down = self.lowering
         if down.nearest.room < 0.0:
             return (
@@ -71,7 +71,7 @@ class ChainStops:
                 f"{1e3 * down.nearest.needed:.0f} mm required"
             )
         if down.lies < LAID_DOWN:
-            return f"a stop lays only {100 * down.lies:.0f} % of the simulated arms down in the rest pose"
+            return f"a stop brings only {100 * down.lies:.0f} % of the simulated arms to the rest pose"
         return ""
 
 

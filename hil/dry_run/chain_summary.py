@@ -20,7 +20,7 @@ from hil.printing import print_fitting, say
 class ChainDryRun:
     """A dry run of a spatial arm.
 
-    config: with path and stabiliser as they would be played. share: fraction of the designed path's amplitude; 1 if
+    config: with the path and stabiliser that would be used. share: fraction of the designed path's amplitude; 1 if
     [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of links with parts
     that touch by construction and are not checked.
     """

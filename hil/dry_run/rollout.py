@@ -1,4 +1,4 @@
-"""One simulated arm through the whole experiment, period by period, as the stream plays it on a real one."""
+"""The whole experiment on one simulated arm, period by period, as the stream runs it on a real one."""
 
 from dataclasses import dataclass
 

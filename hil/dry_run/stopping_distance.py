@@ -4,7 +4,8 @@ The stop itself is simulated on the arms of an ensemble, with gravity, friction 
 
 planned   the run is stopped at any moment of the planned motion: by a signal, lost replies, an alert, a lost port, or
           because the program was killed
-passed    the motion differs from the plan (a blocked, reversed or unpowered joint, or an arm other than described), so
+passed    the motion differs from the plan (a blocked, reversed or unpowered joint, or an arm other than the one
+described), so
           the guard stops it at a limit: one joint at its position limit moves outwards at its velocity limit, the
           other is anywhere within its range
 
@@ -28,6 +29,7 @@ from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import scaled_feedback
 from hil.estimator.models.parameters import CONSTANTS, Physics
 from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
+from hil.estimator.simulation.many_arms import COARSE
 from hil.estimator.threads import thread_count
 from hil.plan.brake import GETS_FASTER, NOTICED_AFTER, braking_gains
 from hil.plan.plan import Plan
@@ -164,7 +166,7 @@ def _planned_goals(config: Config, plan: Plan) -> Array:
 def _planned_starts(config: Config, physics: Physics, scale: Array, goals: Array) -> list[_Start]:
     """States of the planned motion up to a limit: those expected to overshoot most, and evenly spaced ones."""
     rest = resting(np.array(config.arm.rest_pose))
-    moved = respond(physics, rest, goals * scale[:, None], config.experiment.rate, _felt(config, scale))
+    moved = respond(physics, rest, goals * scale[:, None], config.experiment.rate, _felt(config, scale), COARSE)
     until = _within_limits(config, moved)
     chosen = set(np.linspace(1, until - 1, _EVENLY).astype(int).tolist())
     for ahead in _AHEAD_S:
@@ -280,7 +282,7 @@ class _Stops:
             at = [round(after * self._rate) for after in _JUDGED_AFTER_S if off]
             for part in np.split(held, [sample for sample in at if 0 < sample < count], axis=1):
                 torque = np.ascontiguousarray(part)
-                moved = respond(limits.physics, state, torque, self._rate, scaled_feedback(feedback, scale))
+                moved = respond(limits.physics, state, torque, self._rate, scaled_feedback(feedback, scale), COARSE)
                 state = moved.state
                 yield moved
                 if off and limits.holds(state[0], state[1]):

@@ -91,8 +91,8 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
 def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
     """The model requested by the configuration.
 
-    Links turned by several joints tie these joints' torques together, so torque constants that are not exact cannot
-    all be right: their ratios are parameters wherever the configuration gives an uncertainty.
+    Links moved by several joints couple these joints' torques, so inexact torque constants contradict each other: their
+    ratios are parameters wherever the configuration gives an uncertainty.
     """
     wanted = config.model
     scales = known.base.chain.joints > 1 and (wanted.torque_scale or known.prior.scale_precision is not None)

@@ -1,7 +1,7 @@
 """Jumps of a position that its velocity does not explain: an encoder that slipped, or a horn that moved on its shaft.
 
 The guard stops a run at once if a position moves farther between two samples than the joint can; a smaller jump only
-shifts everything after it, and passes for an offset of the zero.
+shifts everything after it, and looks like an offset of the zero.
 """
 
 import numpy as np
@@ -39,7 +39,7 @@ def jump_warnings(config: Config, facts: RunFacts, samples: NDArray[np.void]) ->
         others = f" ({len(jumps)} jumps in all)" if len(jumps) > 1 else ""
         found.append(
             f"{joint.name}: the position jumped by {size:+.3f} rad ({abs(size) / step:.0f} encoder steps) at "
-            f"{time:.2f} s{others}, although the velocity before and after explains no such motion: everything after "
+            f"{time:.2f} s{others}, which the velocity before and after does not explain: everything after "
             "it is shifted. Check the horn's screws, the encoder's magnet and the cable, then record again."
         )
     return found
@@ -65,11 +65,11 @@ def position_jumps(time: Array, position: Array, velocity: Array, step: float) -
     curved = elapsed**2 / 12.0 * np.diff(np.gradient(velocity, time))
     unexplained += np.where(elapsed > 1.5 * interval, curved, 0.0)
     unexplained[elapsed > LONGEST_GAP * interval] = 0.0
-    # A velocity that comes late by a constant time leaves a difference in proportion to its change.
+    # A velocity that is delayed by a constant time leaves a difference proportional to its change.
     change = np.diff(velocity)
     unexplained -= change * float(unexplained @ change) / max(float(change @ change), 1e-12)
     usual = float(np.quantile(np.abs(unexplained), USUAL_QUANTILE))
-    # What is known of the motion across lost samples is less certain.
+    # The motion across lost samples is less certain.
     threshold = max(LEAST_STEPS * step, FAR_OUTSIDE * usual) * np.maximum(1.0, (elapsed / interval) ** 2)
     around = max(2, round(AROUND_S / interval))
     found = []

@@ -17,11 +17,13 @@ from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
 
 _AROUND_S, _FEWEST_AROUND = 0.04, 4
-"""Time before and after a sample whose readings determine its velocity [s], and the fewest of them on either side."""
+"""Time before and after a sample whose readings determine its velocity [s], and the minimum number of them on either
+side.
+"""
 
 
 def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], role: str) -> SettledPeriod:
-    """Extract the settled periods of the multisine played for `role`. Raises RecordingCutShort."""
+    """Extract the settled periods of the multisine with this `role`. Raises RecordingCutShort."""
     experiment = config.experiment
     count = experiment.samples
     chosen = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(role))

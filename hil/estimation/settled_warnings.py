@@ -16,8 +16,8 @@ SHORT = 0.85  # ratio of measured to commanded current below which the current w
 OFTEN = 0.05  # fraction of the samples with large goals
 LEAST_SWING = 30.0  # encoder steps
 LOST = 0.005  # fraction of the samples
-LATE = 0.25  # of the interval: a write that is later disturbs the motion visibly
-BY_LATENESS = 0.3  # of the lost samples: from this share of late ones on, the computer is the likely cause
+LATE = 0.25  # of the interval: a write that is later disturbs the motion noticeably
+BY_LATENESS = 0.3  # of the lost samples: with at least this share of late ones, the computer is the likely cause
 
 
 def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], period: SettledPeriod) -> list[str]:

@@ -1,6 +1,6 @@
 """A supply that sags under load: detected from the servos' Present Input Voltage, and its effect on the torque.
 
-The bridge of a motor that gets the voltage u (or the current i) at the velocity v draws a current in proportion to
+The bridge of a motor that receives the voltage u (or the current i) at the velocity v draws a current proportional to
 u^2 and u v (i^2 and i v) from the supply, whose resistance turns it into a drop. The register is read only a few times
 a second, in steps of 0.1 V. A regression of its readings on these products over the whole recording nevertheless gives
 the drop at every sample.
@@ -23,7 +23,7 @@ FEWEST = 40
 """Fewest readings of the voltage."""
 STEP_V = 0.1  # of the register
 SIGNIFICANT = 6.0
-"""Standard errors that the drop at full load must differ from zero."""
+"""Number of standard errors by which the drop at full load must differ from zero."""
 LEAST = {Mode.PWM: 0.005, Mode.CURRENT: 0.05}
 """Largest drop, relative to the voltage without load, that is not worth mentioning, by drive mode."""
 _FULL_LOAD = 0.99  # quantile of the drop

@@ -1,4 +1,6 @@
-"""Limits on what is commanded: each joint's goal limit, its rate of change, and no value that is not a number."""
+"""Limits on what is commanded: each joint's goal limit, its rate of change, and rejection of values that are not
+finite.
+"""
 
 from collections.abc import Sequence
 from math import inf

@@ -35,7 +35,7 @@ SHORT_S, LONG_S = 0.3, 1.2
 """Time constants of the memories [s]."""
 
 LONG_EVERY_S = 0.0099
-"""Shortest interval added to the long memory [s]: that of 100 Hz, whatever its rounding."""
+"""Shortest interval added to the long memory [s]: that of 100 Hz, regardless of rounding."""
 
 UNSURE_RAD, LONG_UNSURE_RAD = 0.02, 0.045
 """Tolerances [rad] for rounding, encoder noise, and a velocity that is rounded towards zero during each memory."""
@@ -56,12 +56,12 @@ STEP_RAD, STEP_TIMES = 0.0077, 7.0
 """Smallest jump of a position [rad], five ticks, and its smallest ratio to the RMS of the usual differences."""
 
 STEPS, STEPS_S = 4, 0.5
-"""Number of jumps that are too many, and the time within which they must follow each other [s]."""
+"""Number of jumps that counts as a fault, and the longest time between them [s]."""
 
 SCALE, MORE_SCALE = 0.06, 0.02
 CURVED = 0.35
 """Allowance for the velocity between samples, as a fraction of its change times the interval. A wave with only four
-samples per period, the fastest that is played, needs 0.27.
+samples per period, the fastest that is used, needs 0.27.
 """
 
 
@@ -184,7 +184,7 @@ def _learn(memory: Any, velocity: float, seconds: float) -> None:
 
 
 def _has_jumped(steps: Any, step: float, seconds: float) -> bool:
-    """Process the difference over one interval, beyond what its motion explains [rad]; return if it is wrong."""
+    """Process the difference over one interval, beyond what its motion explains [rad]; return whether it is wrong."""
     if seconds <= 0.0:
         return False
     steps.since += seconds

@@ -48,7 +48,7 @@ class Guard:
     for missing replies [s].
 
     left_by_a_run: whether the arm stands where a run just before this one left it. One that was stopped at a limit may
-    have come to rest a little beyond it: a joint found there may move back in, and no farther out.
+    have come to rest a little beyond it: such a joint may move back in, but no farther out.
     """
 
     def __init__(

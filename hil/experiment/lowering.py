@@ -1,8 +1,8 @@
 """Stop of an arm that cannot hang freely: brake, then lower it to its rest pose while its servos accept commands.
 
-The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the way
+The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the path
 home. Lowering is monitored like the experiment: a missing reply, an alert, a current that does not follow its goal or a
-joint that leaves the way ends it, and torque is cut.
+joint that leaves the path ends it, and torque is cut.
 """
 
 import numpy as np
@@ -17,12 +17,12 @@ from hil.plan.plan import Plan
 from hil.plan.way_home import WayHome
 
 LEAVES_RAD = 0.35
-"""Largest accepted tracking error: a joint with a larger one does not follow its way home."""
+"""Largest accepted tracking error: a joint with a larger one does not follow its path home."""
 
 LYING_RAD = 0.06
 """An arm within this angle of its rest pose in every joint is already at rest."""
 
-_ROOM_RAD = 0.2  # beyond the position limits and the way home
+_ROOM_RAD = 0.2  # beyond the position limits and the path home
 _FASTER = 1.3
 
 
@@ -34,7 +34,7 @@ def may_lower(config: Config, error: BaseException) -> bool:
 
 
 class Lowering:
-    """Computes the goals on the way home. Created before torque is switched on; call `begin` when a stop occurs.
+    """Computes the goals on the path home. Created before torque is switched on; call `begin` when a stop occurs.
 
     interval: time between two exchanges [s]; by default, that between two samples.
     """
@@ -79,7 +79,7 @@ class Lowering:
         return self._guard.clamp(((self._feed[index] + held) / self._constants).tolist())
 
     def look(self, index: int, state: State, gap: float, *, between: bool = False) -> None:
-        """Process an exchange. Raises SafetyStop if the arm leaves its way home or a servo is faulty."""
+        """Process an exchange. Raises SafetyStop if the arm leaves its path home or a servo is faulty."""
         self._guard.look(state, gap, between=between)
         away = np.abs(self._position[index] - np.array(state.position))
         if np.nanmax(away, initial=0.0) > LEAVES_RAD:
@@ -103,7 +103,7 @@ def _guard_of(
         _allowing(joint, float(row.min()), float(row.max()), max(fastest, joint.velocity_limit))
         for joint, row in zip(config.joints, position, strict=True)
     ]
-    # A servo that has only lost its watchdog can still be lowered, which is better than to drop it.
+    # A servo that has only lost its watchdog can still be lowered, which is better than dropping it.
     unwatched = config.safety.model_copy(update={"allow_no_watchdog": True})
     return Guard(config.model_copy(update={"joints": joints, "safety": unwatched}), planned, interval=interval)
 

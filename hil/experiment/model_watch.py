@@ -39,7 +39,7 @@ A small first torque moves an arm by a tenth of a radian: its gravity is ten tim
 """
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
-"""Time for which a joint must seem to stand under a torque that is held over several exchanges [s]."""
+"""Time for which a joint must appear stationary under a torque that is held over several exchanges [s]."""
 
 _LAG_S = 0.012
 """Time constant with which a torque step appears in the velocity [s]: current loop and velocity filter."""

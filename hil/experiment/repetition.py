@@ -1,6 +1,6 @@
 """Comparison of successive periods sample by sample, which avoids a burst of work at the end of a period.
 
-The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated while the period is played:
+The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated during the period:
 at its end only a few divisions remain. The previous period is kept in one buffer, which the latest one overwrites.
 
 The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same

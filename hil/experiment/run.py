@@ -211,7 +211,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
         )
     if bus.port.latency_measured:
         raise WrongSetting(
-            f"experiment.rate = {rate:g}: this adapter was measured to hold replies back for "
+            f"experiment.rate = {rate:g}: this adapter was found to delay replies by "
             f"{bus.port.latency * 1e3:.0f} ms, which allows at most {1 / slowest:.0f} Hz. Lower the rate, or use a "
             "wired adapter with a short latency, such as a U2D2."
         )
@@ -258,7 +258,9 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
 
 
 def _check_inside(config: Config, bus: ServoBus) -> None:
-    """Refuse an arm that the previous run left far beyond its limits: an upright one that fell when torque was cut."""
+    """Refuse an arm that the previous run left far beyond its limits, such as an upright one that fell without
+    torque.
+    """
     for joint, position, limited in zip(bus.joints, bus.read_positions(), config.joints, strict=True):
         low, high = limited.position_limit
         if not low - MOST_OUTSIDE_RAD <= position <= high + MOST_OUTSIDE_RAD:

@@ -1,12 +1,12 @@
 """How long servos have not replied, counting only the time during which this program listened to them.
 
-While a computer stalls it hears nothing and sends nothing, which says nothing about the servos. That time is limited as
+A stalled computer neither receives nor sends anything, which reveals nothing about the servos. That time is limited as
 missed deadlines are (`hil.experiment.deadlines`); silence proper is time in which a reply was awaited in vain.
 
-A busy computer also delays what it has received: the kernel hands the bytes of a serial port on in a thread of its own,
+A busy computer also delays what it has received: the kernel passes on the bytes of a serial port in a separate thread,
 which has to wait for a core like any other program, for 4 to 10 ms at a time. So while this program itself wakes up
 late, silence of all servos may be the computer's, and is limited as missed deadlines are, too. If some servos are heard
-and one is not, it is that servo's.
+and one is not, the silence is that servo's.
 """
 
 from hil.config.schema import Config

@@ -22,7 +22,7 @@ _CLOCK_DRIFT = 0.01
 _LEARNT_READINGS = 3
 _STALE_READINGS = 2
 _GOALS_MISSED = 2
-"""Consecutive mismatches before a goal counts as lost, because a single packet may get lost."""
+"""Consecutive mismatches before a goal counts as lost, because a single packet may be lost."""
 
 
 class StatusCheck:
@@ -82,7 +82,7 @@ class StatusCheck:
             return None
         unit = self._unit[joint]
         return Cause.GOALS_LOST, (
-            f"does not take its goals: it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent, and it missed "
+            f"does not accept goals: it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent, and it missed "
             "an earlier one too. Goals are lost on the way, or the servo refuses them: check its cable and limits."
         )
 

@@ -77,6 +77,7 @@ class Stream:
         arms: Ensemble | ChainArms | None = None,
     ) -> None:
         self._bus = bus
+        self._exchange = bus.prepared
         self._clock = bus.port.clock
         self._plan = plan
         self._config = config
@@ -174,7 +175,7 @@ class Stream:
             self._play(segment.period_current, Phase.WARM_UP)
 
     def _play_periods(self, segment: Segment) -> None:
-        """Play periods until one matches its predecessor; it is the first settled one. Then play the other periods to
+        """Run periods until one matches its predecessor; it is the first settled one. Then run the other periods to
         record.
         """
         samples = len(segment.period_current)
@@ -205,7 +206,7 @@ class Stream:
         """What to do about periods of `samples` samples that differ from each other by `differences`."""
         further = periods_of_drift(differences, self._plan.settle_within)
         if further is None:
-            return "Check for play, a dragging cable or a slipping joint; or raise max_settling_periods."
+            return "Check for backlash, a dragging cable or a slipping joint; or raise max_settling_periods."
         seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
         return (
             f"The change falls slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), as "
@@ -274,6 +275,7 @@ class Stream:
             for state in self._between_samples():
                 self._look(state, phase, between=True)
                 self._stop.check()
+        self._look_for_another_master(self._interval)
         self._deadline, now, late = self._ticks.wait()
         self._guard.woke_up(now, now - max(self._deadline, self._awake_at))
         self._awake_at = now
@@ -309,6 +311,7 @@ class Stream:
         following = self._deadline + self._interval
         for turn in range(1, self._turns):
             due = self._deadline + turn * self._apart
+            self._look_for_another_master(turn * self._apart)
             self._clock.wait_until(due)
             now = self._clock.now()
             if now - due < self._apart and now + self._takes < following:
@@ -316,6 +319,13 @@ class Stream:
                 self._sent_at, self._awake_at = state.time_before_write, state.time_after_read
                 self._takes = max(_FORGETS * self._takes, state.time_after_read - state.time_before_write)
                 yield state
+
+    def _look_for_another_master(self, later: float) -> None:
+        """If it is time, read back what the servos hold just before the exchange due `later` than the sample [s]."""
+        deadline = self._deadline
+        if deadline is not None and self._exchange.read_back_at <= deadline + later:
+            self._bus.check_not_overruled(deadline + later)
+            self._awake_at = self._clock.now()
 
     def _look(self, state: State, phase: Phase, *, between: bool = False) -> None:
         former, self._state = self._state, state
@@ -365,6 +375,7 @@ class Stream:
             for checked in self._between_samples() if index else ():
                 lowering.look(index - 1, checked, checked.time_before_write - state.time_before_write, between=True)
                 state = checked
+            self._look_for_another_master(self._interval)
             deadline, now, late = self._ticks.wait()
             self._deadline = deadline
             self._stop.check_again(asked)

@@ -105,7 +105,7 @@ def export_samples(
 
 
 def _nothing_older(formats: Sequence[str], out: Path, samples: int) -> None:
-    """Raise ExportError if arms of an earlier draw would remain in the folder beside those that are written now."""
+    """Raise ExportError if arms of an earlier draw would remain in the folder next to the new ones."""
     for name in formats:
         if name in FORMATS:
             ending = FORMATS[name][1]
@@ -174,7 +174,7 @@ def _physical(
 def _is_physical(model: ArmModel) -> bool:
     p = model.values
     if isinstance(model, ChainArmModel):
-        # Its base parameters are sums of either sign: the mass matrix tells whether any links have them.
+        # Its base parameters are sums of either sign: the mass matrix shows whether any links have them.
         poses = np.random.default_rng(_POSES).uniform(-np.pi, np.pi, (_POSES, len(model.joints)))
         friction = [value for name, value in p.items() if kind_of(name) in _FRICTION]
         return min(friction) >= 0.0 and bool(np.linalg.eigvalsh(model.mass_matrix(poses)).min() > 0.0)

@@ -1,10 +1,10 @@
 """Breakaway of joints that friction holds: more torque from run to run, stopped soon after a joint begins to move.
 
 A joint that stood still reveals little more than that its friction is larger than the torque. Just above it, motion
-grows quickly: in a large part of the plausible arms even a few percent more torque passes a limit, so that an amplitude
-which is safe for a whole run can hardly be raised. Instead, the guard gets narrow limits for such joints. The torque
-can then grow by a constant ratio up to the current limit, and the run ends, braked, where the joint has shown its
-friction.
+grows quickly: in a large part of the plausible arms even a few percent more torque exceeds a limit, so that an
+amplitude which is safe for a whole run can hardly be raised. Instead, the guard is given narrow limits for such joints.
+The torque can then grow by a constant ratio up to the current limit, and the run ends, braked, where the joint has
+shown its friction.
 """
 
 import numpy as np
@@ -43,7 +43,7 @@ def _near(joint: JointConfig, pose: float, options: PilotOptions) -> tuple[float
 
 
 def broke_free(config: Config, narrow: Config, seen: Array) -> Mask:
-    """Return which joints (joints,) only passed limits that `narrow` has brought closer.
+    """Return which joints (joints,) only exceeded limits that `narrow` has tightened.
 
     seen: lowest and highest position and largest speed of each joint (3, joints) [rad, rad/s].
     """

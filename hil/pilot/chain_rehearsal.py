@@ -1,4 +1,4 @@
-"""`hil dry-run` for a spatial arm: simulate the path that would be played on an ensemble of possible arms."""
+"""`hil dry-run` for a spatial arm: simulate the path of the first run on an ensemble of possible arms."""
 
 from hil.clearance.space import Space
 from hil.config.schema import Config

@@ -113,7 +113,7 @@ class ChainSearch:
         )
 
     def _unsafe_stop(self, config: Config, plan: Plan) -> str:
-        """Explain why a stop would not lay the arm down safely; "" if it would."""
+        """Explain why a stop would not lower the arm safely; "" if it would."""
         return "" if config.safety.stop == "cut" else foreseen_stops(config, plan, self.belief.arms.first(ARMS)).unsafe
 
     def step(self, name: str, folder: str, shares: tuple[float, ...]) -> Found:
@@ -128,7 +128,9 @@ class ChainSearch:
         return found
 
     def limit_after(self, error: ExperimentError, found: Found) -> None:
-        """Allow less of the path after a run that met a limit; not after one in which friction held a joint."""
+        """Allow less of the path after a run that exceeded a limit, but not after one in which friction held a
+        joint.
+        """
         if not isinstance(error, NotSettled | DidNotMove):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
@@ -220,13 +222,13 @@ def _full(search: ChainSearch) -> str:
         search.learn(config, search.run)
         before = search.cap
         search.limit_after(error, found)
-        how = "less amplitude" if search.cap < before else "the friction that this run has shown"
+        how = "less amplitude" if search.cap < before else "the friction learned from this run"
         search.say(f"Repeating with {how}.")
         search.run.set_aside(f"stopped-{number}", config)
     raise AssertionError  # the loop returns or raises
 
 
 def step_config(config: Config) -> Config:
-    """The configuration of a step: one path, played for two periods whether or not it settles."""
+    """The configuration of a step: one path, run for two periods whether or not it settles."""
     update: dict[str, Any] = {"held_out": False, "max_settling_periods": 1, "periods": 1, "settle_within": 0.99}
     return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})

@@ -79,7 +79,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
 
 
 def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -> Array:
-    """Torque (joints,) [N m] that a run may have after one that ended with `error`, without exceeding a limit.
+    """Largest torque (joints,) [N m] of the run after one that ended with `error` without exceeding a limit.
 
     A large motion with little friction may never settle, and less torque helps. Where torque hardly exceeds dry
     friction it is friction that stops the joint in a different place each time, and less torque would hold it there.

@@ -32,9 +32,9 @@ class PilotOptions:
     breakaway_raise: float = 1.6
     """Ratio of successive peak torques of a joint that has not moved yet."""
     breakaway_room: float = 0.25
-    """Fraction of the way to its position limits after which a joint that has just broken away is stopped."""
+    """Fraction of the distance to its position limits after which a joint that has just broken away is stopped."""
     min_breakaway_steps: int = 60
-    """Minimum of that way [encoder steps]."""
+    """Minimum of that distance [encoder steps]."""
 
     at_limit: float = 0.99
     """Fraction of a torque limit above which the limit counts as reached."""
@@ -63,13 +63,13 @@ class PilotOptions:
     falling_share: float = 0.85
     """Fraction of the limits for such an arm."""
     min_falling_torque: float = 0.05
-    """Torque that such an arm may get in any case, as a fraction of what the current limit allows."""
+    """Torque that such an arm may receive in any case, as a fraction of what the current limit allows."""
     start_inside: float = 0.95
-    """Fraction of the limits within which an arm is assumed to start that a stopped run left beyond them."""
+    """Fraction of the limits within which an arm that a stopped run left beyond them is assumed to start."""
 
     max_full_runs: int = 6
     """Maximum number of full runs if one exceeds a limit or does not settle; each has less torque than the last."""
     max_unlike_runs: int = 3
-    """Maximum number of full runs that may end because one period was unlike the one before."""
+    """Maximum number of full runs that may end because one period differed from the one before."""
     max_settle_within: float = 0.1
     """Largest experiment.settle_within that a repeated full run accepts."""

@@ -1,4 +1,4 @@
-"""A run that is stopped because this computer was late says nothing about the arm: it is repeated."""
+"""A run that is stopped because this computer was late reveals nothing about the arm: it is repeated."""
 
 from collections.abc import Callable
 

@@ -1,6 +1,6 @@
 """`hil dry-run` for a planar arm with `pilot = true`: what `hil identify` would do.
 
-Simulated are its first run and the largest safe torque, both with the stabiliser that it would propose.
+Its first run and the largest safe torque are simulated, both with the stabiliser that it would propose.
 """
 
 from concurrent.futures import Executor
@@ -35,7 +35,7 @@ def rehearse_in_steps(
     ensemble = ensemble_of(config, result, arms)
     said = quiet_stream(config) if servos else ()
     earlier = None if result is None else read_result(result)
-    # Nothing is played, so the folder and the player are never used.
+    # Nothing is run, so the folder and the player are never used.
     player = Player(config.path, lambda _: None, lambda _: None)
     search = Search.of(config, RunFolder(config.path.parent), player, earlier=earlier)
     held = search.held

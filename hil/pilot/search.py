@@ -78,7 +78,7 @@ class Search:
         return with_stabiliser(self.config, self.belief, self.springs)
 
     def first_run(self) -> tuple[Config, Amplitude]:
-        """Configuration and amplitude of the first run; nothing is played. Raises NoSafeTorque."""
+        """Configuration and amplitude of the first run, without running it. Raises NoSafeTorque."""
         return self._pilot_amplitude(pilot_config(self.held, self.options), 0)
 
     def find(self) -> tuple[Config, Amplitude]:
@@ -138,7 +138,7 @@ class Search:
         return self._with(config, with_peaks(config, torque) if plan is None else plan, torque)
 
     def _with(self, config: Config, plan: Plan, torque: Array) -> Amplitude:
-        """The waves of `plan` with these peak torques (joints,) [N m], whether they are safe or not."""
+        """The waves of `plan` with these peak torques (joints,) [N m], whether safe or not."""
         plan = scaled(config, plan, torque)
         return Amplitude(plan, torque, predict(config, plan, self.belief.ensemble(self._farther), pose=self.pose))
 
@@ -223,7 +223,7 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """The amplitude that leaves least of the range unused, of `found` and of other waves if it leaves much.
+        """Of `found` and, if it leaves much of the range unused, of other waves, the amplitude that leaves least.
 
         Slightly more torque may tip some of the arms over: with other waves that happens at larger amplitudes, or to
         the other side.
@@ -312,7 +312,7 @@ def _from_anywhere(config: Config) -> Config:
 
 
 def _within_limits(config: Config, pose: Array, inside: float) -> Array:
-    """A pose beyond a limit, where a stopped run may leave the arm, moved onto the limit: the next run begins by moving
+    """Move a pose beyond a limit, where a stopped run may leave the arm, onto the limit: the next run begins by moving
     inwards.
     """
     low, high = np.array([joint.position_limit for joint in config.joints]).T

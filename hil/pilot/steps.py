@@ -1,4 +1,4 @@
-"""One intermediate run: played, compared with its prediction, and reported."""
+"""One intermediate run: its execution, the comparison with its prediction, and the report."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ class Step:
 
     def __str__(self) -> str:
         torque = ", ".join(f"{value:.3g}" for value in self.peak_torque)
-        rows = [("", "predicted", "99 % within", "seen")] + [
+        rows = [("", "predicted", "99 % within", "measured")] + [
             (
                 f"{QUANTITIES[row]} [{UNITS[row]}]",
                 *(_list(each[row]) for each in (self.median, self.quantile, self.seen)),
@@ -110,7 +110,8 @@ class Player:
         """Play one run on an arm that could be any of `arms`, compare it with the prediction, and report.
 
         A run that is stopped because this computer was late is repeated. Raises what a run raises, except errors that
-        are informative about the arm: limit exceeded, no motion, no steady motion, a period unlike the one before.
+        are informative about the arm: limit exceeded, no motion, no steady motion, a period that differs from the one
+        before.
         """
         torque, error = "", None
         try:
@@ -142,7 +143,7 @@ class Player:
 
 def tells_of_the_arm(error: ExperimentError) -> bool:
     """Whether the error is informative about the arm, so that another run may follow: limit, no motion, no steady
-    motion, a period unlike the one before.
+    motion, a period that differs from the one before.
     """
     if isinstance(error, SafetyStop):
         return error.cause in _AT_A_LIMIT or error.cause is Cause.UNLIKE_BEFORE

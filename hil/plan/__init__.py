@@ -1,1 +1,1 @@
-"""What the experiment plays: excitation, software spring and damper, brake."""
+"""What the experiment commands: excitation, software spring and damper, brake."""

@@ -1,4 +1,4 @@
-"""Excitation of a spatial arm: joint paths, played as the feed-forward torque of the assumed model.
+"""Excitation of a spatial arm: joint paths, commanded as the feed-forward torque of the assumed model.
 
 The stabiliser always pulls towards the rest pose. To hold the arm to the path instead, its contribution is compensated
 in advance:
@@ -31,7 +31,7 @@ TORQUE_SHARE = 0.8  # of a joint's torque limit that a path may use: the rest is
 
 @dataclass(frozen=True)
 class PathSegment(Segment):
-    """A path; its multisine is the torque that is played for it.
+    """A path; its multisine is the torque that is commanded for it.
 
     way, back: goals of the transitions from and to the rest pose (samples, joints) [A]. paths: the desired motions:
     transition, period, transition back. thought: the assumed model that gave the torque. peaks: largest goal for the
@@ -122,7 +122,7 @@ def path_segment(config: Config, thought: ChainTorque, role: str, path: Path) ->
 
 
 def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array | float = 1.0) -> Array:
-    """Torque to play for a path (joints, samples) [N m], which compensates the stabiliser's pull to the rest pose.
+    """Torque to command for a path (joints, samples) [N m], which compensates the stabiliser's pull to the rest pose.
 
     share: factor on the feed-forward.
     """

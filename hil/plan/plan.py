@@ -52,7 +52,7 @@ class Segment:
 
     @property
     def peak_goal(self) -> NDArray[np.float64]:
-        """Largest goal that is expected to be commanded (joints,) [A, or V under PWM]; NaN counts as nothing."""
+        """Largest goal that is expected to be commanded (joints,) [A, or V under PWM]; NaN counts as zero."""
         peaks: NDArray[np.float64] = np.nan_to_num(np.abs(self.period_current)).max(axis=0)
         return peaks
 
@@ -63,7 +63,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that the stream plays, in order."""
+    """Everything that the stream commands, in order."""
 
     rate: float
     segments: tuple[Segment, ...]
@@ -76,7 +76,7 @@ class Plan:
     settle_within: float
     drift_within: float
     warm_up_periods: int = 0
-    """Number of periods of the first multisine that are played before those that may be used."""
+    """Number of periods of the first multisine that precede those that may be used."""
     lower_samples: int = 0
     """Largest number of samples for lowering a spatial arm after a stop."""
 

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 STATIONS = 16
 """Number of poses of the planned transition at which an arm may join it."""
 
-LOOKED_AT = 25  # poses of a straight line
+LOOKED_AT = 25  # poses of a straight line that are checked
 PEAK = 1.875  # ratio of a fifth-order polynomial's peak speed to its mean speed
 SHORTEST_S = 0.6
 ROUNDED_S = 0.16  # s over which a corner between two straight lines is smoothed
@@ -44,11 +44,11 @@ class WayHome:
 
     @property
     def space(self) -> Space:
-        """The space in which the way must be clear."""
+        """The space in which the path must be clear."""
         return self._space
 
     def poses(self, pose: Array) -> Array:
-        """Corners of the way from a pose (joints,) to the rest pose (joints, corners)."""
+        """Corners of the path from a pose (joints,) to the rest pose (joints, corners)."""
         least = min(0.0, float(self._space.room(pose[:, None], on_the_way=True)[0])) - _ALLOWED_M
         best, best_room = 0, -np.inf
         for station in range(self._stations.shape[1]):
@@ -60,7 +60,7 @@ class WayHome:
         return np.column_stack((pose, self._stations[:, best::-1], self._rest))
 
     def path(self, pose: Array, velocity: Array) -> Path:
-        """The whole way, sampled at the stream's rate: braking from `velocity`, then home."""
+        """The whole path, sampled at the stream's rate: braking from `velocity`, then home."""
         slowing = np.clip(np.abs(velocity).max() / BRAKING, SHORTEST_BRAKE_S, LONGEST_BRAKE_S)
         count = max(2, round(slowing * self._rate))
         time = np.arange(count) / self._rate
@@ -76,7 +76,7 @@ class WayHome:
         )
 
     def seconds(self, corners: Array) -> float:
-        """Duration of the way through these corners [s]."""
+        """Duration of the path through these corners [s]."""
         return float(np.clip(PEAK * _lengths(corners).sum() / self._speed, SHORTEST_S, self._longest))
 
     def _along(self, corners: Array) -> Array:

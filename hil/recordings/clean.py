@@ -13,7 +13,7 @@ Values = NDArray[np.float64]
 
 FEW = 0.02  # of the rows: share that may be corrected, if reported
 LONGEST_HOLE = 0.05  # s of torque that are filled in
-RESTART = 0.2  # s: a time that goes back by more starts a new recording
+RESTART = 0.2  # s: a larger backward step in time starts a new recording
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ Values = NDArray[np.float64]
 
 FEWEST_LEVELS = 5
 MOST_OFF = 0.12  # of a step: largest distance of a reading from a whole step, for values rounded in the file
-MOST_SHARE = 0.7  # of the readings: with more distinct values than this, no steps are recognised
+MOST_SHARE = 0.7  # of the readings: with a larger share of distinct values, no steps are recognised
 
 
 def encoder_step(position: Values) -> float | None:

@@ -113,8 +113,8 @@ def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
     if not found:
         what = ", ".join(sorted(refused)) or "no messages"
         raise CsvError(
-            f"{path}: holds nothing that can be decoded here: {what}. JSON is read, and ROS 2 (cdr) with "
-            "pip install 'hil[recordings]'."
+            f"{path}: holds nothing that can be decoded here: {what}. Readable: JSON and, with "
+            "pip install 'hil[recordings]', ROS 2 (cdr)."
         )
 
 

@@ -1,4 +1,6 @@
-"""The page of a dry run: verdict, predicted peaks and one of the simulated arms moving; one file, like a report."""
+"""The page of a dry run: verdict, predicted peaks and an animation of one simulated arm; a single file, like a
+report.
+"""
 
 from datetime import datetime
 from pathlib import Path

@@ -12,7 +12,7 @@
     return made;
   }
 
-  // Ticks at 1, 2 or 5 times a power of ten, about 70 pixels apart, as hil.report.scale has them.
+  // Ticks at 1, 2 or 5 times a power of ten, about 70 pixels apart, as in hil.report.scale.
   function ticks(low, high, pixels) {
     const raw = (high - low) / Math.max(2, pixels / 70);
     const size = 10 ** Math.floor(Math.log10(raw));
@@ -31,8 +31,8 @@
     const originalAxis = axis.innerHTML;
     const figure = svg.parentNode;
     let shown = [xStart, xEnd]; // the part of the plot, in its own pixels, that fills the chart
-    let from = null; // where a part to be shown was begun
-    let held = null; // where the plot is held to be moved
+    let from = null; // start of the range being selected
+    let held = null; // pointer position from which the plot is being moved
     let chosen = null;
     let curves = null;
 

@@ -31,7 +31,7 @@ from hil.report.svg import NARROW, WIDE, draw_svg
 
 FILE_NAME = "report.html"
 MOST_POINTS = 70_000
-"""Number of points of all curves of a page together, in the wide drawing; twice what a planar arm's page has."""
+"""Total number of points of all curves on a page, in the wide drawing; twice that of a planar arm's page."""
 FEWEST_POINTS = 600
 SCRIPTS = ("page.js", "spatial.js")
 SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
@@ -57,7 +57,7 @@ def write_report(data: RunData, path: Path) -> None:
 
 
 def write_page(page: str, path: Path) -> None:
-    """Write a page whole or not at all; raises RunFolderError."""
+    """Write a page completely or not at all; raises RunFolderError."""
     temporary = path.with_name(path.name + ".partial")
     try:
         temporary.write_text(page, encoding="utf-8")

@@ -56,7 +56,7 @@ def _verdict(shown: _Shown) -> Section:
 
 
 def _prediction(shown: _Shown) -> Section | None:
-    """The longest recording: position and what the model leaves of it; None if nothing was simulated."""
+    """The longest recording: position and residual; None if nothing was simulated."""
     longest = max(shown.recordings, key=lambda each: each.time.size)
     if not np.isfinite(longest.predicted).any():
         return None

@@ -1,4 +1,4 @@
-"""An arm's motion as data for the page: geometry once, then angles, and in space the clearance, frame by frame.
+"""An arm's motion as data for the page: geometry once, then angles and, for spatial arms, clearances, frame by frame.
 
 The page's scripts place the links themselves, so that a motion of minutes takes a few hundred kilobytes.
 """

@@ -1,10 +1,10 @@
 // A spatial arm: links are placed from the joint angles, projected, and drawn from back to front. Drag or use the arrow keys
-// to turn it; colours say where it comes close to something or to a position limit.
+// to turn it; colours show where it comes close to something or to a position limit.
 for (const figure of document.querySelectorAll("figure.spatial")) {
   const scene = JSON.parse(figure.dataset.scene), frames = scene.angles[0].length;
   const svg = figure.querySelector("svg"), ranges = figure.querySelector(".ranges"), said = figure.querySelector(".nearest");
   const [button, slider, shown] = ["button", "input", "output"].map((name) => figure.querySelector(name));
-  const ABOUT_M = 0.02, ABOUT_LIMIT = 0.05; // clearance beyond what is needed, and fraction of the range, that is little
+  const ABOUT_M = 0.02, ABOUT_LIMIT = 0.05; // excess clearance, and fraction of the range, below which they are marked
   const FIRST = { yaw: -0.9, pitch: 0.35 };
   let view = { ...FIRST }, frame = 0, started = null, held = null;
 

@@ -90,7 +90,7 @@ class SettledFit(Fit):
 
 @dataclass(frozen=True, kw_only=True)
 class ShootingFit(Fit):
-    """Of any motion, cut into segments. residual_rms_rad: the residual in rad RMS, per joint; residual_rms_ticks is
+    """Fit of any motion, cut into segments. residual_rms_rad: the residual in rad RMS, per joint; residual_rms_ticks is
     empty where the encoders' resolution is not known."""
 
     residual_rms_rad: PerJoint

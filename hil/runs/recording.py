@@ -89,7 +89,7 @@ class Recorder:
             _reserve(path)
         except OSError as error:
             with contextlib.suppress(OSError):
-                path.unlink()  # a part of it could not be read
+                path.unlink()  # a part of it could not be reserved
             raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
         self._bytes = memoryview(self._samples.view(np.uint8).data)
         self._rows_a_chunk = max(1, _CHUNK_BYTES // self._row.size)

@@ -1,6 +1,6 @@
 """The folder of an estimate from recordings of other tools: what was read, exactly as it was used, and its result.
 
-config.toml      the configuration: a copy of the one given, with [columns] as they were taken
+config.toml      the configuration: a copy of the one given, with [columns] as they were interpreted
 run.json         the files with their SHA-256, versions and machine, notes
 recordings.npz   each recording in SI units, with what the model predicts
 result.json, report.html
@@ -52,7 +52,7 @@ class RecordingRecord:
 
 @dataclass(frozen=True)
 class Predicted:
-    """One recording as it was estimated from. time: (samples,) [s]; the others (joints, samples) [N m, rad].
+    """One recording as it was used for the estimate. time: (samples,) [s]; the others (joints, samples) [N m, rad].
 
     predicted: by the fitted model, segment by segment, each from its estimated state; NaN where nothing was simulated.
     """
@@ -83,7 +83,7 @@ def is_recording_folder(path: Path) -> bool:
 
 
 def create(path: Path) -> None:
-    """Make the folder; raises RunFolderError when it is taken or not writable."""
+    """Make the folder; raises RunFolderError if it is not empty or not writable."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         if any(path.iterdir()):

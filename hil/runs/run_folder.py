@@ -1,8 +1,8 @@
 """The run folder: an exact copy of the configuration, versions and machine, events, samples, result.
 
 config.toml     copied byte for byte
-experiment.json the [experiment] as played, if hil chose it (pilot, torque found by dry runs)
-stabiliser.json the [stabiliser] as played, if hil chose it
+experiment.json the [experiment] as run, if hil chose it (pilot, torque found by dry runs)
+stabiliser.json the [stabiliser] as used, if hil chose it
 run.json        versions, start time, and the facts needed to interpret the samples
 servo_settings.json  the servos' settings before the run (hil.setup.servo_session)
 events.jsonl    events with their time, one JSON object per line, written as they happen
@@ -61,7 +61,7 @@ class RunFacts:
 
     config: path of the configuration, as the user wrote it. command_to_sample: time from the arrival of the goal
     currents at the servos to the sampling of their positions [s]. position_step: encoder step of each joint [rad].
-    segments: role of each multisine, in the order played.
+    segments: role of each multisine, in the order of the experiment.
     """
 
     config: str
@@ -72,7 +72,7 @@ class RunFacts:
 
 @dataclass(frozen=True)
 class Excitation:
-    """One multisine as played: its role, and the excited harmonics and crest factor of each joint."""
+    """One multisine of the experiment: its role, and the excited harmonics and crest factor of each joint."""
 
     role: str
     lines: tuple[tuple[int, ...], ...]
@@ -190,7 +190,7 @@ class RunFolder:
         return self.path / "stabiliser.json"
 
     def load_config(self) -> Config:
-        """The configuration, with the experiment as it was actually played. Raises ConfigError, RunFolderError."""
+        """The configuration, with the experiment that was actually run. Raises ConfigError, RunFolderError."""
         try:
             text = self.config_path.read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
@@ -206,7 +206,7 @@ class RunFolder:
                 played["stabiliser"] = StabiliserConfig(**_read_json(self.stabiliser_path))
         except ValidationError as error:
             raise RunFolderError(
-                f"The record of the excitation beside {self.config_path} is damaged: {error}."
+                f"The record of the excitation next to {self.config_path} is damaged: {error}."
             ) from error
         return config.model_copy(update=played)
 
@@ -234,7 +234,7 @@ class RunFolder:
         return starts
 
     def write_played(self, played: Config) -> None:
-        """Save the [experiment] and [stabiliser] as played, if they differ from the file (pilot, computed torque or
+        """Save the [experiment] and [stabiliser] as used, if they differ from the file (pilot, computed torque or
         gains).
         """
         write_json(self.played_path, played.experiment.model_dump())
@@ -242,7 +242,7 @@ class RunFolder:
             write_json(self.stabiliser_path, played.stabiliser.model_dump())
 
     def set_aside(self, name: str, played: Config) -> None:
-        """Move the recording of a run of `played` to a subfolder, so that another one can be made in this folder."""
+        """Move the recording of a run of `played` to a subfolder, so that another run can use this folder."""
         folder = self.below(name, played)
         try:
             for path in (self.samples_path, self.run_path, self.path / "lateness.json"):

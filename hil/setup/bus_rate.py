@@ -1,4 +1,4 @@
-"""The sample rate that a bus can sustain, measured with torque off for every way of exchanging data.
+"""The sample rate that a bus can sustain, measured with torque off for every exchange mode.
 
 The rate is a property of servos, wire and adapter. A computer that other programs keep busy delays single exchanges,
 which an experiment tolerates (`hil.experiment.deadlines`): such outliers are reported, but do not limit the rate.
@@ -32,7 +32,7 @@ class ExchangeMode:
     """Measured timing of one exchange mode.
 
     median_s, longest_s: round trips [s]. usual_s: time within which 90 % of the exchanges with the slowest kind of read
-    return [s]. lost: replies out of CYCLES that were lost, not only late.
+    return [s]. lost: replies out of CYCLES that were lost, not just late.
     """
 
     one_write: bool

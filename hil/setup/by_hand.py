@@ -1,4 +1,4 @@
-"""The arm as the bus sees it, compared with its description: each joint in turn is moved by hand, with torque off.
+"""The pose read from the bus, compared with the arm's description: each joint in turn is moved by hand, torque off.
 
 An identification cannot detect wrong IDs, directions, zeros and axes: a chain's parameters do not absorb a wrong
 geometry, they become wrong. A person notices at once.

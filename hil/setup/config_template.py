@@ -13,7 +13,7 @@ _OF_STALL = 0.3  # of the stall current or the supply voltage; initial limit
 _USUAL_STALL = 4.1  # N m, stall torque of an XM430
 _CYCLE_BYTES = 39  # on the wire per servo: goal, request and reply
 RATES = (400, 300, 250, 200, 160, 125, 100, 80, 64, 50, 40, 32, 25, 20)
-"""Sample rates [Hz] that a new file may have, close enough that no more than a quarter of what a bus can do is lost."""
+"""Sample rates [Hz] that a new file may have, spaced so closely that at most a quarter of a bus's capacity is lost."""
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
     handles = [Servo(port, found.id, load_control_table(str(found.model))) for found in chosen]
     for servo in handles:
         if servo.read("Torque Enable"):
-            raise ExperimentError(f"{servo.title} holds its torque. Power-cycle it, then start again.")
+            raise ExperimentError(f"{servo.title} keeps its torque on. Power-cycle it, then start again.")
     names = [_name(number, found, ask) for number, found in enumerate(chosen)]
     stance = _stance(ask, say)
     tilt = (

@@ -14,7 +14,7 @@ def measured_bus(arm: ArmAnswers, path: Path) -> tuple[MeasuredBus | None, str]:
     """Measure the bus of an arm that has been described; path: of the file to be written, for messages.
 
     Returns:
-        What was measured, or None if it could not be; and a sentence that says so.
+        What was measured, or None if that was impossible; and a sentence about it.
     """
     config = parse_config(arm_toml(arm), path)
     fakes.register_for(config.url)
@@ -25,10 +25,10 @@ def measured_bus(arm: ArmAnswers, path: Path) -> tuple[MeasuredBus | None, str]:
             mode, rate = choose_mode(bus, modes, RATES)
     except DriverError as error:
         return None, f"The rate of this bus was not measured: {error}"
-    # Servos without Fast Sync Read are read without it anyway, so the file need not say so.
+    # Servos without Fast Sync Read are read without it anyway, so the file need not disable it.
     fast = mode.fast or not any(each.fast for each in modes)
     found = MeasuredBus(float(rate), mode.rate, mode.one_write, fast)
-    said = f"This bus can sustain {mode.rate:.0f} Hz with {mode.name}: the file gets rate = {rate:g}."
+    said = f"This bus can sustain {mode.rate:.0f} Hz with {mode.name}; rate = {rate:g} is set in the file."
     if mode.lost:
         said += (
             f" But {mode.lost} of {CYCLES} replies were lost: check cables, supply and termination, and whether other "

@@ -46,7 +46,9 @@ class Finding:
 
 
 def check_arm(config: Config) -> Iterator[Finding]:
-    """Check port, servos, pose and rate, in this order. A check that cannot be made is a STOP, not an exception."""
+    """Check port, servos, pose and rate, in this order. A check that cannot be carried out is a STOP, not an
+    exception.
+    """
     fakes.register_for(config.url)
     try:
         bus = ServoBus.connect(config.bus)
@@ -354,8 +356,8 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
             )
             continue
         fix = (
-            "A goal sent by Sync Write did not arrive although reads are answered: try port.one_write = false; check "
-            "for an adapter or hub that swallows bytes, and for a second servo with this ID."
+            "A Sync Write goal did not arrive although the servo answers reads: try port.one_write = false; check "
+            "for an adapter or hub that drops bytes, and for a second servo with this ID."
         )
         yield Finding(Level.STOP, str(joint), "goals", "not taken", fix)
 

@@ -188,15 +188,17 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             _outermost.reset(token)
             with signals_held_back():
                 left = session.end()
-            if isinstance(stopped, TorqueNotOff):  # a servo may have answered again since
+            if isinstance(stopped, TorqueNotOff):  # a servo may have started to answer again
                 stopped.args = (str(bus.torque_off_report),)
-            for line in left:  # behind what stopped the arm and the state of its torque, which matter more
+            for line in left:  # after what stopped the arm and the state of its torque, which matter more
                 stopped.add_note(line) if stopped is not None else say(line)
 
 
 @contextmanager
 def _telling_of_torque(bus: ServoBus) -> Iterator[None]:
-    """Add to whatever ends the block a note about torque, unless it has one: a stop may come between two runs."""
+    """Add a note about torque to any exception that ends the block, unless it has one: a stop may come between two
+    runs.
+    """
     try:
         yield
     except TorqueNotOff:
@@ -211,7 +213,7 @@ def _telling_of_torque(bus: ServoBus) -> Iterator[None]:
 
 
 def _about_torque(bus: ServoBus) -> str:
-    """A sentence about the torque of servos whose torque no run is using."""
+    """A sentence about the servos' torque while no run is in progress."""
     if bus.torque_off_report is not None:
         return str(bus.torque_off_report)
     try:
@@ -248,9 +250,9 @@ def recover(servo: Servo, port: str) -> list[str]:
 
 
 def _before(kept: Kept, present: dict[str, int]) -> dict[str, int]:
-    """The settings before the program that was killed, except for registers that somebody has changed since.
+    """The settings before the program that was killed, except for registers that have been changed since.
 
-    A register that holds neither the value set by that program nor the one it found was changed by somebody else. If
+    A register that holds neither the value set by that program nor the one it found was changed by something else. If
     that is the Operating Mode, goals and gains belong to the new mode and are kept.
     """
     theirs = {name for name, value in kept.changed.items() if present.get(name) not in (value, kept.settings.get(name))}

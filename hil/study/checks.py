@@ -74,7 +74,7 @@ def _check_fake(study: Study, config: Config) -> None:
             'moves a real arm. Set port.url = "fake://", or record its runs one by one and use task = "estimate".'
         )
     if study.study.task == "fault" and config.experiment.pilot:
-        raise ConfigError(f'{study.path}: task = "fault" plays one experiment: set experiment.pilot = false.')
+        raise ConfigError(f'{study.path}: task = "fault" runs a single experiment: set experiment.pilot = false.')
 
 
 def _folder_bytes(config: Config) -> int:

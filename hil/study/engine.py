@@ -27,7 +27,7 @@ ONE_THREAD = dict.fromkeys(
 
 _DASK: dict[str, Any] = {
     "distributed.worker.daemon": False,
-    # Dask's own logs and profiles, which grow for hours with every task before they reach their length.
+    # Dask's own logs and profiles, which grow with every task for hours before they reach their maximum length.
     "distributed.worker.profile.enabled": False,
     "distributed.admin.log-length": 100,
     "distributed.admin.low-level-log-length": 100,
@@ -121,11 +121,11 @@ def executor(scheduler: str | None = None, count: int | None = None) -> Iterator
     """The same workers with the interface of concurrent.futures, for `executor=` of a dry run or an estimate.
 
     Args:
-        scheduler: as of `workers`.
+        scheduler: as for `workers`.
         count: workers; one per core unless given.
 
     Raises:
-        ConfigError, MissingExtra: as of `workers`.
+        ConfigError, MissingExtra: as for `workers`.
     """
     with workers(EngineTable(), scheduler, count) as client:
         yield client.get_executor(pure=False)

@@ -1,7 +1,8 @@
-"""The folder of a study: one process at a time works in it, and it is only continued as it was started.
+"""The folder of a study: only one process at a time works in it, and it can only be continued under the conditions of
+its start.
 
 DIR/study.toml   an exact copy of the study
-DIR/about.json   number of runs, seed, versions, the arm's and the recordings' fingerprints
+DIR/about.json   number of runs, seed, versions, hashes of the arm's file and of the recordings
 DIR/rows/        the rows (hil.study.dataset)
 """
 
@@ -69,7 +70,7 @@ def _discard(out: Path) -> None:
     """Remove what a start that failed before its first row left behind, so that it does not block the next one."""
     for name in ("study.toml", "about.json", ".lock"):
         (out / name).unlink(missing_ok=True)
-    with suppress(OSError):  # what somebody else put there stays
+    with suppress(OSError):  # files of others are kept
         (out / "rows").rmdir()
         out.rmdir()
 
@@ -99,7 +100,7 @@ def _read(about: Path) -> dict[str, Any]:
     try:
         found = json.loads(about.read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return {}  # killed before it was written: nothing has run yet
+        return {}  # the process was killed before writing it: nothing has run yet
     return found if isinstance(found, dict) else {}
 
 

@@ -1,4 +1,6 @@
-"""A run with faults: whether the experiment went on or was stopped, by what, how late, and how far the arm got."""
+"""A run with faults: whether the experiment continued or was stopped, why, with what delay, and how far the arm
+moved.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -14,13 +16,13 @@ from hil.runs.run_folder import RunFolder
 
 
 def inject(arm: Path, folder: Path) -> dict[str, Any]:
-    """Play the experiment of `arm`, whose [[fake.faults]] happen in it.
+    """Run the experiment of `arm`, during which its [[fake.faults]] occur.
 
     Returns:
-        `fault.outcome`: "finished", "stopped" (the guard saw something), or "failed" (the experiment or the bus ended
-        it); `cause` and `message`, what the program said; `torque_off_confirmed`, whether all servos said so;
+        `fault.outcome`: "finished", "stopped" (by the guard), or "failed" (ended by the experiment or the bus);
+        `cause` and `message`, as reported; `torque_off_confirmed`, whether all servos confirmed it;
         `samples`; `stopped_after_s`, from the first fault to the last sample, in the arm's time; `beyond_limit_rad`,
-        the farthest that a joint was beyond its limits.
+        the farthest that a joint moved beyond its limits.
     """
     config = load_config(arm)
     run = RunFolder.create(folder, config)
@@ -44,7 +46,7 @@ def inject(arm: Path, folder: Path) -> dict[str, Any]:
 
 
 def _first_stop(error: BaseException | None) -> SafetyStop | None:
-    """What the guard saw, also where the bus failed after it."""
+    """What the guard detected, even if the bus failed afterwards."""
     while error is not None and not isinstance(error, SafetyStop):
         error = error.__cause__ or error.__context__
     return error

@@ -24,11 +24,11 @@ _AHEAD = 8
 
 
 _TASK_S, _MOST_IN_A_TASK = 0.1, 50
-"""Jobs shorter than this share a task: every task costs some milliseconds, whatever it does."""
+"""Jobs shorter than this share a task: every task has an overhead of some milliseconds."""
 
 
 _COUNTED_EVERY_S = 1.0
-"""Interval at which the workers are counted, which queries the scheduler."""
+"""Interval at which the scheduler is queried for the number of workers."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,14 @@ class _Flight(Generic[Item, Result]):
         self._waiting = waiting
         self._size = 1
         self._submitted = 0
-        # A scheduler has one name space: two studies on it must not get each other's results.
+        # A scheduler has a single name space: two studies on it must not receive each other's results.
         self._name = f"job-{uuid4().hex[:12]}"
         self._tasks: dict[str, list[tuple[int, Item]]] = {}
         self._window, self._counted = 0, -math.inf
 
     @property
     def room(self) -> int:
-        """How many more tasks may be in flight. Workers may join at any time; until counted, they wait."""
+        """How many more tasks may be in flight. Workers may join at any time; they wait until they are counted."""
         if time.monotonic() - self._counted > _COUNTED_EVERY_S:
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
             self._window, self._counted = max(1, len(workers)) * (1 + _AHEAD), time.monotonic()
@@ -113,10 +113,10 @@ class _Flight(Generic[Item, Result]):
         return self._client.map(_call, [self._function] * len(tasks), items, key=keys, pure=False)
 
     def end(self, key: str, result: Any, *, lost: bool) -> tuple[list[Any], list[Ended[Item, Result]]]:
-        """Futures of jobs to be done again, and those that have ended."""
+        """Futures of jobs to be repeated, and the jobs that have ended."""
         jobs = self._tasks.pop(key)
         if lost and len(jobs) > 1:
-            return self._submit([[job] for job in jobs]), []  # one of them takes its worker with it
+            return self._submit([[job] for job in jobs]), []  # one of them kills its worker
         if lost:
             return [], [Ended(*jobs[0], None, result[1])]
         outcomes, seconds = result
@@ -127,7 +127,7 @@ class _Flight(Generic[Item, Result]):
 def _call(
     function: Callable[[Item], Result], items: list[Item]
 ) -> tuple[list[tuple[Result | None, Exception | None]], float]:
-    """On a worker: result or error of each; seconds that they took together."""
+    """Called on a worker: return the result or error of each job, and their total duration [s]."""
     began, outcomes = time.perf_counter(), list[tuple[Result | None, Exception | None]]()
     for item in items:
         try:
@@ -151,15 +151,15 @@ def each(
     """The results of `function` on each item, in the items' order, computed by the workers of a study.
 
     Args:
-        function: as of `run_jobs`.
+        function: as for `run_jobs`.
         items: its arguments.
         count: workers; one per core unless given; 0 computes in this process.
-        scheduler: as of `hil.study.engine.workers`.
-        tell: called with each result as it comes.
+        scheduler: as for `hil.study.engine.workers`.
+        tell: called with each result as it arrives.
 
     Raises:
         Exception: the first that `function` raised.
-        ConfigError, MissingExtra, SchedulerLost: as of `workers` and `run_jobs`.
+        ConfigError, MissingExtra, SchedulerLost: as for `workers` and `run_jobs`.
     """
     found: dict[int, Any] = {}
     if count == 0:

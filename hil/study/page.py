@@ -17,7 +17,7 @@ _BINS = 24
 _MOST_ARMS = 200
 """Rows of a fleet's table on the page; the dataset has all."""
 _MANY = 100
-"""Values from which on the outermost hundredths are left out of a histogram."""
+"""Smallest number of values for which a histogram leaves out the outermost hundredths."""
 
 
 def write_page(table: pa.Table, title: str, path: Path) -> Figures:

@@ -175,7 +175,7 @@ def load_study(path: Path) -> Study:
         raise ConfigError(f"{path}: path is not a known key.")
     if "study" not in values and "joints" in values:
         raise ConfigError(
-            f"{path}: it describes an arm, not a study. A study is a file of its own, with a [study] table that names "
+            f"{path}: it describes an arm, not a study. A study is a separate file, with a [study] table that names "
             "the arm's: see docs/scale.md."
         )
     try:

@@ -36,7 +36,7 @@ def slurm_cluster(count: int, memory: str, environment: Mapping[str, str]) -> It
     answers: list[str | None] = []
 
     class Job(SLURMJob):  # type: ignore[misc]
-        """Remembers how the queue answered: dask-jobqueue only logs it, and waits for workers that never come."""
+        """Stores the queue's answer: dask-jobqueue only logs it, and waits for workers that never start."""
 
         async def _submit_job(self, script_filename: str) -> Any:
             try:

@@ -55,7 +55,7 @@ class Spec:
 
 
 class WrongVersions(Exception):
-    """A worker that joined later has other versions than those the study was begun with."""
+    """A worker that joined later has package versions other than those with which the study was started."""
 
 
 class OutOfTime(Exception):
@@ -79,7 +79,7 @@ def work(spec: Spec) -> Row:
 
 
 def lost_row(spec: Spec, error: BaseException | None) -> Row:
-    """Return the row of a run that returned no result because every worker that tried it died."""
+    """Return the row of a run that returned no result because every worker that attempted it died."""
     why = RuntimeError("no worker finished it") if error is None else error
     if type(error).__name__ == "KilledWorker":
         why = MemoryError("every worker that tried it died: it needs more than engine.worker_memory_gib, or crashes")
@@ -108,7 +108,7 @@ def _check_versions(spec: Spec) -> None:
 def _at_most(seconds: float) -> Iterator[None]:
     """Raise OutOfTime in this thread once the process has used so much processor time.
 
-    Not by a signal: runs are not done in a worker's main thread. Compiled code comes to its own end first.
+    No signal is used, because runs are not done in a worker's main thread. Compiled code is not interrupted.
     """
     runner, over, limit = threading.get_ident(), threading.Event(), time.process_time() + seconds
 
@@ -178,14 +178,14 @@ def _done(spec: Spec, folder: Path) -> Any:
 
 @contextmanager
 def _place(spec: Spec) -> Iterator[Path]:
-    """The folder of a run, gone afterwards unless it is to be kept; what hil keeps for its user is kept there too."""
+    """The folder of a run, removed afterwards unless it is to be kept; hil's state folder for the user is there too."""
     with tempfile.TemporaryDirectory(prefix="hil-study-", dir=_scratch(), ignore_cleanup_errors=True) as scratch:
         folder = Path(spec.keep_in) if spec.keep_in else Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
         kept = os.environ.get(_STATE)
         os.environ[_STATE] = str(Path(scratch) / "state")
         try:
-            # A thousand runs' warnings are not for the terminal.
+            # The warnings of a thousand runs do not belong on the terminal.
             with redirect_stderr(io.StringIO()):
                 yield folder
         finally:
@@ -195,7 +195,7 @@ def _place(spec: Spec) -> Iterator[Path]:
 
 
 def _scratch() -> str | None:
-    """The worker's own folder, which Dask removes also after a worker that was killed."""
+    """The worker's own folder, which Dask removes even if the worker was killed."""
     from distributed import get_worker
 
     try:

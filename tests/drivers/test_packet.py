@@ -19,7 +19,7 @@ from hil.drivers.packet import (
     unstuff,
 )
 
-settings.register_profile("no deadline", deadline=None)  # a busy machine is no failure
+settings.register_profile("no deadline", deadline=None)  # a busy machine is not a failure
 settings.load_profile("no deadline")
 
 # Bytes in which headers and stuffing happen often.
@@ -105,7 +105,7 @@ def test_packets_are_found_whatever_the_pieces(packets: list[tuple[int, bytes]],
     assert [(p.id, p.body) for p in found] == packets
 
 
-# Noise without FF cannot look like a header, so nothing of what follows may be lost.
+# Noise without FF cannot look like a header, so nothing after it may be lost.
 @given(st.lists(st.integers(0, 0xFE), max_size=30).map(bytes), BODIES)
 def test_noise_before_a_packet_costs_nothing(noise: bytes, body: bytes) -> None:
     framer = Framer()

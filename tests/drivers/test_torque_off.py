@@ -1,4 +1,4 @@
-"""Cutting torque, packet by packet: what is sent when, to a port and servos that only take notes."""
+"""Cutting torque, packet by packet: what is sent when, to a port and servos that only record."""
 
 import signal
 import threading

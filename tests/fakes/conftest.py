@@ -11,7 +11,7 @@ from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import load_model
 from hil.fakes.servo.servo import EmulatedServo
 
-# A busy machine is no failure; the fixtures used with @given only build benches, so they may be shared.
+# A busy machine is not a failure; the fixtures used with @given only build benches, so they may be shared.
 settings.register_profile("no deadline", deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 settings.load_profile("no deadline")
 

@@ -71,7 +71,7 @@ def test_bus_as_described(tmp_path: Path) -> None:
         (FIRST, FIRST.replace("W350", "W351"), ["fake.servos[1].model = 'XM430-W351'", "did you mean XM430-W350?"]),
         (FIRST, FIRST.replace("XM430-W350", "motor"), ["fake.servos[1].model = 'motor'", "XM430-W350, XM430-W210"]),
         (FIRST, FIRST.replace("id = 1", "id = 253"), ["fake.servos[1].id = 253", "252"]),
-        (FIRST, FIRST.replace("id = 1", "id = 2"), ["IDs 2, 2", "an ID of its own"]),
+        (FIRST, FIRST.replace("id = 1", "id = 2"), ["IDs 2, 2", "needs its own ID"]),
         (FIRST, "", ["1 servos for 2 drives"]),
         (FIRST, FIRST + 'registers = { "Goal Current" = 1 }\n', ["Goal Current", "not an EEPROM register"]),
         (FIRST, FIRST + 'registers = { "Shutdown" = 256 }\n', ["Shutdown", "0 to 255 is allowed"]),

@@ -1,4 +1,5 @@
-"""dynamixel_sdk in random order against rules from the manual: the answers are the same, and the comparison is strict.
+"""dynamixel_sdk calls in random order compared with rules from the manual: the answers are the same, and the comparison
+is strict.
 
 In virtual time; `benchmarks/bus/random_calls.py` does the same over a terminal.
 """

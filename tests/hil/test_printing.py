@@ -77,7 +77,7 @@ def test_no_word_is_broken(words: list[str], width: int) -> None:
 
 PEAKS = (
     "Pilot, peak torque 0.308, 0.162 N m:\n"
-    "                           predicted      99 % within    seen\n"
+    "                           predicted      99 % within    measured\n"
     "  lowest position [rad]    -1.93, -0.27   -2.46, -0.89   -1.95, -0.33\n"
     "  velocity [rad/s]         2.55, 1.38     5.70, 4.28     2.85, 1.89"
 )
@@ -87,6 +87,6 @@ def test_a_table_of_peaks_becomes_lines_of_their_own_where_it_does_not_fit() -> 
     assert rows_below(PEAKS, 80) == PEAKS
     narrow = rows_below(PEAKS, 40)
     assert max(map(len, narrow.splitlines())) <= 40
-    assert "  lowest position [rad]\n    predicted -1.93, -0.27\n    99 % within -2.46, -0.89\n    seen" in narrow
+    assert "  lowest position [rad]\n    predicted -1.93, -0.27\n    99 % within -2.46, -0.89\n    measured" in narrow
     sentence = "The estimate is still too uncertain to go straight to the limits: adding an intermediate run."
     assert rows_below(sentence, 40) == sentence

@@ -149,7 +149,7 @@ def test_python_blocks_are_python() -> None:
 def test_every_subcommand_is_described() -> None:
     text = "\n".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
     for name in COMMANDS:
-        assert f"hil {name}" in text, f"hil {name} is in no document"
+        assert f"hil {name}" in text, f"no document mentions hil {name}"
 
 
 def test_every_core_dependency_has_a_reason() -> None:

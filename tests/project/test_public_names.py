@@ -1,4 +1,4 @@
-"""What the documents and examples import is public: its module lists it in `__all__`, and the list is true."""
+"""What the documents and examples import is public: its module lists it in `__all__`, and the list is correct."""
 
 import ast
 import re
@@ -13,7 +13,7 @@ from tests.support.paths import ROOT
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 REFERENCE = re.compile(r"^::: (hil[\w.]*)", re.M)
 PIECES = "architecture.md"
-"""Its blocks are pieces of the package's own files; tests/project/test_architecture.py applies them."""
+"""Its blocks are fragments of the package's own files; tests/project/test_architecture.py applies them."""
 
 
 def _imported(source: str) -> Iterator[tuple[str, str]]:

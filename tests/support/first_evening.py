@@ -1,8 +1,8 @@
 """A person who types docs/first_evening.md command by command: commands are taken from the page, questions are
 answered.
 
-The arm is a fake one behind a pseudo-terminal, its joints are moved with `hil hand`, and every command is a process
-of its own on a terminal, as on the evening. Only the name of the serial port is replaced.
+The arm is a fake one behind a pseudo-terminal, its joints are moved with `hil hand`, and every command is a separate
+process on a terminal, as on a real evening. Only the name of the serial port is replaced.
 """
 
 import contextlib

@@ -3,7 +3,7 @@
     python -m tests.support.interrupted ramp SIGINT identify arm.toml --out run
 
 The stage is reached when a function is called, or when a sample of some phase is recorded, so that the moment is exact
-and no time is lost; the signal is a real one, and everything after it is the program's own doing.
+and no time is lost; the signal is a real one, and everything after it is up to the program.
 """
 
 import atexit
@@ -113,7 +113,9 @@ def _watch_samples(wanted: Callable[[Phase, int, int, int], bool], send: Callabl
 
 
 def _report_servos() -> None:
-    """At the end of the process, report how it leaves the servos: a fake arm exists only as long as the process."""
+    """At the end of the process, report the state in which it leaves the servos: a fake arm exists only as long as
+    the process.
+    """
     from hil.fakes.bus.bus import FakeBus
 
     original, buses = FakeBus.__init__, []

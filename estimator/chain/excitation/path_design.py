@@ -5,7 +5,7 @@ Evolutionary Computation 9 (2001) 159, with one step size for all) on the finite
 `hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation is scaled to the
 limits of position and speed and then shrunk until `allowed` accepts it.
 
-This designer serves the pilot, which knows only limits: it chooses the centre and the width of the motion too. For a
+This designer is for the pilot, which knows only limits: it also chooses the centre and the width of the motion. For a
 box that the user has chosen, `fourier_path.design_path` is simpler; its criterion, the prediction of other motions in
 that box, needs the box to be given.
 """

@@ -50,8 +50,8 @@ class ChainCoordinates:
     names: tuple[str, ...]
     scales: Array
     """Scales of the base parameters, at their indices; ignored for others (parameters,)."""
-    width_floor: float
-    """Minimum width of every Coulomb step [rad/s]."""
+    width_floor: Array
+    """Minimum width of each joint's Coulomb step (joints,) [rad/s]."""
 
     def values(self, x: Array) -> Array:
         """Return the parameters (parameters,) at the coordinates `x`."""
@@ -63,6 +63,26 @@ class ChainCoordinates:
         positive = np.log(np.where(self._positive, np.maximum(value, self._least), 1.0))
         x: Array = np.where(self._positive, positive, value / self._scales)
         return x
+
+    def moved(self, x: Array, step: Array) -> Array:
+        """Return the point reached by `step` from `x`; other coordinates may follow both.
+
+        If a recording hardly determines the torque of some joints relative to that of the first, their torque scales
+        and all parameters of their links change by a common factor. The scales are exponential. Unless the
+        parameters change exponentially with them, straight steps leave this curved valley, and only tiny ones succeed.
+        """
+        y = x + step
+        if self.torque_scales.size:
+            count = len(self.names)
+            factor = self._following @ step[self.torque_scales]
+            y[:count] = (y[:count] - factor * x[:count]) * np.exp(factor)
+        return y
+
+    def raised(self, x: Array) -> Array:
+        """Return `x`, which other coordinates may follow, with every width raised to its floor."""
+        y = x.copy()
+        y[self._widths] = np.maximum(x[self._widths], np.log(self._least[self._widths]))
+        return y
 
     def slopes(self, x: Array) -> Array:
         """Return the derivative of each parameter by its coordinate (parameters,)."""
@@ -79,13 +99,13 @@ class ChainCoordinates:
         least[:count], most[:count] = -bound, bound
         widths = self._widths
         least[widths], most[widths] = (
-            np.clip(np.log(self.width_floor) - x[widths], -reach * NARROWING, 0.0),
+            np.clip(np.log(self._least[widths]) - x[widths], -reach * NARROWING, 0.0),
             reach * WIDENING,
         )
 
     @cached_property
     def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices of the parameters with a prior of their own: friction shapes and small angles.
+        """Indices of the parameters with their own prior: friction shapes and small angles.
 
         With their typical coordinates and the standard deviations of these.
         """
@@ -111,14 +131,30 @@ class ChainCoordinates:
         return np.array([kind in POSITIVE for kind in self._kinds])
 
     @cached_property
+    def _following(self) -> Array:
+        """Weights with which parameters follow the logarithms of the torque scales (parameters, joints - 1).
+
+        An offset follows the scale of its own joint, a link's parameters the mean scale of all joints but the first up
+        to its own; those of the first link follow none.
+        """
+        weights = np.zeros((len(self.names), self.torque_scales.size))
+        for index, (name, kind) in enumerate(zip(self.names, self._kinds, strict=True)):
+            joint = int(name.rpartition("_")[2]) if kind != name else 1
+            if joint > 1 and kind == "offset":
+                weights[index, joint - 2] = 1.0
+            elif joint > 1 and kind not in POSITIVE and kind not in SMALL:
+                weights[index, : joint - 1] = 1.0 / (joint - 1)
+        return weights
+
+    @cached_property
     def _widths(self) -> npt.NDArray[np.int64]:
         return np.flatnonzero([kind == "coulomb_width" for kind in self._kinds])
 
     @cached_property
     def _least(self) -> Array:
-        return np.array(
-            [self.width_floor if kind == "coulomb_width" else POSITIVE.get(kind, 0.0) for kind in self._kinds]
-        )
+        least = np.array([POSITIVE.get(kind, 0.0) for kind in self._kinds])
+        least[self._widths] = self.width_floor
+        return least
 
     @cached_property
     def _scales(self) -> Array:

@@ -150,7 +150,9 @@ class ChainProblem:
             self.coordinates.limit(point[: self.count], self.reach, least, most)
             return least, most
 
-        return minimise(self.evaluate, x, ftol, damping, at, limits=limits, options=options)
+        return minimise(
+            self.evaluate, x, ftol, damping, at, move=self.coordinates.moved, limits=limits, options=options
+        )
 
     def positions(self, x: Array) -> tuple[Array, ...] | None:
         """Return the predicted positions of each period (joints, samples) [rad]; None if a motion diverges."""

@@ -24,7 +24,7 @@ from hil.estimator.errors import RecordingError
 def fit_filtered(
     recordings: Sequence[Recording], model: ChainModel, prior: Prior, cutoff: float, delay: float = 0.0
 ) -> tuple[Array, Array]:
-    """Return values and standard errors, assuming a white residual, of `ChainModel.linear_names` [SI].
+    """Return the values of `ChainModel.linear_names` and their standard errors, assuming a white residual [SI].
 
     cutoff: cut-off frequency of the filter [Hz]. delay: delay of the torque [s]. Raises RecordingError if the recording
     cannot be filtered.

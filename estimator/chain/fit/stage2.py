@@ -13,6 +13,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.coordinates import ChainCoordinates, kind_of
 from hil.estimator.chain.fit.objective import ChainProblem
+from hil.estimator.chain.fit.resolved_widths import resolved_widths
 from hil.estimator.chain.fit.stage1 import ChainLinear
 from hil.estimator.chain.fit.uncertainty import coloured_covariance
 from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
@@ -28,7 +29,7 @@ from hil.estimator.fit.covariance import (
 )
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.noise_weights import noise_weights
-from hil.estimator.options import CovarianceOptions, MinimiserOptions
+from hil.estimator.options import CoordinateOptions, CovarianceOptions, MinimiserOptions
 from hil.estimator.simulation.arm import steps_per_sample
 
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0, ADDED_MASS: 1.0}
@@ -53,6 +54,9 @@ class ChainOptions:
     """Integration step of the last iterations [s]."""
     finer: int = 16
     """Number of smaller steps that replace one near standstill, where friction changes fast."""
+    finest: int = 64
+    """The same number in the last iterations."""
+    widths_per_substep: float = CoordinateOptions.widths_per_substep
     width_floor: float = 3e-4
     """Minimum width of every Coulomb step [rad/s]: hardly distinguishable from friction that truly sticks."""
     initial_width: float = 0.03
@@ -72,6 +76,9 @@ class ChainOptions:
     ftol: float = 2e-5
     towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
     """Initial guesses as fractions of the way from the prior to stage 1; the first that can be simulated is used."""
+    unfinished: float = 9.0
+    """Decrease of the sum of squares, expected of one more step, above which the minimum counts as not reached: the
+    fit continues with shorter integration steps, and what still remains widens the standard errors."""
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""
     outlier_threshold: float = 4.0
@@ -79,7 +86,7 @@ class ChainOptions:
 
 
 DEFAULTS = ChainOptions()
-REPEATED = 4  # equal readings in a row that still count in full: a moving joint gives as many
+REPEATED = 4  # consecutive equal readings that still count in full: a moving joint produces as many
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 NEARER, LAST = MinimiserOptions(max_damping=0.1), MinimiserOptions(max_damping=1.0)
 """Options of the last iterations with coarse steps, which fine ones follow, and with fine steps.
@@ -111,6 +118,8 @@ class ChainFit:
     """Number of simulations with derivatives."""
     softness: float
     """Natural frequency of the observer at the end [Hz]."""
+    remaining: float
+    """Decrease of the sum of squares that is expected of one more step: how far the minimum may be."""
 
 
 def fit_periods(
@@ -132,7 +141,11 @@ def fit_periods(
     coarse = replace(problem, steps=_steps(periods, options.coarse_step), reach=0.0)
     x = _towards_prior(coarse, x, options)
     soft, softness, spent = _softened(coarse, x, options)
-    sticking = replace(coarse, softness=softness, finer=options.finer, reach=1.0)
+    resolved = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
+    floors = np.maximum(resolved, options.width_floor)
+    bounded = replace(problem.coordinates, width_floor=floors)
+    soft = bounded.raised(soft)
+    sticking = replace(coarse, coordinates=bounded, softness=softness, finer=options.finer, reach=1.0)
     near = sticking.minimise(soft, options.ftol_near)
     positions = sticking.positions(near.x)
     assert positions is not None  # the minimum's motion is finite
@@ -141,7 +154,7 @@ def fit_periods(
     nearer = replace(sticking, weights=weights, reach=options.reach).minimise(
         near.x, options.ftol_nearer, options=NEARER
     )
-    last = replace(sticking, weights=weights, steps=problem.steps, reach=options.reach)
+    last = replace(sticking, weights=weights, steps=problem.steps, finer=options.finest, reach=options.reach)
     damped = last.minimise(nearer.x, options.ftol, options=LAST)
     # Damping holds back poorly determined coordinates, so it is removed now. Without it from the beginning, many
     # coordinates would reach their step limits and hold up the others.
@@ -150,7 +163,22 @@ def fit_periods(
         minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
         spent += minimum.iterations
     spent += near.iterations + nearer.iterations + damped.iterations
-    return _fit(last, minimum, outliers, COVARIANCE, spent)
+    if _remaining(minimum)[1] > options.unfinished:
+        last = replace(last, steps=2 * last.steps)
+        minimum = last.minimise(minimum.x, options.ftol, MINIMISER.min_damping, LAST)
+        spent += minimum.iterations
+    return _fit(last, minimum, outliers, COVARIANCE, spent, options.unfinished)
+
+
+def _remaining(minimum: Minimum) -> tuple[Array, float]:
+    """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations foresee.
+
+    Where the sum of squares has small steps, all damped steps may fail although the gradient is not zero.
+    """
+    at = minimum.at
+    scale = np.sqrt(np.maximum(np.diag(at.normal), 1e-300))
+    step = -np.linalg.pinv(at.normal / np.outer(scale, scale), hermitian=True) @ (at.gradient / scale) / scale
+    return step, -float(step @ at.gradient)
 
 
 def _softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Array, float, int]:
@@ -186,7 +214,7 @@ def _problem(
     """Return the problem, with every sample weighted by the known noise, and the initial guess."""
     velocity = float(np.sqrt(np.mean([np.mean(motion.velocity**2) for motion in linear.motions])))
     scales = np.concatenate((np.maximum(prior.std, 1e-9), np.ones(len(model.names) - prior.std.size)))
-    coordinates = ChainCoordinates(model.names, scales, options.width_floor)
+    coordinates = ChainCoordinates(model.names, scales, np.full(model.joints, options.width_floor))
     state_scale = np.repeat([options.angle_scale, velocity], model.joints)
     known = dict(zip(model.linear_names, linear.value.tolist(), strict=True))
     known |= {
@@ -239,7 +267,12 @@ def _repeated(period: SettledPeriod) -> Array:
 
 
 def _fit(
-    problem: ChainProblem, minimum: Minimum, outliers: int, options: CovarianceOptions, iterations: int
+    problem: ChainProblem,
+    minimum: Minimum,
+    outliers: int,
+    options: CovarianceOptions,
+    iterations: int,
+    unfinished: float,
 ) -> ChainFit:
     x, count = minimum.x, problem.count
     positions = problem.positions(x)
@@ -259,6 +292,9 @@ def _fit(
     if structured > 0.0:  # a model error repeats itself, and its size may vary over time
         robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
         covariance = _larger(covariance, robust)
+    step, decrease = _remaining(minimum)
+    if decrease > unfinished:
+        covariance = covariance + np.outer(step[:count], step[:count])
     value = problem.coordinates.values(x[:count])
     return ChainFit(
         value,
@@ -270,6 +306,7 @@ def _fit(
         float(lags),
         iterations,
         problem.softness,
+        decrease,
     )
 
 

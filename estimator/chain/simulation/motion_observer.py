@@ -196,7 +196,8 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
                 alarm = j
         taught = min(beyond * beyond, CLIPPED * spread) - left_open - rounding
         memory[NOISE, j] += min(dt / NOISE_S, 1.0) * (max(taught, least_noise[j]) - memory[NOISE, j])
-        # Static friction takes up any torque within its bounds, for as long as a joint stands: that teaches nothing.
+        # Static friction takes up any torque within its bounds, for as long as a joint stands: nothing can be learned
+        # from it.
         if lesson and beyond <= limit and memory[STANDS, j] < MOSTLY:
             total = spread + holds * holds
             for i in range(count):

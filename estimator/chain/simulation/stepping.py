@@ -224,6 +224,29 @@ def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:
     return int(min(math.ceil(needed), most))
 
 
+def _broken(p: Any, v: Any, k: Any, solve: Any, step: float, most: int) -> int:
+    """Return the number of smaller steps, at most `most`, that replace an undivided one after its first stage.
+
+    A joint that breaks away from standstill in this step was not accelerating before it, so `_pieces` cannot foresee
+    it. Friction at the end of the stage then differs from the tangent that the stage assumed; the velocity error
+    that this difference causes may reach CROSSED widths. k: accelerations of the stage. solve: as `_stage` left it.
+    """
+    left, inverse = solve[0], solve[2]
+    gh = GAMMA * step
+    needed = 1.0
+    for j in range(v.size):
+        width = p[WIDTH, j]
+        ahead = v[j] + step * k[j]
+        if p[COULOMB, j] > 0.0 and (min(abs(v[j]), abs(ahead)) < NEAR * width or v[j] * ahead < 0.0):
+            bend = math.tanh(ahead / width)
+            steepness = (left[1, j] - p[VISCOUS, j]) * width  # level of dry friction times (1 - bend^2) before the step
+            level = p[COULOMB, j] * (1.0 + p[RISE, j] * left[2, j])
+            wrong = abs(level * (bend - left[3, j]) - steepness * (ahead - v[j]) / width)
+            inertia = 1.0 / inverse[j, j] + gh * (level * (1.0 - bend * bend) - steepness) / width
+            needed = max(needed, step * wrong / (CROSSED * width * max(inertia, 1e-12)))
+    return int(min(math.ceil(needed), most))
+
+
 def _run_loop(  # noqa: PLR0912
     chain: Any,
     links: Any,
@@ -270,11 +293,17 @@ def _run_loop(  # noqa: PLR0912
         for s in range(torque.shape[1]):
             t = torque[sample, s]
             pieces = _pieces(p, v, k, step, finer)
-            h = step / pieces
-            gh = GAMMA * h
-            for _ in range(pieces):
+            done = 0
+            while done < pieces:
+                h = step / pieces
+                gh = GAMMA * h
                 if not _stage(chain, links, p, q, v, t, nothing, gh, k, work, solve):
                     return False
+                if pieces == 1 and finer > 1:
+                    pieces = _broken(p, v, k, solve, step, finer)
+                    if pieces > 1:
+                        continue
+                done += 1
                 if causes > 0:
                     _follow(chain, links, p, v, t, slopes[sample, s], k, gh, columns, work, solve, by, direct)
                     for i in range(n):
@@ -315,7 +344,7 @@ def _run_loop(  # noqa: PLR0912
 _inner: Any = numba.njit(  # type: ignore[call-overload]
     nogil=True, error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True, no_cpython_wrapper=True
 )
-_left, _direct, _add_eight, _add_four, _add_one, _add_product, _solved, _stage, _follow, _pieces = map(
-    _inner, (_left, _direct, _add_eight, _add_four, _add_one, _add_product, _solved, _stage, _follow, _pieces)
+_left, _direct, _add_eight, _add_four, _add_one, _add_product, _solved, _stage, _follow, _pieces, _broken = map(
+    _inner, (_left, _direct, _add_eight, _add_four, _add_one, _add_product, _solved, _stage, _follow, _pieces, _broken)
 )
 run: Callable[..., bool] = compiled(_run_loop, fastmath={"contract"})

@@ -13,7 +13,7 @@ from hil.experiment.stream import Progress
 
 _NEAR = 0.85  # fraction of a limit above which a value is shown in yellow
 _WIDEST, _NARROWEST = 22, 8  # columns of a gauge
-_TOLD_IN_FULL = 60  # columns from which on the timing is told in full
+_TOLD_IN_FULL = 60  # smallest number of columns in which the timing is shown in full
 _VALUE, _LIMITS, _HEALTH = 7, 12, 14  # columns of a value, of a gauge's two limits, of temperature and voltage
 
 
@@ -116,6 +116,6 @@ class LiveView:
 
 
 def _keep_finite(kept: list[float], seen: Sequence[float]) -> None:
-    """Replace the values kept by those seen, except where a servo did not answer."""
+    """Overwrite the stored values with the new ones, except where a servo did not answer."""
     for index, value in enumerate(seen):
         kept[index] = float(value) if math.isfinite(value) else kept[index]

@@ -48,7 +48,7 @@ def rerun_view(live: str, config_path: Path) -> Iterator[OnProgress]:
 
 
 def _open(recording: Any, place: str) -> None:
-    """Send to the viewer at `place`: a file, a URL, or none for a viewer of its own."""
+    """Send to `place`: a file or a URL; if it is empty, start a viewer."""
     if "://" in place:
         recording.connect_grpc(place)
     elif place:

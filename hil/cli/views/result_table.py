@@ -17,7 +17,7 @@ from hil.results.parts import Quantity
 from hil.results.result import Result, SettledResult, ShootingResult
 
 _NOTHING = 0.01
-"""Fraction of a standard error below which a true value is practically 0, so that a relative error means nothing."""
+"""Fraction of a standard error below which a true value is practically 0, so that a relative error is meaningless."""
 
 _MOST_NAMED = 3
 """Largest number of tried models that are all listed by name."""
@@ -95,7 +95,7 @@ def _parameters(result: SettledResult) -> Table:
 
 
 def _undetermined(result: SettledResult) -> list[str]:
-    """Name the values that this motion hardly determines, so that nobody takes them for measured ones."""
+    """Name the values that this motion hardly determines, so that nobody mistakes them for measured ones."""
     known = {**result.parameters, **result.extra}
     names = [
         name
@@ -104,13 +104,13 @@ def _undetermined(result: SettledResult) -> list[str]:
     ]
     if not names:
         return []
-    return [f"Not determined by this motion (its effect is within a standard error of none): {', '.join(names)}."]
+    return [f"Not determined by this motion (effect within one standard error of zero): {', '.join(names)}."]
 
 
 def _may_be_absent(name: str, entry: Quantity) -> bool:
     """Whether a term's distance from no effect is below its standard error."""
     kind = kind_of(name)
-    if kind == "stribeck_velocity":  # no velocity stands for no effect
+    if kind == "stribeck_velocity":  # no value of the velocity means no effect
         return entry.std > abs(entry.value)
     return kind in TERMS and not abs(entry.value - term_of(name).absent) > entry.std
 
@@ -127,7 +127,7 @@ def _constant_std(result: SettledResult, name: str) -> float:
 
 
 def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
-    """counted: standard error that an error is held against, with the torque constant's."""
+    """counted: standard error with which an error is compared, including that of the torque constant."""
     value, std = entry.value, entry.std
     cells = [f"{value:.5g}", f"{std:.1e}"]
     if truth is not None:

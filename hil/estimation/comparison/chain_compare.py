@@ -78,7 +78,7 @@ class Judge:
 def worst_chain_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
     """Name and largest relative error among the large base parameters and the friction terms.
 
-    Offsets are left out, and so are sums that are small beside others of their kind (see LARGE).
+    Offsets are left out, and so are sums that are small compared with others of their kind (see LARGE).
     """
     kinds = {name: name.partition("_")[0] for name in truth if not name.startswith(("offset", "base_tilt"))}
     largest = {kind: max(abs(truth[name]) for name in kinds if kinds[name] == kind) for kind in set(kinds.values())}

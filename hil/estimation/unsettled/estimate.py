@@ -127,7 +127,7 @@ def _fitted(
             recordings, wanted.drive, start, length=segment, zeros=zeros, torque_scale=wanted.torque_scale
         )
         return choice.estimate, choice, choice.chosen.held_out
-    # The encoders' zeros are each recording's own here.
+    # Here each recording has its own encoder zeros.
     model = wanted_model(wanted, recordings[0].joints).without("zeros")
     estimate = estimate_by_shooting(recordings, model, start, length=segment, zeros=zeros)
     return estimate, None, held_out_error(recordings, estimate, start)

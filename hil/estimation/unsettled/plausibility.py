@@ -12,11 +12,11 @@ TORQUE = (2e-3, 60.0)  # N m: the largest torque of the smallest and of the larg
 PENDULUM = (3e-3, 3.0)  # m: length of a pendulum with the joint's inertia and gravity
 SURE = 4.0  # standard errors
 UNKNOWN = 0.5  # standard error over value
-SHOWN = 1e-3  # of the largest torque of a joint, or of a ratio: less is nothing
+SHOWN = 1e-3  # of the largest torque of a joint, or of a ratio: less counts as zero
 
 
 def implausible(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: float) -> list[str]:
-    """One sentence for each value that cannot be. gravity: in the arm's plane [m/s^2]."""
+    """One sentence for each impossible value. gravity: in the arm's plane [m/s^2]."""
     return [*_torques(recordings), *_pendulum(estimate, gravity), *_weight(estimate, gravity)]
 
 

@@ -1,4 +1,4 @@
-"""From other tools' files to a folder with a result, as a run of this one has it."""
+"""From other tools' files to a folder with a result, like that of a run."""
 
 import json
 import re
@@ -43,7 +43,7 @@ class _Read:
 
 
 def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder: Path | None) -> ShootingResult:
-    """The result of one or more files of the same arm, recorded apart; written into `folder`, which exists.
+    """The result of one or more separate recordings of the same arm; written into `folder`, which exists.
 
     Raises HilError, EstimationError.
     """
@@ -68,7 +68,7 @@ def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder:
 def _estimate_chain(
     paths: Sequence[Path], config_path: Path | None, config: RecordingConfig, folder: Path | None
 ) -> ShootingResult:
-    """The same for a spatial arm; its URDF is kept beside the result."""
+    """The same for a spatial arm; its URDF is kept next to the result."""
     read = _read(paths, config.columns)
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
     found = estimate_chain_recordings(read.recordings, config, shown)

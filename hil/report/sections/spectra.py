@@ -46,7 +46,7 @@ def _levels(data: RunData) -> tuple[Table, ...]:
         for joint, name in enumerate(data.names)
     ]
     rows += [(f"noise, {name}", "", steps(levels.noise[joint]), "") for joint, name in enumerate(data.names)]
-    head = ("lines", "how many", "motion per line [steps]", "model residual [steps]")
+    head = ("lines", "number", "motion per line [steps]", "model residual [steps]")
     return (Table(head, tuple(rows), caption="RMS per line, by kind"),)
 
 

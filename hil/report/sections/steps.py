@@ -9,7 +9,7 @@ from hil.results.parts import PlayedStep
 
 
 def steps(data: RunData) -> Section | None:
-    """The section; None if the run was not played in steps."""
+    """The section; None if the run did not proceed in steps."""
     played = data.result.steps
     if not played:
         return None
@@ -34,5 +34,5 @@ def _table(step: PlayedStep, config: Config) -> Table:
         for row, (quantity, unit) in enumerate(quantities_of(config))
     ]
     torque = listed([f"{name} {number(peak, 3)} N m" for name, peak in zip(names, step.peak_torque, strict=True)])
-    head = ("joint and peak", "typical arm", "99 of 100 arms", "seen")
+    head = ("joint and peak", "typical arm", "99 of 100 arms", "measured")
     return Table(head, tuple(rows), caption=f"{step.name}, peak torque {torque}")

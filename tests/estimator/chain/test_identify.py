@@ -143,7 +143,9 @@ def test_filtered_least_squares_takes_any_recording(setup: bench.Setup, period: 
 
 
 def test_wrong_torque_constants_are_found(setup: bench.Setup, period: SettledPeriod) -> None:
-    """Joints share links, so constants that are off by different factors fit no arm unless their ratios are free."""
+    """Joints share links, so constants that are off by different factors are consistent with no arm unless their
+    ratios are free.
+    """
     wrong = np.array([1.0, 1.03, 0.97, 1.02])
     assumed = replace(period, torque=period.torque * wrong[:, None])
     prior = replace(setup.prior, scale_precision=scale_precision(np.full(4, 0.05)))

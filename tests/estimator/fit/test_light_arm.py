@@ -1,4 +1,6 @@
-"""A light arm with large friction: a narrow Coulomb step stays resolved, and cogging is found beside encoder errors."""
+"""A light arm with large friction: a narrow Coulomb step stays resolved, and cogging is found despite encoder
+errors.
+"""
 
 import math
 from dataclasses import replace

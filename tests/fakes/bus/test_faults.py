@@ -317,7 +317,7 @@ def test_from_the_command_line() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("gone", "Its kinds: lost_reply, corrupted_reply"),
+        ("gone", "Available kinds: lost_reply, corrupted_reply"),
         ("overload:when=3", '"when=3" is not KEY=VALUE with one of the keys at, duration'),
         ("overload:at=soon", "at = 'soon': must be a number"),
         ("overload:probability=2", "probability = 2.0"),

@@ -223,7 +223,7 @@ CASES: list[tuple[str, int, str]] = [
     ("schema --out nowhere/deep/schema.json", 2, "nowhere/deep"),
     ("dry-run arm.toml --arms 0", 2, "arms"),
     ("dry-run arm.toml", 2, "link_lengths"),
-    # thirty more, as typed by an outsider for the first time (2026-11-22)
+    # thirty more, as typed by a first-time user (2026-11-22)
     ("identfy arm.toml", 2, "Did you mean 'identify'?"),
     ("--versoin", 2, "--version"),
     ("identify arm.toml --live paper", 2, "must be terminal, rerun"),
@@ -254,7 +254,7 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate run list.csv", 2, "give either one run folder or recordings"),
     ("estimate arm.toml", 2, "give the folder of a run"),
     ("export run --format stl", 2, "'stl' is not a format"),
-    ("check arm.yaml", 2, "arm.yaml: it is YAML, by its name; hil's files are TOML. `hil init` writes one."),
+    ("check arm.yaml", 2, "arm.yaml: judging by its name, it is YAML; hil's files are TOML. `hil init` writes one."),
     ("check mbaud.toml", 2, "port.baud = 1: must be one of 9600,"),
     ("identify mbaud.toml", 2, "If it is in millions, write 1000000."),
     ("check radians.toml", 2, "If it is in rad/s, write [0.1114, 31.83]"),

@@ -41,10 +41,10 @@ def test_a_file_runs_no_command(
     assert not made.exists()
     said = capsys.readouterr()
     assert "--allow-code" in said.out + said.err
-    assert hil(command, path, *options, "--allow-code") != 0, "what comes of it is no plant"
+    assert hil(command, path, *options, "--allow-code") != 0, "its return value is not a plant"
     assert made.exists()
     made.unlink()
-    assert hil(command, path, *options) != 0 and not made.exists(), "leave is for one command"
+    assert hil(command, path, *options) != 0 and not made.exists(), "permission applies to one command only"
 
 
 def test_a_link_made_by_somebody_else_while_the_cable_was_out_stays(arm_file: ArmFile, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ ALL_CONFIGS = sorted(CONFIGS.rglob("*.toml"))
 
 
 def test_the_committed_schema_is_that_of_the_code() -> None:
-    said = f"write it anew: hil schema --out configs/{FILE_NAME}"
+    said = f"regenerate it: hil schema --out configs/{FILE_NAME}"
     assert (CONFIGS / FILE_NAME).read_text(encoding="utf-8") == schema_text(), said
 
 

@@ -1,4 +1,4 @@
-"""A dry run of a spatial arm is only "safe" if a stop would lay the arm down."""
+"""A dry run of a spatial arm is only "safe" if a stop would lower the arm to its rest pose."""
 
 import numpy as np
 

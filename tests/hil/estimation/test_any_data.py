@@ -50,7 +50,7 @@ def test_a_real_arm_recorded_by_others(capsys: pytest.CaptureFixture[str]) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not WHOLE.is_dir(), reason="the whole recordings are not here")
+@pytest.mark.skipif(not WHOLE.is_dir(), reason="the complete recordings are not available")
 def test_the_whole_of_it_is_within_four_percent(capsys: pytest.CaptureFixture[str]) -> None:
     files = sorted(WHOLE.glob("c1_sinusoids_*.csv"))
     assert hil("estimate", *files, "--config", DFKI, "--json") == 0
@@ -195,7 +195,7 @@ def test_compare_and_known_quantities_on_one_run(
     methods = json.loads(capsys.readouterr().out)["methods"]
     assert set(methods) == {"hil", "idim_ls", "rls", "ekf", "ukf", "paper"}
     others = [entry["worst_relative_error"] for name, entry in methods.items() if name != "hil"]
-    assert methods["hil"]["worst_relative_error"] < min(others) < 0.1, "the best, and not among straw men"
+    assert methods["hil"]["worst_relative_error"] < min(others) < 0.1, "the best, in a fair comparison"
     assert Path("run/compare.json").is_file()
 
 

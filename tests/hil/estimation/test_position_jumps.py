@@ -1,4 +1,4 @@
-"""A single jump of a position is found; real motion, delay and bad readings are not taken for one."""
+"""A single jump of a position is found; real motion, delay and bad readings are not mistaken for one."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ VELOCITY_STEP = 0.229 * 2 * np.pi / 60
 def swing(
     rate: float, amplitude: float, delay_s: float, seed: int, seconds: float = 20.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time, position and velocity as a servo reports them: rounded, and the velocity late."""
+    """Time, position and velocity as a servo reports them: rounded, and with a delayed velocity."""
     random = np.random.default_rng(seed)
     time = np.arange(round(seconds * rate)) / rate
     tones = [(0.3 + 4.0 * random.random(), 2 * np.pi * random.random()) for _ in range(6)]

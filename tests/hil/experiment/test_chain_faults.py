@@ -19,7 +19,7 @@ def test_random_faults_end_safe_and_where_possible_lying() -> None:
     assert not any(counted[bad] for bad in ("misleading", "unreadable", "not_restored")), told
     overruled = [each for each in outcomes if each.overruled_ms > each.cut_ms]
     assert counted["unsafe"] == len(overruled), told
-    # Asked: none. A servo that another program put into another mode is noticed later than that (docs/benchmarks.md).
+    # Required: none. A servo that another program switched to another mode is detected later (docs/benchmarks.md).
     assert all(each.overruled_ms <= OVERRULED_MS for each in overruled), told
     assert len(overruled) <= 1, told
     assert counted["lying"] == counted["could_command"] > 0, told

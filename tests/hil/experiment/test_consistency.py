@@ -68,7 +68,7 @@ def test_a_velocity_that_is_scaled_turned_round_or_old(rate: int, scale: float, 
         return speed(now) if now < 2.0 else scale * speed(now - lag)
 
     when = seen_after(rate, lambda now: -4.0 / math.tau * math.cos(math.tau * now), felt)
-    assert 0.0 <= when - 2.0 <= 0.25 + 2 / rate, "a sine at its zero: it takes a while until there is something to see"
+    assert 0.0 <= when - 2.0 <= 0.25 + 2 / rate, "a sine at its zero: nothing can be seen at once"
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -101,7 +101,7 @@ def test_after_a_lost_reply_it_begins_anew() -> None:
     for index in range(400):
         assert not look.look(0.01 * index, 4.0, 0.0025)
     look.lost()
-    assert not look.look(9.0, 4.0, 0.0025), "the way over lost replies is not its affair"
+    assert not look.look(9.0, 4.0, 0.0025), "the motion during lost replies is not checked here"
     for index in range(400):
         assert not look.look(9.0 + 0.01 * (index + 1), 4.0, 0.0025)
 
@@ -175,7 +175,9 @@ def test_a_creep_slower_than_a_tick_of_velocity_is_taken_for_rounding() -> None:
 
 @pytest.mark.parametrize(("jumps", "seen"), [((0.4, 0.5, 0.6), False), ((0.4, 0.5, 0.6, 0.7), True)])
 def test_four_jumps_are_too_many(jumps: tuple[float, ...], seen: bool) -> None:
-    """To and fro, so that nothing accumulates; each there-and-back is one jump, its return half of the next."""
+    """Back and forth, so that nothing accumulates; each pair of steps is one jump, the return being half of the
+    next.
+    """
     times = [round(400 * jump) for jump in jumps]
 
     def position(now: float) -> float:
@@ -185,7 +187,7 @@ def test_four_jumps_are_too_many(jumps: tuple[float, ...], seen: bool) -> None:
 
 
 class _Reference:
-    """The memory of one time constant, computed anew from everything that was ever added."""
+    """The memory of one time constant, recomputed from everything added so far."""
 
     def __init__(self, seconds: float, first: float) -> None:
         self.seconds, self.first = seconds, first
@@ -274,7 +276,7 @@ def test_the_tolerance_is_the_sum_of_its_parts(sign: float) -> None:
 
 @pytest.mark.parametrize(("moved", "velocities"), [(0.12, (0.0, 1.5)), (-0.09, (0.0, 0.0))])
 def test_lag_and_scale_explain_part_of_a_jump(moved: float, velocities: tuple[float, float]) -> None:
-    """A velocity that changes may lag; of a way that was covered, the scale's share may be wrong."""
+    """A changing velocity may lag; a distance covered may be wrong by the scale error's share."""
     look = Consistency()
     look.look(0.0, velocities[0], 0.0)
     look.look(moved, velocities[1], 0.01, 0.001)

@@ -27,7 +27,7 @@ REFUSED = re.compile(r"fake_inverted at 20 Hz .*experiment\.rate = 20 is too low
 """A software spring that acts 75 ms late cannot hold an arm upright."""
 
 LEARNS_S = 1.5
-"""For how long an arm without `arm.link_lengths` is learnt, with whatever else drives it meanwhile [s]."""
+"""Time for which an arm without `arm.link_lengths` is learnt, together with anything else that drives it [s]."""
 
 LEARNT = frozenset({Kind.PUSHED, Kind.GRIPPED, Kind.SLIP, Kind.GOAL_FIGHT})
 """Faults that show only in the motion."""
@@ -41,7 +41,7 @@ EVERY_THIRD = 3
 def taught(outcome: Outcome) -> bool:
     """Whether something moved an arm without a description from its first moments on, and was learnt with the arm.
 
-    The one fault that is known to stay unseen for longer than it should (docs/safety.md).
+    The only kind of fault known to remain undetected for longer than it should (docs/safety.md).
     """
     described = prepare(outcome.setting, PERIOD_S).config.arm.link_lengths is not None
     first = min([each.start for each in outcome.drawn.attacks if each.kind in LEARNT], default=np.inf)

@@ -103,7 +103,7 @@ def test_silence_on_a_computer_that_was_late_before_names_it_too(arm: Arm) -> No
     with pytest.raises(SafetyStop, match=r"Check its cable and its supply.$"):
         for number in range(31, 60):
             guard.look(at(number, MISSING))
-    assert number == 36, "one servo among others is silent itself"
+    assert number == 36, "a single servo is itself silent"
 
 
 def test_a_current_that_does_not_follow(arm: Arm) -> None:

@@ -56,7 +56,7 @@ def test_ctrl_c_lowers_the_arm_to_its_rest_pose(tmp_path: Path) -> None:
     assert any("lowered to its rest pose" in note for note in error.__notes__)
     np.testing.assert_allclose(samples["position"][-1], rest_of(TEXT), atol=0.05)
     assert np.abs(samples["velocity"][-1]).max() < 0.1
-    assert np.abs(lowered["goal_current"][-1]).max() < 0.1  # nothing is left to drop when torque is cut
+    assert np.abs(lowered["goal_current"][-1]).max() < 0.1  # the arm does not drop when torque is cut
     assert np.abs(lowered["velocity"][120:]).max() < 1.0  # braked, then slowly
     assert len(lowered) / 400 < 12.0
 

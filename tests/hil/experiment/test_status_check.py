@@ -100,7 +100,7 @@ def test_another_servos_clock_is_told_from_a_late_reply(arm: Arm) -> None:
 def test_either_doubt_asks_for_another_reading(arm: Arm) -> None:
     check = StatusCheck(arm())
     check.look(0, FINE._replace(goal=0.05), 0.1, 1.0)
-    assert check.is_in_doubt, "a goal that was not taken"
+    assert check.is_in_doubt, "a goal that was not accepted"
     check.look(0, FINE, 0.1, 1.0)
     assert not check.is_in_doubt
     late = StatusCheck(arm())

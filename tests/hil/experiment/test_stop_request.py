@@ -31,7 +31,7 @@ def test_a_signal_is_only_noted_under_torque_and_raised_after_it(number: signal.
     with pytest.raises(StopRequested, match=r"Ctrl-C|SIGTERM|SIGHUP"), StopRequest() as stop:
         with stop.only_noted():
             send(number)
-            after.append("torque is cut in peace")
+            after.append("torque is cut undisturbed")
         stop.check()
     assert after
 
@@ -55,7 +55,7 @@ def test_handlers_are_the_former_ones_after_the_outermost_block_and_a_second_sig
     with pytest.raises(StopRequested), StopRequest() as stop:
         with StopRequest() as inner:
             assert inner is stop
-        assert signal.getsignal(signal.SIGTERM) != before, "the outer block still stands"
+        assert signal.getsignal(signal.SIGTERM) != before, "the outer block is still active"
         with stop.only_noted():
             send(signal.SIGTERM)
             assert not stop.insisted

@@ -33,7 +33,7 @@ class Viewer:
 
 
 def checked(message: Any, schema: dict[str, Any]) -> None:
-    """Every field of the message stands in the schema, and the other way round."""
+    """Every field of the message is in the schema, and vice versa."""
     if schema["type"] == "object" and "properties" in schema:
         assert set(message) == set(schema["properties"])
         for name, value in message.items():

@@ -58,7 +58,7 @@ def test_a_joint_that_stood_still_asks_for_friction_and_nothing_else(config: Con
     belief = prior.after(config, seen)
     for joint in (1, 2):
         assert median(belief, f"coulomb_{joint}") > 1.2 * median(prior, f"coulomb_{joint}")
-        assert belief.spread(f"coulomb_{joint}") > 0.1, "how much more, nobody knows"
+        assert belief.spread(f"coulomb_{joint}") > 0.1, "how much more is unknown"
         assert median(belief, f"gravity_{joint}") == median(prior, f"gravity_{joint}")
     assert (np.ptp(belief._motions(config, seen), axis=2) < 0.03).mean() > 0.95
     assert belief.ensemble().source == "belief" and prior.ensemble().source == "prior"
@@ -76,7 +76,7 @@ def test_arms_that_do_not_come_back_are_given_gains_that_hold_them(
     assert (held.stabiliser is not None) is needed
     if not needed:
         return
-    assert with_stabiliser(held, belief) is held, "gains that somebody gave are kept"
+    assert with_stabiliser(held, belief) is held, "configured gains are kept"
     push = np.zeros((2, 1600))
     push[:, :80] = 0.2 * np.array([[2.1], [1.4]])
     feedback = feedback_of(held)

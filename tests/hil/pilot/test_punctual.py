@@ -22,7 +22,7 @@ class Plays:
         self.times = 0
 
     def __call__(self) -> str:
-        assert not self.folder.samples_path.exists(), "the recording before is out of the way"
+        assert not self.folder.samples_path.exists(), "the previous recording has been set aside"
         self.times += 1
         self.folder.samples_path.write_text(f"recording {self.times}")
         if not self.causes:

@@ -47,7 +47,7 @@ def written(folder: Path, kind: tuple[float, float], joints: int = 1, swing: flo
 
 @pytest.fixture(autouse=True)
 def _without_stopping_distance(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It takes most of the time of a dry run and has tests of its own."""
+    """It takes most of the time of a dry run and has its own tests."""
 
     def none(config: Config, *_: object) -> Stopping:
         beyond = dict.fromkeys(Way, np.zeros(len(config.joints)))

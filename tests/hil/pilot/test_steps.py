@@ -92,7 +92,7 @@ def test_the_full_run_beats_the_pilot(in_steps: Any) -> None:
 def test_every_step_says_predicted_against_seen(in_steps: Any) -> None:
     result, _, said = in_steps
     assert result.steps[0].name == "Pilot"
-    assert sum("predicted" in line and "seen" in line for line in said) == len(result.steps)
+    assert sum("predicted" in line and "99 % within" in line for line in said) == len(result.steps)
     full = result.steps[-1]
     rest = np.array([-np.pi / 2, 0.0])
     for row, origin in ((0, rest), (1, rest), (2, 0.0)):

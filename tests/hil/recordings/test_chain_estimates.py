@@ -1,4 +1,4 @@
-"""Recordings of a spatial arm by other tools: a stretch of motion that is no period, with its URDF."""
+"""Recordings of a spatial arm by other tools: motion that is not periodic, with its URDF."""
 
 import json
 import shutil

@@ -157,7 +157,7 @@ def test_a_visitor_sees_it_move_and_turns_it(moving: SpatialMotion, tmp_path: Pa
     assert seen["requests"] == []
     assert seen["overflow"] == 0
     expected = projected(moving.scene, 0)
-    # Drawn from back to front, so in another order than the joints.
+    # Drawn from back to front, so in an order other than that of the joints.
     np.testing.assert_allclose(np.sort(np.array(seen["first"]), axis=0), np.sort(expected, axis=0), atol=0.11)
     assert np.abs(np.array(seen["turned"]) - np.array(seen["first"])).max() > 5
     np.testing.assert_allclose(seen["back"], seen["first"], atol=0.11)

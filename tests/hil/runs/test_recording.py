@@ -126,7 +126,7 @@ def test_phases_are_numbered_as_in_recordings_made_before() -> None:
 
 
 class AtOnce:
-    """A background thread that does its work when it is told to."""
+    """A background thread that does its work on request."""
 
     made: list["AtOnce"]
 

@@ -107,7 +107,7 @@ def test_a_run_leaves_every_register_as_it_was(arm: Arm, tmp_path: Path, bench: 
     assert bench.changed() == []
     assert all(sorted(set(names)) == ["Current Limit", "Operating Mode"] for names in bench.eeprom.values())
     assert all(len(names) <= 4 for names in bench.eeprom.values())
-    assert list(state_folder.glob("*.json")) == [], "nothing is left to be put back"
+    assert list(state_folder.glob("*.json")) == [], "nothing is left to restore"
     kept = json.loads((run.path / SETTINGS_NAME).read_text())["servos"]
     assert kept["1"]["Operating Mode"] == 3 and kept["1"]["Current Limit"] == 1193
 
@@ -187,7 +187,7 @@ def test_a_servo_that_rebooted_is_named_with_those_that_were_fine(
     cause = str(stop.value.__context__)
     if servo == 1:  # it hides the second one
         assert "'elbow' (ID 2, XM430-W350) answered afterwards and joint 'shoulder' (ID 1, XM430-W350) did not" in cause
-        assert "adapter" not in cause, "it is not what all servos share"
+        assert "adapter" not in cause, "the fault is not in what all servos share"
     assert bench.changed() == []
 
 

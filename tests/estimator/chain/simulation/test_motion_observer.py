@@ -1,4 +1,4 @@
-"""What the observer of a spatial arm learns, and what it must not learn, from a joint that stands."""
+"""What the observer of a spatial arm learns, and must not learn, from a joint at standstill."""
 
 import numpy as np
 

@@ -146,7 +146,7 @@ class Terminal:
 
 
 class UnreadPipe:
-    """A pipe that is full already and that nobody reads."""
+    """A full pipe that nobody reads."""
 
     def __init__(self, _run: Path) -> None:
         self._read, self.output = os.pipe()
@@ -233,7 +233,7 @@ def _try(folder: Path, what: Hung, act: Callable[[int], None]) -> Ending | None:
             if not moving or process.poll() is not None or not all(servos.torque):
                 return None
             output.hang()
-            time.sleep(0.3)  # until a thread has run into what hangs
+            time.sleep(0.3)  # until a thread is blocked
             if process.poll() is not None:
                 return None
             signalled = time.monotonic()

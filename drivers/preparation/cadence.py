@@ -1,0 +1,48 @@
+"""How often the servos are read: exchanges per sample, and the status read between them, as far as the wire allows."""
+
+import math
+from collections.abc import Sequence
+
+from hil.drivers.control_table import ControlTable
+from hil.drivers.exchange import HOST_S
+from hil.drivers.joint import Joint
+from hil.drivers.port import Port
+from hil.drivers.state import Spans, status_span
+from hil.drivers.sync_read import one_each
+
+CHECK_S = 0.01
+"""Longest time between two exchanges [s], if the bus allows: faults must not go unnoticed because samples are rare."""
+
+STATUS_S = 0.035
+"""Time between two status reads [s]."""
+
+_SHARE, _MOST_SHARE = 0.6, 0.9
+"""Fraction of a control cycle that a status read may take on the wire; the rest is for the adapter and the computer."""
+
+
+def cadence(
+    sample: float, port: Port, drives: Sequence[Joint], tables: Sequence[ControlTable], return_delay: float
+) -> tuple[int, Spans | None, int]:
+    """Return the exchanges per sample, the status registers to read, and the exchanges between two status reads.
+
+    The registers are None if there is no time to read them. sample: time between two samples [s], 0 if unknown. drives:
+    one entry per servo. return_delay: the longest of the servos [s].
+    """
+    if not sample:
+        return 1, None, 0
+    modes, count = [drive.mode for drive in drives], len(drives)
+    # Without a current sensor in the motor, a loss of torque shows first in Torque Enable: worth a late sample.
+    share = _MOST_SHARE if any(drive.servo.senses_supply for drive in drives) else _SHARE
+    goals = 14 * len(set(modes)) + 3 * count
+    every, interval = 1, sample
+    for whole in (True, False):
+        span = status_span(modes, tables, whole=whole)
+        taken = port.wire_time(goals + 14 + count + count * (11 + one_each(span, count)[0].size))
+        taken += return_delay * count
+        if whole:
+            least = max(CHECK_S, taken / share + HOST_S)
+            every = max(1, math.floor(sample / least + 1e-6))
+            interval /= every
+        if taken < share * interval:
+            return every, span, max(1, round(STATUS_S / interval))
+    return every, None, 0

@@ -1,0 +1,32 @@
+"""The narrowest smoothed Coulomb steps that a chain's simulation resolves; see `hil.estimator.fit.resolved_widths`."""
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.fit.objective import ChainProblem
+from hil.estimator.chain.model.dynamics import mass_matrix
+
+POSES = 40  # of a recording, in which the joints' inertias are computed
+
+
+def resolved_widths(problem: ChainProblem, x: Array, shortest_step: float, widths_per_substep: float) -> Array:
+    """Return the narrowest Coulomb step that is resolved for each joint (joints,) [rad/s].
+
+    The inertia of a joint is that about its own axis while all others move freely, the smallest in the poses of the
+    recording. widths_per_substep: see `hil.estimator.options.CoordinateOptions`.
+
+    Args:
+        problem: the recordings.
+        x: coordinates at which the arm can be simulated.
+        shortest_step: shortest integration step, near standstill [s].
+        widths_per_substep: widths through which reversed friction may move a joint within `shortest_step`.
+    """
+    model, parameters = problem.model, problem.parameters(x)
+    every = model.base.as_all(np.array([parameters[name] for name in model.base.names]))
+    inertia = np.inf * np.ones(model.joints)
+    for period in problem.periods:
+        for q in period.filled()[:, :: max(1, period.samples // POSES)].T:
+            inverse = np.linalg.pinv(mass_matrix(model.base.chain, every, q), hermitian=True)
+            inertia = np.minimum(inertia, 1.0 / np.maximum(np.diag(inverse), 1e-9))
+    reversal = 2.0 * np.array([parameters[f"coulomb_{joint + 1}"] for joint in range(model.joints)]) / inertia
+    return np.asarray(reversal * shortest_step / widths_per_substep)

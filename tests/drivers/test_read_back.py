@@ -1,0 +1,117 @@
+"""What the servos hold right before a cycle shows whether another master commands them."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from hil.drivers.bus import BusConfig, ServoBus
+from hil.drivers.errors import BusShared
+
+Make = Callable[..., BusConfig]
+INTERVAL = 0.01
+
+
+def after_each(bus: ServoBus, act: Callable[[Any], None], cycles: int, interval: float = INTERVAL) -> float:
+    """Drive both joints with goals that change, acting on the servos after each cycle; returns the duration [s]."""
+    clock, servos = bus.port.clock, bus.port._serial.bus.servos
+    start = clock.now()
+    for cycle in range(cycles):
+        clock.wait_until(start + cycle * interval)
+        bus.exchange([0.01 * (cycle % 30), 0.1 + 0.003 * (cycle % 50)])
+        act(servos)
+        due = start + (cycle + 1) * interval
+        if bus.prepared.read_back_at <= due:
+            try:
+                bus.check_not_overruled(due)
+            finally:
+                assert clock.now() <= due, "the next sample is never late"
+    return float(clock.now() - start)
+
+
+@contextmanager
+def driven(config: BusConfig) -> Iterator[ServoBus]:
+    with ServoBus.open(config) as bus, bus.torque(watchdog=0.1):
+        yield bus
+
+
+def nothing(_servos: Any) -> None:
+    pass
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize("interval", [0.0025, 0.01, 0.05])
+def test_servos_that_only_this_program_commands(fake_config: Make, fast: bool, interval: float) -> None:
+    with driven(fake_config(fast_sync_read=fast, interval=interval)) as bus:
+        after_each(bus, nothing, 100, interval)
+        assert bus.prepared.read_back_at > 0.0 and not bus.prepared.is_in_doubt
+
+
+def test_a_goal_written_after_each_of_ours_is_found_within_a_tenth_of_a_second(fake_config: Make) -> None:
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        start = bus.port.clock.now()
+        with pytest.raises(BusShared, match=r"elbow.*ID 2.* another program: its Goal Current reads -7, but \d+ was"):
+            after_each(bus, lambda servos: servos[2].write(102, b"\xf9\xff"), 100)
+        assert bus.port.clock.now() - start < 0.1
+
+
+def test_a_goal_written_once_or_twice_is_no_proof(fake_config: Make) -> None:
+    times = iter(range(10_000))
+
+    def twice(servos: Any) -> None:
+        if next(times) in (20, 21):
+            servos[1].write(102, b"\x07\x00")
+
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        after_each(bus, twice, 100)
+
+
+def test_a_changed_mode_is_found_within_a_tenth_of_a_second(fake_config: Make) -> None:
+    times = iter(range(10_000))
+
+    def taken(servos: Any) -> None:
+        if next(times) == 20:
+            for address, value in ((64, 0), (11, 3), (64, 1)):
+                servos[1].write(address, bytes((value,)))
+
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        start = bus.port.clock.now()
+        with pytest.raises(BusShared, match=r"shoulder.*its Operating Mode reads 3, but 0 was written"):
+            after_each(bus, taken, 100)
+        assert 0.2 < bus.port.clock.now() - start < 0.3
+
+
+@pytest.mark.parametrize("places", [(1, 2), (2, 1)])
+def test_a_goal_of_ours_that_came_late_or_to_the_neighbour_is_not_foreign(
+    fake_config: Make, places: tuple[int, int]
+) -> None:
+    source, target = places
+
+    def copied(servos: Any) -> None:
+        servos[target].write(102, servos[source].memory.value("Goal Current").to_bytes(2, "little"))
+
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        after_each(bus, copied, 100)
+
+
+def test_what_was_not_read_back_for_lack_of_time_is_tried_again_soon(fake_config: Make) -> None:
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        bus.exchange([0.1, 0.1])
+        now = bus.port.clock.now()
+        assert bus.prepared.overruled(now + 2e-4) is None
+        assert bus.port.clock.now() == now, "nothing was sent"
+        assert now < bus.prepared.read_back_at <= now + 0.005
+
+
+def test_a_servo_that_does_not_answer_is_left_to_the_next_cycle(fake_config: Make) -> None:
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        bus.exchange([0.1, 0.1])
+        bus.port._serial.bus.servos[2].connected = False
+        due = bus.port.clock.now() + INTERVAL
+        bus.check_not_overruled(due)
+        assert bus.port.clock.now() <= due + 1e-4
+        state = bus.exchange([0.1, 0.1])
+        assert state.missing == (False, True)
+        bus.port._serial.bus.servos[2].connected = True
+        assert bus.exchange([0.1, 0.1]).missing == (False, False)
