@@ -208,7 +208,8 @@ class Exchange:
         port.clock.wait_until(due - takes - HOST_S)
         before = self._now()
         received = port.ask(read.request, asked, max(due - before, takes), before)
-        servos, _ = read.search(received.removeprefix(read.request))
+        received = received.removeprefix(read.request)
+        servos = read.unpack(received) or read.search(received)[0]
         now = self._now()
         if None in servos:
             self._late_possible, self._lost = True, 1

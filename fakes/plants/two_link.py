@@ -56,6 +56,8 @@ class TwoLink:
         q1, q2, v1, v2 = map(float, (*arm.start, *velocity))
         self._state: State = (q1, q2, v1, v2, 0.0, 0.0, 0.0, 0.0)
         self._run = _compiled() if "numba" in sys.modules else _run
+        self._warms_up = any(drive.warms_up for drive in arm.drives)
+        self._drives_changed()
 
     @property
     def joints(self) -> int:
@@ -76,28 +78,31 @@ class TwoLink:
     def jam(self, joint: int, jammed: bool) -> None:
         """Block a joint, or release it."""
         self._motors[joint].jammed = jammed
+        self._drives_changed()
 
     def hold(self, joint: int, velocity: float | None) -> None:
         """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._motors[joint].held_at = velocity
+        self._drives_changed()
+
+    def _drives_changed(self) -> None:
+        motor_1, motor_2 = self._motors
+        self._are_plain = motor_1.is_plain and motor_2.is_plain
+        self._drives = (*motor_1.plain, *motor_2.plain)
 
     def advance(self, until: float, current: Sequence[float]) -> None:
         remaining = until - self._time
         if remaining <= 0.0:
             return
-        motor_1, motor_2 = self._motors
-        motor_1.warm_up(self._time)
-        motor_2.warm_up(self._time)
+        if self._warms_up:
+            for motor in self._motors:
+                motor.warm_up(self._time)
+            self._drives_changed()
         self._time = until
         longest = remaining / ceil(remaining / self._longest_step)
         command_1, command_2 = float(current[0]), float(current[1])
-        drives = (*motor_1.plain, *motor_2.plain)
-        if motor_1.is_plain and motor_2.is_plain:
-            state = self._run(remaining, longest, command_1, command_2, self._state, self._terms, drives, None)
-            motor_1.current, motor_2.current = state[6:]
-        else:
-            state = _run(remaining, longest, command_1, command_2, self._state, self._terms, drives, self._motors)
-        self._state = state
+        run, motors = (self._run, None) if self._are_plain else (_run, self._motors)
+        self._state = run(remaining, longest, command_1, command_2, self._state, self._terms, self._drives, motors)
 
 
 def _run(  # noqa: PLR0915
@@ -121,6 +126,8 @@ def _run(  # noqa: PLR0915
     kt_1, offset_1, coulomb_1, rise_1, per_v1, viscous_1, lag_1 = drives[:7]
     kt_2, offset_2, coulomb_2, rise_2, per_v2, viscous_2, lag_2 = drives[7:]
     q1, q2, v1, v2, a1, a2, amp_1, amp_2 = state
+    if motors is not None:
+        motors[0].current, motors[1].current = amp_1, amp_2
     slope_1 = slope_2 = prepared = left_1 = left_2 = mean_1 = mean_2 = 0.0
     cut = rest = 0.0
     while remaining > SHORTEST_STEP:
