@@ -43,23 +43,29 @@ class StandIn:
 
     def __init__(self, config: Config, clock: VirtualClock, swing: float) -> None:
         self.joints = config.bus.joints
-        self.port = self
+        self.port = self.prepared = self
+        self.exchanges_per_sample = 1
+        self.patience = 0.02
+        self.read_back_at = math.inf
         self.clock = clock
         self.spent: list[int] = []
         """Processor time before each exchange [ns]."""
         self._swing = swing
         self._former: tuple[float, ...] = (0.0,) * len(self.joints)
         self._left_at = 0
-        self._rest = config.arm.rest_pose
+        self._rest = self._position = tuple(config.arm.rest_pose)
 
     def exchange(self, goals: list[float]) -> State:
         self.spent.append(time.thread_time_ns() - self._left_at)
         now = self.clock.now()
-        position = tuple(rest + self._swing * goal for rest, goal in zip(self._rest, goals, strict=True))
-        interval = 1e-3
-        velocity = tuple(
-            (goal - former) * self._swing / interval for goal, former in zip(goals, self._former, strict=True)
+        # Half an interval late: then, over whole waves, the motors do no work, and the guard has nothing to stop.
+        position = tuple(
+            rest + 0.5 * self._swing * (goal + former)
+            for rest, goal, former in zip(self._rest, goals, self._former, strict=True)
         )
+        interval = 1e-3
+        velocity = tuple((new - old) / interval for new, old in zip(position, self._position, strict=True))
+        self._position = position
         self._former = tuple(goals)
         nothing = (0,) * len(goals)
         state = State(

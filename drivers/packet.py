@@ -8,7 +8,7 @@ LEN counts the bytes from INST to the CRC. First the bytes from INST to the last
 then the CRC is computed over everything before it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from enum import IntEnum, IntFlag
 from struct import Struct
 from typing import NamedTuple
@@ -97,9 +97,8 @@ class Packet(NamedTuple):
         return self.body[1:]
 
 
-def crc(data: bytes) -> int:
-    """Return the CRC-16 that the servos use: polynomial 0x8005, initial value 0, not reflected."""
-    return int(crc16.umts(data))
+crc: Callable[[bytes], int] = crc16.umts
+"""The CRC-16 that the servos use: polynomial 0x8005, initial value 0, not reflected."""
 
 
 def stuff(payload: bytes) -> bytes:

@@ -65,6 +65,7 @@ class Port:
         self.echoes = False
         """Whether the adapter echoes what it sends; detected during set-up."""
         self._serial = opened
+        self._timeout: float | None = opened.timeout
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()
         self.is_open = True
 
@@ -88,8 +89,8 @@ class Port:
         """Return up to `count` bytes; fewer if they have not arrived within `timeout` [s]."""
         try:
             # Setting the timeout makes pyserial query the terminal settings, so it is set only when it changes.
-            if self._serial.timeout != timeout:
-                self._serial.timeout = timeout
+            if self._timeout != timeout:
+                self._serial.timeout = self._timeout = timeout
             return cast(bytes, self._serial.read(count))
         except _FAILURES as error:
             raise self._lost(error) from error

@@ -1,5 +1,6 @@
 """A fixed rate from absolute deadlines: one late cycle does not delay later ones."""
 
+from functools import partial
 from typing import NamedTuple
 
 from hil.drivers.clock import Clock
@@ -18,6 +19,9 @@ class Tick(NamedTuple):
     deadline: float
     now: float
     missed: bool
+
+
+_tick = partial(tuple.__new__, Tick)  # half the time of Tick(...)
 
 
 class FixedRate:
@@ -44,4 +48,4 @@ class FixedRate:
         now = self._clock.now()
         missed = now - deadline >= self._interval
         self.missed += missed
-        return Tick(deadline, now, missed)
+        return _tick((deadline, now, missed))

@@ -3,6 +3,7 @@
 import functools
 import operator
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from hil.drivers.control_table import ControlTable
@@ -71,6 +72,8 @@ class State(NamedTuple):
     status: tuple[Status | None, ...] | None = None
     apart: tuple[tuple[float, ...], ...] | None = None
 
+
+_state = partial(tuple.__new__, State)  # half the time of State(...)
 
 _DRIVE = {Mode.CURRENT: "Present Current", Mode.PWM: "Present PWM"}
 
@@ -155,26 +158,28 @@ class Converter:
             raise self._wrong(goals) from None
 
     def state(self, ticks: Sequence[int], reply: Reply) -> State:
-        sent = tuple([unit * tick for unit, tick in zip(self._drive_units, ticks, strict=True)])
+        sent = tuple(map(operator.mul, self._drive_units, ticks))
         # Additional registers precede the three that are always read, but voltage and temperature follow them.
         at = 1 if reply.span in (0, SLOW_SPANS) else 2 if reply.span == 1 else self._answer_length(reply) - 3
-        each = [
-            (NAN, NAN, NAN, 0 if answer is None else answer[0], True)
-            if answer is None or len(answer) == 1
-            else (
-                answer[at] * drive_unit,
-                answer[at + 1] * velocity_unit,
-                (answer[at + 2] - zero) * position_unit,
-                answer[0],
-                False,
-            )
-            for answer, (drive_unit, velocity_unit, position_unit, zero) in zip(reply.servos, self._scales, strict=True)
-        ]
-        drive, velocity, position, error, missing = zip(*each, strict=True)
+        drive, velocity, position, error, missing = [], [], [], [], []
+        for answer, (drive_unit, velocity_unit, position_unit, zero) in zip(reply.servos, self._scales, strict=True):
+            if answer is None or len(answer) == 1:
+                missing.append(True)
+                drive.append(NAN)
+                velocity.append(NAN)
+                position.append(NAN)
+                error.append(0 if answer is None else answer[0])
+            else:
+                missing.append(False)
+                drive.append(answer[at] * drive_unit)
+                velocity.append(answer[at + 1] * velocity_unit)
+                position.append((answer[at + 2] - zero) * position_unit)
+                error.append(answer[0])
         slow = _slow(reply) if 0 < reply.span <= SLOW_SPANS else None
         status = self._status(reply.servos) if reply.span > SLOW_SPANS else None
         before, after = reply.time_before_write, reply.time_after_read
-        return State(before, after, sent, drive, velocity, position, error, missing, slow, status)
+        measured = (tuple(drive), tuple(velocity), tuple(position), tuple(error), tuple(missing))
+        return _state((before, after, sent, *measured, slow, status, None))
 
     def _status(self, answers: Sequence[Answer]) -> tuple[Status | None, ...]:
         told: list[Status | None] = []

@@ -145,12 +145,14 @@ class FakeSerial(SerialBase):
         self._open_bus()
 
     def _open_bus(self) -> FakeBus:
-        if not self.is_open or self._bus is None:
+        bus = self._bus
+        if not self.is_open or bus is None:
             raise serial.PortNotOpenError
-        self._bus.notice_faults()
-        if self._pulls != self._bus.pulls:
-            raise self._unplugged(self._bus)
-        return self._bus
+        if bus.faults.next_change < math.inf:
+            bus.notice_faults()
+        if self._pulls != bus.pulls:
+            raise self._unplugged(bus)
+        return bus
 
     def _unplugged(self, bus: FakeBus) -> _Unplugged:
         """Return the error for an unplugged cable, at the time of unplugging, of which the bus may know in advance."""

@@ -138,7 +138,8 @@ class FakeBus:
         """Put bytes on the wire, after those still being sent. They are lost if the cable is unplugged."""
         wire, receiver = self._wire, self._receiver
         now = self.clock.now()
-        self.notice_faults()
+        if now - self._origin >= self.faults.next_change:
+            self.notice_faults()
         if self.cable_is_out:
             return
         start = now if now > self._sent_by else self._sent_by

@@ -115,8 +115,8 @@ class Instructions:
                 servo.heard_at = now  # feeds its watchdog, and marks it below as having received this packet
         if packet.id != BROADCAST_ID:
             self._single(packet, now)
-        elif packet.instruction in self._broadcast:
-            self._broadcast[packet.instruction](packet.body, now)
+        elif (act := self._broadcast.get(packet.instruction)) is not None:
+            act(packet.body, now)
         elif packet.instruction != Instruction.FACTORY_RESET or packet.body != bytes((RESET_ALL,)):
             for servo in self._listening(now):
                 self._execute(servo, packet.instruction, packet.body, now)

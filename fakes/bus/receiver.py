@@ -1,6 +1,7 @@
 """Servo-side receiver: extracts instruction packets from the bytes on the wire."""
 
 from collections.abc import Iterator
+from functools import partial
 from struct import Struct
 
 from hil.drivers.packet import BROADCAST_ID, HEADER, MAX_ID, MAX_LENGTH, Framer, Instruction, Packet, crc, unstuff
@@ -13,6 +14,9 @@ _FRONT = Struct("<4sBHB")  # header, ID, LEN, INST
 _GROUP_READS = frozenset(
     {Instruction.SYNC_READ, Instruction.FAST_SYNC_READ, Instruction.BULK_READ, Instruction.FAST_BULK_READ}
 )
+
+
+_packet = partial(tuple.__new__, Packet)  # half the time of Packet(...)
 
 
 class Receiver:
@@ -71,7 +75,7 @@ class Receiver:
         if _STUFFED in raw:
             payload = unstuff(raw[7:-2])
             instruction, body = payload[0], payload[1:]
-        packet = Packet(packet_id, instruction, body)
+        packet = _packet((packet_id, instruction, body, False))
         if instruction in _GROUP_READS and len(self._asked) < MOST_ASKED:
             self._asked[raw] = packet
         return packet

@@ -15,13 +15,22 @@ Time integration is symmetric and second-order: drift half a step, kick with the
 friction at its middle, drift half a step. Dry friction is an impulse on each joint, limited to its level times the step
 and just large enough to bring the joint to rest, so stiction is exact. A step in which a joint's velocity changes sign
 is split there.
+
+In a process that has loaded numba anyway, as hil's own experiments do, the loop is compiled for arms with plain drives.
+Its results are the same to the last bit, so a fake that is used on its own does without.
 """
 
-from collections.abc import Sequence
-from math import ceil, cos, exp, sin
+import sys
+from collections.abc import Callable, Sequence
+from functools import cache
+from math import ceil, cos, exp, expm1, sin
+from typing import Any
 
 from hil.fakes.plants.arm import Arm, Link, armature
 from hil.fakes.plants.motor import SHORTEST_STEP, Motor
+
+State = tuple[float, float, float, float, float, float, float, float]
+"""Angles, velocities, accelerations of the last step (to extrapolate velocities to the next one's middle), currents."""
 
 
 class TwoLink:
@@ -31,18 +40,24 @@ class TwoLink:
         first, second = arm.links
         self._motors = (Motor(arm.drives[0]), Motor(arm.drives[1]))
         beyond = second.mass + arm.drives[1].mass
-        self._inertia_first = _about_joint(first) + beyond * first.length**2
-        self._inertia_second = _about_joint(second)
-        self._swing = second.mass * first.length * second.centre
-        self._turned_first = self._inertia_first + armature(arm.drives[0])
-        self._turned_second = self._inertia_second + armature(arm.drives[1])
-        self._weight_first = (first.mass * first.centre + beyond * first.length) * arm.weight
-        self._weight_second = second.mass * second.centre * arm.weight
+        inertia_first = _about_joint(first) + beyond * first.length**2
+        inertia_second = _about_joint(second)
+        self._terms = (
+            second.mass * first.length * second.centre,
+            inertia_second,
+            inertia_first + armature(arm.drives[0]),
+            inertia_second + armature(arm.drives[1]),
+            (first.mass * first.centre + beyond * first.length) * arm.weight,
+            second.mass * second.centre * arm.weight,
+        )
+        """Coupling, inertia of link 2, inertias with rotors [kg m^2], and both links' weight at the joints [N m]."""
         self._longest_step = min(motor.longest_step for motor in self._motors)
         self._time = 0.0
-        self._q1, self._q2 = arm.start
-        self._v1, self._v2 = velocity
-        self._a1 = self._a2 = 0.0  # accelerations of the last step, to extrapolate velocities to the next step's middle
+        q1, q2, v1, v2 = map(float, (*arm.start, *velocity))
+        self._state: State = (q1, q2, v1, v2, 0.0, 0.0, 0.0, 0.0)
+        self._run = _compiled() if "numba" in sys.modules else _run
+        self._warms_up = any(drive.warms_up for drive in arm.drives)
+        self._drives_changed()
 
     @property
     def joints(self) -> int:
@@ -50,129 +65,155 @@ class TwoLink:
 
     @property
     def position(self) -> tuple[float, float]:
-        return self._q1, self._q2
+        return self._state[:2]
 
     @property
     def velocity(self) -> tuple[float, float]:
-        return self._v1, self._v2
+        return self._state[2:4]
 
     @property
     def current(self) -> tuple[float, float]:
-        return self._motors[0].current, self._motors[1].current
+        return self._state[6:]
 
     def jam(self, joint: int, jammed: bool) -> None:
         """Block a joint, or release it."""
         self._motors[joint].jammed = jammed
+        self._drives_changed()
 
     def hold(self, joint: int, velocity: float | None) -> None:
         """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._motors[joint].held_at = velocity
+        self._drives_changed()
+
+    def _drives_changed(self) -> None:
+        motor_1, motor_2 = self._motors
+        self._are_plain = motor_1.is_plain and motor_2.is_plain
+        self._drives = (*motor_1.plain, *motor_2.plain)
 
     def advance(self, until: float, current: Sequence[float]) -> None:
         remaining = until - self._time
         if remaining <= 0.0:
             return
-        for motor in self._motors:
-            motor.warm_up(self._time)
+        if self._warms_up:
+            for motor in self._motors:
+                motor.warm_up(self._time)
+            self._drives_changed()
         self._time = until
-        self._run(remaining, remaining / ceil(remaining / self._longest_step), *current)
+        longest = remaining / ceil(remaining / self._longest_step)
+        command_1, command_2 = float(current[0]), float(current[1])
+        run, motors = (self._run, None) if self._are_plain else (_run, self._motors)
+        self._state = run(remaining, longest, command_1, command_2, self._state, self._terms, self._drives, motors)
 
-    def _run(self, remaining: float, longest: float, i1: float, i2: float) -> None:  # noqa: PLR0915
-        """Integrate over `remaining` [s] in steps of at most `longest` [s] with commanded currents [A].
 
-        This is one long loop on local floats because a fake arm spends most of its time here: with a function call per
-        step it takes 1.5 times as long. A step in which a joint's velocity changes sign is first taken up to that point
-        (`cut`).
-        """
-        motor_1, motor_2 = self._motors
-        plain = motor_1.is_plain and motor_2.is_plain
-        jammed = motor_1.jammed or motor_2.jammed
-        bristly = motor_1.bristle_stiffness or motor_2.bristle_stiffness
-        kt_1, offset_1, coulomb_1, rise_1, per_v1 = motor_1.constants
-        kt_2, offset_2, coulomb_2, rise_2, per_v2 = motor_2.constants
-        amp_1, amp_2 = motor_1.current, motor_2.current
-        slope_1 = slope_2 = prepared = 0.0
-        viscous_1, viscous_2 = motor_1.viscous, motor_2.viscous
-        swing, inertia_second = self._swing, self._inertia_second
-        turned_first, turned_second = self._turned_first, self._turned_second
-        weight_first, weight_second = self._weight_first, self._weight_second
-        q1, q2, v1, v2, a1, a2 = self._q1, self._q2, self._v1, self._v2, self._a1, self._a2
-        cut = rest = 0.0
-        while remaining > SHORTEST_STEP:
-            step = cut or rest or (longest if longest < remaining else remaining)
-            half = 0.5 * step
-            middle_v1 = v1 + half * a1 if v1 else 0.0
-            middle_v2 = v2 + half * a2 if v2 else 0.0
-            middle_q1 = q1 + half * v1
-            middle_q2 = q2 + half * v2
-            if plain:  # same as Motor.push
-                if step != prepared:
-                    prepared = step
-                    left_1, mean_1 = motor_1.lag(step)
-                    left_2, mean_2 = motor_2.lag(step)
-                away_1, away_2 = amp_1 - i1, amp_2 - i2
-                ratio_1, ratio_2 = middle_v1 * per_v1, middle_v2 * per_v2
-                push_1 = kt_1 * (i1 + away_1 * mean_1) - offset_1
-                push_2 = kt_2 * (i2 + away_2 * mean_2) - offset_2
-                level_1 = coulomb_1 + rise_1 * exp(-ratio_1 * ratio_1)
-                level_2 = coulomb_2 + rise_2 * exp(-ratio_2 * ratio_2)
-                next_amp_1, next_amp_2 = i1 + away_1 * left_1, i2 + away_2 * left_2
-            else:
-                push_1, level_1, slope_1, next_amp_1 = motor_1.push(step, i1, middle_q1, middle_v1)
-                push_2, level_2, slope_2, next_amp_2 = motor_2.push(step, i2, middle_q2, middle_v2)
+def _run(  # noqa: PLR0915
+    remaining: float,
+    longest: float,
+    i1: float,
+    i2: float,
+    state: State,
+    arm: tuple[float, ...],
+    drives: tuple[float, ...],
+    motors: tuple[Motor, Motor] | None,
+) -> State:
+    """Integrate over `remaining` [s] in steps of at most `longest` [s] with commanded currents [A].
 
-            across = swing * cos(middle_q2)
-            turning = swing * sin(middle_q2)
-            weight_2 = weight_second * cos(middle_q1 + middle_q2)
-            w2 = middle_v1 + middle_v2
-            force_1 = push_1 + turning * (w2 * w2 - middle_v1 * middle_v1) - weight_first * cos(middle_q1) - weight_2
-            force_2 = push_2 - turning * middle_v1 * middle_v1 - weight_2
+    This is one long loop on local floats because a fake arm spends most of its time here: with a function call per step
+    it takes 1.5 times as long. A step in which a joint's velocity changes sign is first taken up to that point (`cut`).
 
-            # Viscous friction at the mean of old and new velocity, smooth friction linearised about the middle,
-            # (M + D) new = (M - D) v + step (force + slope middle_v) - dry, with D = step / 2 (viscous + slope).
-            m12 = inertia_second + across
-            m11 = turned_first + across + m12
-            damp_1 = half * (viscous_1 + slope_1)
-            damp_2 = half * (viscous_2 + slope_2)
-            b1 = (m11 - damp_1) * v1 + m12 * v2 + step * (force_1 + slope_1 * middle_v1)
-            b2 = m12 * v1 + (turned_second - damp_2) * v2 + step * (force_2 + slope_2 * middle_v2)
-            m11 += damp_1
-            m22 = turned_second + damp_2
-            dry_1 = step * level_1
-            dry_2 = step * level_2
-            # First assume that both joints keep sliding in their present direction.
-            slid_1 = b1 - dry_1 if v1 > 0.0 else b1 + dry_1
-            slid_2 = b2 - dry_2 if v2 > 0.0 else b2 + dry_2
-            determinant = m11 * m22 - m12 * m12
-            new_1 = (m22 * slid_1 - m12 * slid_2) / determinant
-            new_2 = (m11 * slid_2 - m12 * slid_1) / determinant
-            if (new_1 * v1 <= 0.0 or new_2 * v2 <= 0.0) and (level_1 or level_2):
-                if not cut and not rest:
-                    cut = step * min(_until_zero(v1, new_1), _until_zero(v2, new_2))
-                    if SHORTEST_STEP < cut < step - SHORTEST_STEP:
-                        rest = step - cut
-                        continue
-                    cut = 0.0
-                new_1, new_2 = _sticking((m11, m12, m22), (b1, b2), (dry_1, dry_2), (new_1, new_2))
-            a1 = (new_1 - v1) / step
-            a2 = (new_2 - v2) / step
-            if jammed:  # the impulse of a tiny step cannot be extrapolated to the next
-                a1 = a2 = 0.0
-            if bristly:
-                motor_1.bend(step, 0.5 * (v1 + new_1))
-                motor_2.bend(step, 0.5 * (v2 + new_2))
-            v1 = new_1
-            v2 = new_2
-            q1 = middle_q1 + half * new_1
-            q2 = middle_q2 + half * new_2
-            motor_1.current = amp_1 = next_amp_1
-            motor_2.current = amp_2 = next_amp_2
-            remaining -= step
-            if cut:
+    arm: `TwoLink._terms`. drives: `Motor.plain` of both motors. motors: None if both are plain; only this is compiled.
+    """
+    swing, inertia_second, turned_first, turned_second, weight_first, weight_second = arm
+    kt_1, offset_1, coulomb_1, rise_1, per_v1, viscous_1, lag_1 = drives[:7]
+    kt_2, offset_2, coulomb_2, rise_2, per_v2, viscous_2, lag_2 = drives[7:]
+    q1, q2, v1, v2, a1, a2, amp_1, amp_2 = state
+    if motors is not None:
+        motors[0].current, motors[1].current = amp_1, amp_2
+    slope_1 = slope_2 = prepared = left_1 = left_2 = mean_1 = mean_2 = 0.0
+    cut = rest = 0.0
+    while remaining > SHORTEST_STEP:
+        step = cut or rest or (longest if longest < remaining else remaining)
+        half = 0.5 * step
+        middle_v1 = v1 + half * a1 if v1 else 0.0
+        middle_v2 = v2 + half * a2 if v2 else 0.0
+        middle_q1 = q1 + half * v1
+        middle_q2 = q2 + half * v2
+        if motors is None:  # same as Motor.push
+            if step != prepared:
+                prepared = step
+                left_1, mean_1 = _lag(step, lag_1)
+                left_2, mean_2 = _lag(step, lag_2)
+            away_1, away_2 = amp_1 - i1, amp_2 - i2
+            ratio_1, ratio_2 = middle_v1 * per_v1, middle_v2 * per_v2
+            push_1 = kt_1 * (i1 + away_1 * mean_1) - offset_1
+            push_2 = kt_2 * (i2 + away_2 * mean_2) - offset_2
+            level_1 = coulomb_1 + rise_1 * exp(-ratio_1 * ratio_1)
+            level_2 = coulomb_2 + rise_2 * exp(-ratio_2 * ratio_2)
+            next_amp_1, next_amp_2 = i1 + away_1 * left_1, i2 + away_2 * left_2
+        else:
+            push_1, level_1, slope_1, next_amp_1 = motors[0].push(step, i1, middle_q1, middle_v1)
+            push_2, level_2, slope_2, next_amp_2 = motors[1].push(step, i2, middle_q2, middle_v2)
+
+        across = swing * cos(middle_q2)
+        turning = swing * sin(middle_q2)
+        weight_2 = weight_second * cos(middle_q1 + middle_q2)
+        w2 = middle_v1 + middle_v2
+        force_1 = push_1 + turning * (w2 * w2 - middle_v1 * middle_v1) - weight_first * cos(middle_q1) - weight_2
+        force_2 = push_2 - turning * middle_v1 * middle_v1 - weight_2
+
+        # Viscous friction at the mean of old and new velocity, smooth friction linearised about the middle,
+        # (M + D) new = (M - D) v + step (force + slope middle_v) - dry, with D = step / 2 (viscous + slope).
+        m12 = inertia_second + across
+        m11 = turned_first + across + m12
+        damp_1 = half * (viscous_1 + slope_1)
+        damp_2 = half * (viscous_2 + slope_2)
+        b1 = (m11 - damp_1) * v1 + m12 * v2 + step * (force_1 + slope_1 * middle_v1)
+        b2 = m12 * v1 + (turned_second - damp_2) * v2 + step * (force_2 + slope_2 * middle_v2)
+        m11 += damp_1
+        m22 = turned_second + damp_2
+        dry_1 = step * level_1
+        dry_2 = step * level_2
+        # First assume that both joints keep sliding in their present direction.
+        slid_1 = b1 - dry_1 if v1 > 0.0 else b1 + dry_1
+        slid_2 = b2 - dry_2 if v2 > 0.0 else b2 + dry_2
+        determinant = m11 * m22 - m12 * m12
+        new_1 = (m22 * slid_1 - m12 * slid_2) / determinant
+        new_2 = (m11 * slid_2 - m12 * slid_1) / determinant
+        if (new_1 * v1 <= 0.0 or new_2 * v2 <= 0.0) and (level_1 or level_2):
+            if not cut and not rest:
+                cut = step * min(_until_zero(v1, new_1), _until_zero(v2, new_2))
+                if SHORTEST_STEP < cut < step - SHORTEST_STEP:
+                    rest = step - cut
+                    continue
                 cut = 0.0
-            elif rest:
-                rest = 0.0
-        self._q1, self._q2, self._v1, self._v2, self._a1, self._a2 = q1, q2, v1, v2, a1, a2
+            new_1, new_2 = _sticking((m11, m12, m22), (b1, b2), (dry_1, dry_2), (new_1, new_2))
+        a1 = (new_1 - v1) / step
+        a2 = (new_2 - v2) / step
+        amp_1 = next_amp_1
+        amp_2 = next_amp_2
+        if motors is not None:
+            if motors[0].jammed or motors[1].jammed:  # the impulse of a tiny step cannot be extrapolated to the next
+                a1 = a2 = 0.0
+            motors[0].current, motors[1].current = amp_1, amp_2
+            motors[0].bend(step, 0.5 * (v1 + new_1))
+            motors[1].bend(step, 0.5 * (v2 + new_2))
+        v1 = new_1
+        v2 = new_2
+        q1 = middle_q1 + half * new_1
+        q2 = middle_q2 + half * new_2
+        remaining -= step
+        if cut:
+            cut = 0.0
+        elif rest:
+            rest = 0.0
+    return q1, q2, v1, v2, a1, a2, amp_1, amp_2
+
+
+def _lag(step: float, seconds: float) -> tuple[float, float]:
+    """As `Motor.lag`, for a lag of `seconds`."""
+    if not seconds:
+        return 0.0, 0.0
+    fallen = -expm1(-step / seconds)
+    return 1.0 - fallen, fallen * seconds / step
 
 
 def _about_joint(link: Link) -> float:
@@ -212,3 +253,14 @@ def _shrunk(impulse: float, limit: float) -> float:
     if impulse < -limit:
         return impulse + limit
     return 0.0
+
+
+@cache
+def _compiled() -> Callable[..., State]:
+    """Return the loop compiled, and from now on call compiled functions from the interpreted one, too."""
+    import numba
+
+    inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
+    for function in (_lag, _until_zero, _shrunk, _sticking):
+        globals()[function.__name__] = inner(function)
+    return numba.njit(cache=True, nogil=True, error_model="numpy")(_run)

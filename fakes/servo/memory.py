@@ -54,7 +54,8 @@ class Memory:
 
     def is_indirect(self, address: int, length: int) -> bool:
         """Return whether the range includes indirect data that refers to another address."""
-        return any(at in self._points for at in range(address, address + length))
+        points = self._points
+        return bool(points) and any(at in points for at in range(address, address + length))
 
     def follow_indirect_addresses(self) -> None:
         """Update the targets of the indirect addresses; must be called after one was written."""

@@ -283,9 +283,17 @@ class EmulatedServo(Powered):
 
     def write(self, address: int, data: bytes) -> int:
         """Write a range of the control table; return the error number."""
-        if address == _GOAL_CURRENT and len(data) == 2 and self._takes_goal_current:
-            return self._write_goal_current(data)
-        return self._write_stretch(address, data, shadow=False)
+        if address != _GOAL_CURRENT or len(data) != 2 or not self._takes_goal_current:
+            return self._write_stretch(address, data, shadow=False)
+        # What a control cycle writes takes a fast path with the same result as the general one.
+        ticks = int.from_bytes(data, "little", signed=True)
+        limit = self._current_limit
+        if ticks > limit or ticks < -limit:
+            return StatusError.DATA_LIMIT
+        self.memory.data[_GOAL_CURRENT : _GOAL_CURRENT + 2] = data
+        if self._driven:
+            self.motor_current_a = ticks * self._current_per_tick
+        return StatusError.NONE
 
     def write_as_shadow(self, address: int, data: bytes) -> int:
         """Write a range of the control table, addressed by Secondary ID; return the error number."""
@@ -314,17 +322,6 @@ class EmulatedServo(Powered):
             self.memory.set("Torque Enable", 1)
             self._forget_turns_in_position_mode()
             self._shut_down_if_masked()
-
-    def _write_goal_current(self, data: bytes) -> int:
-        """Write Goal Current as a control cycle does: a fast path with the same result as the general one."""
-        ticks = int.from_bytes(data, "little", signed=True)
-        limit = self._current_limit
-        if ticks > limit or ticks < -limit:
-            return StatusError.DATA_LIMIT
-        self.memory.data[_GOAL_CURRENT : _GOAL_CURRENT + 2] = data
-        if self._driven:
-            self.motor_current_a = ticks * self._current_per_tick
-        return StatusError.NONE
 
     def _register_write(self, body: bytes, shadow: bool) -> int:
         writes, error = self.memory.split(body[0] | body[1] << 8, body[2:])

@@ -26,9 +26,12 @@ class Deadlines:
         self._most_often = max(_OFTEN_LATE, 0.5 * self._limit.seconds / self._interval)
         self._in_a_row = 0
         self._often = 0.0
+        self.any_missed = False
+        """Whether missed deadlines have not been made up for by those met since."""
 
     def missed(self, seconds: float = 0.0) -> None:
         """Record a missed deadline, `seconds` after the last command."""
+        self.any_missed = True
         self._in_a_row += 1
         if self._in_a_row <= _OF_ONE_STALL:
             self._often += 1.0
@@ -47,6 +50,7 @@ class Deadlines:
         """Record a sample taken on time. A single stall does not count, a large share of missed deadlines does."""
         self._in_a_row = 0
         if self._often <= 0.0:
+            self.any_missed = False
             return
         self._often = max(0.0, self._often - LATE_SHARE)
         if self._often >= self._most_often:

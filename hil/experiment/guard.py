@@ -23,7 +23,7 @@ from hil.experiment.apart import Apart
 from hil.experiment.command_limits import CommandLimits
 from hil.experiment.deadlines import Deadlines
 from hil.experiment.joint_checks import JOINT, MOST_OUTSIDE_RAD, JointChecks
-from hil.experiment.silence import Silence
+from hil.experiment.silence import LATE_WAKE_UP_S, Silence
 from hil.experiment.status_check import StatusCheck
 from hil.plan.find_torque import how_to_find_torque
 
@@ -73,6 +73,7 @@ class Guard:
         self._interval = 1.0 / rate if interval is None else interval
         self._silence = Silence(config, self._interval, patience)
         self._patience = patience or float("inf")
+        self._watchdog = safety.watchdog
         self._deadlines = Deadlines(config)
         self._joints = _joint_records(config, planned, left_by_a_run)
         self._checks = JointChecks(self._joints, self._interval)
@@ -106,13 +107,16 @@ class Guard:
         """
         now = state.time_before_write
         took = state.time_after_read - now
-        self._deadlines.check_gap(watchdog_gap if watchdog_gap > took else took)
+        gap = watchdog_gap if watchdog_gap > took else took
+        if gap >= self._watchdog:
+            self._deadlines.check_gap(gap)
         self._silence.ask(now)
-        self._silence.woke_up(now, took - self._patience)
+        if took - self._patience >= LATE_WAKE_UP_S:
+            self._silence.woke_up(now, took - self._patience)
         if took < self._shortest:
             self._shortest = took
         unsure = took - self._shortest
-        if not between:
+        if self._deadlines.any_missed and not between:
             self._deadlines.met()
         if any(state.error) or True in state.missing or self._silence.any_missed:
             self._look_one_by_one(state, now, unsure)

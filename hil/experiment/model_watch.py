@@ -6,6 +6,7 @@ too, only the planned torque is known: the first motion then trains the model, a
 """
 
 import math
+import operator
 from collections import deque
 from collections.abc import Sequence
 
@@ -59,26 +60,29 @@ _WINDOW_S = 0.3
 """Time over which a message reports the torques commanded to a stationary joint [s]: a multisine often crosses zero."""
 
 
-class _Range:
-    """Smallest and largest value within the last `_WINDOW_S`, or the last half of it."""
+class _Ranges:
+    """Smallest and largest value of each joint within the last `_WINDOW_S`, or the last half of it."""
 
-    def __init__(self) -> None:
+    def __init__(self, joints: int) -> None:
         self._began = -math.inf
-        self._former = self._present = (0.0, 0.0)
+        self._low, self._high = [0.0] * joints, [0.0] * joints
+        self._former = self._low, self._high
 
-    def add(self, value: float, now: float) -> None:
+    def add(self, values: list[float], now: float) -> None:
         if now - self._began >= 0.5 * _WINDOW_S:
-            self._former, self._present, self._began = self._present, (value, value), now
+            self._former, self._began = (self._low, self._high), now
+            self._low, self._high = values.copy(), values.copy()
             return
-        low, high = self._present
-        if value < low:
-            self._present = value, high
-        elif value > high:
-            self._present = low, value
+        low, high = self._low, self._high
+        for joint, value in enumerate(values):
+            if value < low[joint]:
+                low[joint] = value
+            elif value > high[joint]:
+                high[joint] = value
 
-    @property
-    def limits(self) -> tuple[float, float]:
-        return min(self._former[0], self._present[0]), max(self._former[1], self._present[1])
+    def of(self, joint: int) -> tuple[float, float]:
+        low, high = self._former
+        return min(low[joint], self._low[joint]), max(high[joint], self._high[joint])
 
 
 class Jolts:
@@ -154,7 +158,7 @@ class ModelWatch:
         held = interval < 0.99 / config.experiment.rate
         self._follows = 1.0 - math.exp(-interval / _LAG_S) if held else 1.0
         self._felt = [0.0] * len(largest)
-        self._commanded = [_Range() for _ in largest]
+        self._commanded = _Ranges(len(largest))
         self._stands_for = 0.0
         self._long = max(interval, _VAGUE_S)
         self._jolts = [Jolts(interval) for _ in largest]
@@ -173,13 +177,12 @@ class ModelWatch:
             self._shortest = took
         if goal is None or took - self._shortest > self._long:
             goal, seconds = state.goal_current, float("inf")
-        torque = [constant * each for constant, each in zip(self._constants, goal, strict=True)]
+        torque = list(map(operator.mul, self._constants, goal))
         if self._follows < 1.0:
             follows = self._follows
             torque = self._felt = [felt + follows * (to - felt) for felt, to in zip(self._felt, torque, strict=True)]
         self._look_for_jolts(state, seconds)
-        for commanded, each in zip(self._commanded, torque, strict=True):
-            commanded.add(each, now)
+        self._commanded.add(torque, now)
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
         if joint < 0:
             self._stands_for = 0.0
@@ -208,7 +211,7 @@ class ModelWatch:
         lacking = self._observer.lacking[joint]
         name, velocity = self._names[joint], state.velocity[joint]
         if abs(velocity) < _STILL_RAD_S:
-            low, high = self._commanded[joint].limits
+            low, high = self._commanded.of(joint)
             said = (
                 f"{name} stands still, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "
                 "arm consistent with the prior and the data so far would move. Something blocks it, or its encoder is "

@@ -8,9 +8,14 @@ sample of the previous period. If they differ by more than `TIMES` the RMS diffe
 plus `FLOOR_RAD`, for `LASTING_S`, the joint does not repeat its motion (`unlike`).
 """
 
-from array import array
-from collections.abc import Sequence
-from math import inf, isnan, sqrt
+from collections.abc import Callable, Sequence
+from math import inf, sqrt
+from struct import Struct
+from typing import Any
+
+import numpy as np
+
+from hil.estimator.compiled import compiled
 
 _EMPTY = float("nan")
 
@@ -22,6 +27,16 @@ LASTING_S = 0.03
 _FEWEST = 2  # samples, however low the rate
 
 
+_SUMS = np.dtype(
+    [(name, "f8") for name in ("lowest", "highest", "first", "squared", "sum", "sum_of_squares", "pairs", "seen")]
+)
+"""Running sums of one joint.
+
+lowest, highest: range of its positions [rad]. first: first one compared, which is subtracted from the others to avoid
+cancellation. sum, sum_of_squares, seen: of the others. squared, pairs: of changes from the period before.
+"""
+
+
 class Repetition:
     """Compares the positions of a period of up to `samples` samples with those of the period before.
 
@@ -31,9 +46,13 @@ class Repetition:
     def __init__(self, samples: int, joints: int, interval: float) -> None:
         self._half = 0
         self._lasting = max(_FEWEST, round(LASTING_S / interval))
-        self._sums: list[_Sums] = [_Sums() for _ in range(joints)]
-        self._former = [array("d", [_EMPTY]) * samples for _ in range(joints)]
+        self._sums = np.zeros(joints, _SUMS)
+        self._former = np.full((joints, samples), np.nan)
+        self._latest = np.full(joints, np.nan)
+        self._pack = Struct(f"{joints}d").pack_into
+        self._bytes = memoryview(self._latest.data).cast("B")
         self.begin(samples, anew=True)
+        _add(self._former, self._sums, self._allowed, self._unlike_for, self._latest, 0, False, True)  # compile
 
     def begin(self, samples: int, *, anew: bool = False) -> None:
         """Start a new period of `samples` samples. anew: whether its torque differs from the previous period's.
@@ -42,81 +61,82 @@ class Repetition:
         """
         self._anew = anew
         self._half = samples // 2
-        self._allowed = [inf if anew else TIMES * sums.rms_change + FLOOR_RAD for sums in self._sums]
-        self._unlike_for = [0] * len(self._former)
-        self._sums = [_Sums() for _ in self._former]
+        self._allowed = np.array([inf if anew else TIMES * _rms_change(sums) + FLOOR_RAD for sums in self._sums])
+        self._unlike_for = np.zeros(len(self._sums), np.int64)
+        self._sums = np.zeros(len(self._sums), _SUMS)
+        self._sums["lowest"], self._sums["highest"] = inf, -inf
+        self.unlike: int | None = None
+        """Index of a joint that does not repeat the motion of the period before, or None."""
 
     def add(self, index: int, position: Sequence[float]) -> None:
         """Add sample `index` of the period: positions of all joints [rad], NaN where missing."""
+        self._pack(self._bytes, 0, *position)
         compared = index >= self._half
-        for joint, (former, sums, latest) in enumerate(zip(self._former, self._sums, position, strict=True)):
-            if not isnan(latest):
-                # False where the former sample is missing, as every comparison with NaN is.
-                self._unlike_for[joint] = (
-                    self._unlike_for[joint] + 1 if abs(latest - former[index]) > self._allowed[joint] else 0
-                )
-                if latest < sums.lowest:
-                    sums.lowest = latest
-                if latest > sums.highest:
-                    sums.highest = latest
-                if compared:
-                    sums.add(_EMPTY if self._anew else former[index], latest)
-            former[index] = latest
-
-    @property
-    def unlike(self) -> int | None:
-        """Index of a joint that does not repeat the motion of the period before, or None."""
-        longest = max(self._unlike_for)
-        return self._unlike_for.index(longest) if longest >= self._lasting else None
+        joint = _add(
+            self._former, self._sums, self._allowed, self._unlike_for, self._latest, index, compared, self._anew
+        )
+        self.unlike = joint if self._unlike_for[joint] >= self._lasting else None
 
     @property
     def moved(self) -> list[float]:
         """Range of each joint's positions in this period (joints,) [rad]; NaN if no reply was received."""
-        return [sums.highest - sums.lowest if sums.highest >= sums.lowest else _EMPTY for sums in self._sums]
+        return [
+            float(sums["highest"] - sums["lowest"]) if sums["highest"] >= sums["lowest"] else _EMPTY
+            for sums in self._sums
+        ]
 
     @property
     def difference(self) -> float:
         """RMS difference between the second halves of the periods, relative to the RMS of the motion; the worst
         joint's.
         """
-        return max(sums.relative for sums in self._sums)
+        return max(_relative(sums) for sums in self._sums)
 
 
-class _Sums:
-    """Running sums of one joint."""
+def _rms_change(sums: Any) -> float:
+    """RMS difference from the period before [rad]; infinite if there was none to compare with."""
+    return sqrt(sums["squared"] / sums["pairs"]) if sums["pairs"] else inf
 
-    __slots__ = ("_first", "_pairs", "_seen", "_squared", "_sum", "_sum_of_squares", "highest", "lowest")
 
-    def __init__(self) -> None:
-        self.lowest, self.highest = inf, -inf
-        self._first = 0.0
-        self._squared = self._sum = self._sum_of_squares = 0.0
-        self._pairs = self._seen = 0
+def _relative(sums: Any) -> float:
+    """RMS difference from the period before, relative to the RMS of the motion."""
+    if not sums["pairs"]:
+        return inf
+    mean = sums["sum"] / sums["seen"]
+    motion = sums["sum_of_squares"] / sums["seen"] - mean * mean
+    changed = sums["squared"] / sums["pairs"]
+    if motion <= 0.0:
+        return inf if changed > 0.0 else 0.0
+    return sqrt(changed / motion)
 
-    def add(self, former: float, latest: float) -> None:
-        if self._seen == 0:
-            self._first = latest  # subtracting it avoids cancellation
-        from_first = latest - self._first
-        self._seen += 1
-        self._sum += from_first
-        self._sum_of_squares += from_first * from_first
-        if not isnan(former):
-            change = latest - former
-            self._pairs += 1
-            self._squared += change * change
 
-    @property
-    def rms_change(self) -> float:
-        """RMS difference from the period before [rad]; infinite if there was none to compare with."""
-        return sqrt(self._squared / self._pairs) if self._pairs else inf
+def _add_loop(
+    former: Any, all_sums: Any, allowed: Any, unlike_for: Any, position: Any, index: int, compared: bool, anew: bool
+) -> int:
+    """Add one sample; return the joint that has been unlike the period before for longest."""
+    longest = 0
+    for joint in range(len(position)):
+        sums, latest, before = all_sums[joint], position[joint], former[joint, index]
+        if not np.isnan(latest):
+            # False where the former sample is missing, as every comparison with NaN is.
+            unlike_for[joint] = unlike_for[joint] + 1 if abs(latest - before) > allowed[joint] else 0
+            sums.lowest = min(sums.lowest, latest)
+            sums.highest = max(sums.highest, latest)
+            if compared:
+                if sums.seen == 0.0:
+                    sums.first = latest
+                from_first = latest - sums.first
+                sums.seen += 1.0
+                sums.sum += from_first
+                sums.sum_of_squares += from_first * from_first
+                if not (anew or np.isnan(before)):
+                    change = latest - before
+                    sums.pairs += 1.0
+                    sums.squared += change * change
+        former[joint, index] = latest
+        if unlike_for[joint] > unlike_for[longest]:
+            longest = joint
+    return longest
 
-    @property
-    def relative(self) -> float:
-        if not self._pairs:
-            return inf
-        mean = self._sum / self._seen
-        motion = self._sum_of_squares / self._seen - mean * mean
-        changed = self._squared / self._pairs
-        if motion <= 0.0:
-            return inf if changed > 0.0 else 0.0
-        return sqrt(changed / motion)
+
+_add: Callable[..., int] = compiled(_add_loop)

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from hil.estimator.models.regressor import inverse_dynamics
 from hil.estimator.models.terms import base_names
+from hil.fakes.plants import two_link
 from hil.fakes.plants.arm import Arm, armature, base_parameters
 from hil.fakes.plants.pendulum import Pendulum
 from hil.fakes.plants.plant import make_plant
@@ -218,3 +219,30 @@ def test_a_wrong_arm_is_refused_by_name(change: dict[str, Any], named: str) -> N
     Arm.model_validate(right)
     with pytest.raises(ValidationError, match=named):
         Arm.model_validate({**right, **change})
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    start=st.tuples(angles, angles),
+    speed=st.tuples(speeds, speeds),
+    lag=st.sampled_from((0.0, 2e-3)),
+    friction=st.sampled_from((FRICTION, {}, {"coulomb": 0.3, "offset": 0.02})),
+    commands=st.lists(st.tuples(currents, currents, st.floats(1e-10, 4e-3)), min_size=1, max_size=60),
+)
+def test_the_compiled_loop_gives_the_same_to_the_last_bit(
+    start: tuple[float, float],
+    speed: tuple[float, float],
+    lag: float,
+    friction: dict[str, float],
+    commands: list[tuple[float, float, float]],
+) -> None:
+    described = arm(start=start, current_lag=lag, **friction)
+    compiled, interpreted = TwoLink(described, speed), TwoLink(described, speed)
+    interpreted._run = two_link._run
+    assert compiled._run is not interpreted._run, "numba is loaded here"
+    now = 0.0
+    for *current, seconds in commands:
+        now += seconds
+        compiled.advance(now, current)
+        interpreted.advance(now, current)
+        assert compiled._state == interpreted._state

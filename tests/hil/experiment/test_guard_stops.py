@@ -31,6 +31,12 @@ Arm = Callable[..., Config]
 STIFF_GUARD = ("[experiment]\n", "[safety]\nmax_temperature = 40.0\nmin_voltage = 11.0\n\n[experiment]\n")
 
 
+def swing_elbow(ports: list[Any], velocity: float) -> None:
+    """Give the elbow this velocity [rad/s]."""
+    plant = ports[0].bus.plant
+    plant._state = (*plant._state[:3], velocity, *plant._state[4:])
+
+
 @pytest.fixture(scope="module")
 def plan() -> Plan:
     """The plan of every run here, shared because designing it takes longer than playing it."""
@@ -148,7 +154,7 @@ def test_a_joint_that_is_elsewhere_than_a_period_before_is_said_so(
     monkeypatch.setattr(ModelWatch, "look", lambda *_: None)
 
     def push() -> None:
-        ports[0].bus.plant._v2 += 2.0
+        swing_elbow(ports, ports[0].bus.plant.velocity[1] + 2.0)
 
     plan = replace(plan, periods=3)
     run = RunFolder.create(tmp_path / "run", config := arm())
@@ -187,7 +193,7 @@ def test_commands_too_far_apart_for_the_watchdogs(arm: Arm, tmp_path: Path, port
 
 def test_an_arm_that_moves_before_the_start(arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan) -> None:
     def push() -> None:
-        ports[0].bus.plant._v2 = 1.5
+        swing_elbow(ports, 1.5)
 
     stop, samples = run_until_stopped(arm(), tmp_path / "run", once(push, Phase.REST, 10), plan)
     assert stop.cause is Cause.EARLY_MOTION
@@ -201,7 +207,7 @@ def test_an_arm_that_is_still_moving_when_the_rest_is_over(
     config = arm()
 
     def push() -> None:
-        ports[0].bus.plant._v2 = 0.6
+        swing_elbow(ports, 0.6)
 
     run = RunFolder.create(tmp_path / "run", config)
     with pytest.raises(ExperimentError, match=r"is moving before the start: joint 'elbow' \(ID 2.* at 0\.\d\d rad/s"):
