@@ -358,12 +358,14 @@ def echoed(wire: Wire, reply: bytes, goals: list[int]) -> bytes:
     return b"".join(silent.written) + reply
 
 
-def test_an_echo_is_removed_and_its_end_is_noticed() -> None:
+@pytest.mark.parametrize("one_write", [True, False])
+def test_an_echo_is_removed_and_its_end_is_noticed(one_write: bool) -> None:
     reply = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
     wire = Wire()
     wire.echoes = True
-    bus = exchange(wire)
-    wire.answers = [echoed(wire, reply, [7, 8])] * 5 + [reply] * 2
+    bus = exchange(wire, one_write=one_write)
+    told = [echoed(wire, reply, [7, 8])] * 5 + [reply] * 2
+    wire.answers = told if one_write else [each for answered in told for each in (b"", answered)]
     wanted = [(0, 1, 2, 3), (0, 4, 5, 6)]
     times = []
     for _ in range(7):
