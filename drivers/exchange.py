@@ -344,6 +344,8 @@ class Exchange:
         else:
             port.write(goals)
             received = port.ask(read.request, len(sent) + read.reply_size, timeout, start)
+        if len(received) == read.reply_size and read.unpack(received) is not None:
+            self._echoes = False  # an adapter that no longer echoes: waiting for it would make every cycle late
         return received.removeprefix(sent)
 
     def _timeout(self, read: GroupRead, return_delay: float) -> float:

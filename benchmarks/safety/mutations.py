@@ -169,6 +169,8 @@ def _test_in_child(module: str, source: str) -> None:
         mutated = types.ModuleType(name)
         mutated.__file__ = str(ROOT / module)
         sys.modules[name] = mutated
+        parent, _, leaf = name.rpartition(".")
+        setattr(importlib.import_module(parent), leaf, mutated)  # tests patch it by its dotted name
         exec(compile(source, module, "exec"), mutated.__dict__)
         with tempfile.TemporaryDirectory() as compiled:
             vars(numba.config)["CACHE_DIR"] = compiled  # code compiled before, without this mutation, must not be found

@@ -349,3 +349,61 @@ def test_damaged_bytes_are_told_from_silence_and_late_replies_from_both() -> Non
     wire.waiting = fine
     cycles.cycle([0, 0])
     assert math.isfinite(cycles.late_at)
+
+
+def echoed(wire: Wire, reply: bytes, goals: list[int]) -> bytes:
+    """The reply behind an echo of what a cycle with these goals sends."""
+    silent = Wire()
+    exchange(silent).cycle(goals)
+    return b"".join(silent.written) + reply
+
+
+@pytest.mark.parametrize("one_write", [True, False])
+def test_an_echo_is_removed_and_its_end_is_noticed(one_write: bool) -> None:
+    reply = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+    wire = Wire()
+    wire.echoes = True
+    bus = exchange(wire, one_write=one_write)
+    told = [echoed(wire, reply, [7, 8])] * 5 + [reply] * 2
+    wire.answers = told if one_write else [each for answered in told for each in (b"", answered)]
+    wanted = [(0, 1, 2, 3), (0, 4, 5, 6)]
+    times = []
+    for _ in range(7):
+        began = wire.time
+        assert bus.cycle([7, 8]).servos == wanted
+        times.append(wire.time - began)
+    assert times[4] < 1e-4, "it waits for no more than echo and reply"
+    assert times[5] > 1e-3 > 10 * times[6], "only one cycle waits for an echo that has ended"
+
+
+@pytest.mark.parametrize(("share", "latest"), [(0.4, True), (0.6, False)])
+def test_a_reply_sooner_than_the_wire_allows_gives_way_to_the_one_behind_it(share: float, latest: bool) -> None:
+    class Paced(Wire):
+        def read(self, count: int, timeout: float) -> bytes:
+            taken = super().read(count, timeout)
+            self.time += share * self.wire_time(17 + 15 + 14 + 2 * 21) if len(taken) == count else 0.0
+            return taken
+
+    former, present = answer(1, 1, 2, 3) + answer(2, 4, 5, 6), answer(1, 7, 8, 9) + answer(2, 7, 8, 9)
+    wire = Paced([former + present])
+    wire.time = 1.0
+    assert exchange(wire).cycle([0, 0]).servos[0] == ((0, 7, 8, 9) if latest else (0, 1, 2, 3))
+
+
+def test_without_slow_registers_only_the_usual_ones_are_read() -> None:
+    reply = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+    usual = spans(Mode.CURRENT, [XM430] * 2)[:1]
+    bus = Exchange(Wire([reply] * 25), (1, 2), XM430["Goal Current"], usual, 0.0, slow_every=10)
+    assert {bus.cycle([0, 0]).span for _ in range(25)} == {0}
+
+
+def test_servos_with_different_goal_registers_each_receive_their_own_goal() -> None:
+    wire = Wire()
+    goals = (XM430["Goal Current"], XM430["Goal PWM"], XM430["Goal Current"])
+    Exchange(wire, (1, 2, 3), goals, spans(Mode.CURRENT, [XM430] * 3), 0.0).cycle([10, 20, 30])
+    sent = {
+        (packet.body[0], packet.body[4:]) for packet in Framer().feed(wire.written[0]) if packet.body[2:4] == b"\2\0"
+    }
+    assert sent == {(102, b"\1\x0a\0\3\x1e\0"), (100, b"\2\x14\0")}
+    with pytest.raises(ValueError, match="2 goals for 3 servos"):
+        Exchange(wire, (1, 2, 3), goals, spans(Mode.CURRENT, [XM430] * 3), 0.0).cycle([10, 20])
