@@ -127,10 +127,12 @@ class ChainProblem:
                     return Quadratic(np.inf, normal, gradient)
                 square = np.square(weight[:: self.every][part]).reshape(-1)
                 found = normal_equations(J.reshape(-1, slopes.size), r.reshape(-1), square)
-                J_J, J_r = J_J + found[0], J_r + found[1]
-                cost += float(square @ r.reshape(-1) ** 2)
-            normal[np.ix_(where, where)] += J_J * np.outer(slopes, slopes)
-            gradient[where] += J_r * slopes
+                with np.errstate(over="ignore", invalid="ignore"):  # a motion that diverges has an infinite sum
+                    J_J, J_r = J_J + found[0], J_r + found[1]
+                    cost += float(square @ r.reshape(-1) ** 2)
+            with np.errstate(over="ignore", invalid="ignore"):
+                normal[np.ix_(where, where)] += J_J * np.outer(slopes, slopes)
+                gradient[where] += J_r * slopes
         if not (np.isfinite(cost) and np.all(np.isfinite(normal))):
             return Quadratic(np.inf, np.zeros_like(normal), np.zeros_like(gradient))
         return Quadratic(cost, normal, gradient)
