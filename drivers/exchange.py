@@ -16,6 +16,7 @@ import struct
 from collections import deque
 from collections.abc import Sequence
 from functools import partial
+from random import Random
 from typing import NamedTuple
 
 from fastcrc import crc16
@@ -35,8 +36,14 @@ MOST_PATIENCE_S = 0.02
 """Upper limit of the minimum reply timeout [s]: in slow cycles too, a silent servo must not delay the others."""
 
 _NEVER = 1 << 62
-_READ_BACK_S = 0.025
-"""Time between two read-backs [s]: of the goals and of the operating modes, in turn."""
+_READ_BACK_S = 0.015
+"""Mean time between two read-backs [s]."""
+
+_GOALS_PER_MODE = 2
+"""Largest number of read-backs of goals between two of modes.
+
+Number and times are drawn, because a regular pattern might never see a program that overwrites every other goal.
+"""
 
 _REMEMBERED = 4
 """Number of latest goals that a servo may still hold if writes are lost; more are a matter of the status."""
@@ -368,6 +375,8 @@ class _ReadBack:
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
         self._modes = tuple(modes)
         self._is_of_modes = True
+        self._until_mode = 0
+        self._draw = Random(1)
         self._goals_sighted: list[deque[float]] = [deque() for _ in ids]
         self._modes_sighted: list[deque[float]] = [deque() for _ in ids]
         self._doubts_until = -math.inf
@@ -408,8 +417,10 @@ class _ReadBack:
             self._doubts_until = now + _IN_DOUBT_S
             is_nearly_sure |= len(times) == most - 1
         # A change of mode resets the goal, so a foreign goal may be the first that is seen of it.
-        self._is_of_modes = of_modes == is_nearly_sure
-        self.due = now if now < self._doubts_until else now + _READ_BACK_S
+        if not is_nearly_sure:
+            self._until_mode = self._draw.randint(1, _GOALS_PER_MODE) if of_modes else self._until_mode - 1
+            self._is_of_modes = self._until_mode == 0
+        self.due = now if now < self._doubts_until else now + _READ_BACK_S * self._draw.uniform(0.5, 1.5)
         return None
 
 

@@ -136,7 +136,7 @@ def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable])
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
     goals = [_status_names(own)[:2] for own in modes]
     goal = Span.of(tables, goals[0]) if len(set(modes)) == 1 else Span.each(tables, goals)
-    return goal, Span.of(tables, ("Return Delay Time", "Drive Mode", "Operating Mode"))
+    return goal, Span.of(tables, ("ID", "Baud Rate", "Return Delay Time", "Drive Mode", "Operating Mode"))
 
 
 class Converter:

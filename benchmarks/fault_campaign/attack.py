@@ -185,7 +185,8 @@ def blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
 def _fast_blocks_in(data: bytes, request: Request) -> dict[int, tuple[int, bytes]]:
     """The same for a fast answer, which is never byte-stuffed, as far as its CRCs are correct."""
     found: dict[int, tuple[int, bytes]] = {}
-    start = data.rfind(HEADER + b"\xfe")
+    length = 1 + (request.length + 4) * len(request.ids)
+    start = data.rfind(HEADER + b"\xfe" + length.to_bytes(2, "little"))  # an answer to another request may be pending
     at = start + 8  # ERR, ID, data and CRC of each servo, after header, ID, LEN and INST
     for servo_id in request.ids if start >= 0 else ():
         end = at + 2 + request.length

@@ -31,7 +31,7 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         done = kill_campaign(options.kills, Path(folder))
-    counted = [kill for kill in done if kill.counts]
+    counted = [kill for kill in done if kill.counts()]
     measured = {
         "kills": len(counted),
         "not_stopped": sum(not kill.safe for kill in done),

@@ -1,6 +1,7 @@
 """Entry point of the chain estimator: settled periods in, parameters with standard errors out."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,6 +43,8 @@ class ChainEstimate(FittedParameters):
     correlation_time: float
     softness: float
     """Natural frequency of the observer that couples the simulation to the measurements [Hz]."""
+    reached: bool
+    """Whether the fit has reached its minimum; if not, the standard errors include what remains."""
     from_prior: tuple[str, ...]
     """Base parameters that the data hardly determine, so that their values come from the prior."""
     unseen: tuple[str, ...]
@@ -89,6 +92,7 @@ def identify_chain(
         white_std=np.sqrt(np.diag(fit.white_covariance)),
         correlation_time=fit.correlation_time,
         softness=fit.softness,
+        reached=fit.remaining <= DEFAULTS.unfinished,
         from_prior=tuple(name for name, open_ in zip(model.base.names, wide, strict=True) if open_),
         unseen=tuple(
             name
@@ -106,23 +110,20 @@ def _best_fit(
     options: ChainOptions,
     added: Sequence[Array | None],
 ) -> ChainFit:
-    """Fit; if the motion is not explained, fit once more from a narrower Coulomb step and keep the better minimum.
+    """Fit; while the motion is not explained, fit again from narrower Coulomb steps and keep the best minimum.
 
     Where a joint often turns or sticks, the sum of squares has several minima in the shape of its friction.
     """
-    first = fit_periods(periods, model, linear, prior, options, added)
-    before = _worst_residual(periods, first)
-    if before <= EXPLAINED_RESIDUAL * ROUNDING:
-        return first
-    try:
-        narrow = replace(options, initial_width=options.other_initial_width)
-        again = fit_periods(periods, model, linear, prior, narrow, added)
-    except ConvergenceError:
-        return first
-    after = _worst_residual(periods, again)
-    # A stiffer observer leaves less of any error: compared only if it is the same, or if nothing is left to explain.
-    is_better = after < before and again.softness == first.softness
-    return again if is_better or after <= EXPLAINED_RESIDUAL * ROUNDING else first
+    best = fit_periods(periods, model, linear, prior, options, added)
+    for width in options.other_initial_widths:
+        before = _worst_residual(periods, best)
+        if before <= EXPLAINED_RESIDUAL * ROUNDING:
+            break
+        with suppress(ConvergenceError):
+            narrow = replace(options, initial_width=width)
+            again = fit_periods(periods, model, linear, prior, narrow, added, best)
+            best = again if _worst_residual(periods, again) < before else best
+    return best
 
 
 def _worst_residual(periods: Sequence[SettledPeriod], fit: ChainFit) -> float:

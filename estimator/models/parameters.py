@@ -88,8 +88,8 @@ class Physics:
         late: Array = self.lags + max(self.delay, 0.0)
         return late
 
-    def crossing_time(self) -> float:
-        """Return the shortest time in which reversed friction crosses a joint's step or bristle deflection [s]."""
+    def crossing_times(self) -> tuple[float, float]:
+        """Return the time in which reversed friction crosses each joint's step or bristle deflection [s]."""
         constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))
         inertia = self.free_inertias()
         times = []
@@ -101,7 +101,7 @@ class Physics:
             else:
                 turned = 2.0 * constant[f"coulomb_{joint}"] * (1.0 + constant[f"stribeck_rise_{joint}"])
                 times.append(constant[f"coulomb_width_{joint}"] * inertia[joint - 1] / (turned + 1e-12))
-        return float(min(times))
+        return times[0], times[1]
 
     def free_inertias(self) -> tuple[float, float]:
         """Return the inertia of each joint about its own axis while the other moves freely, arm straight [kg m^2]."""

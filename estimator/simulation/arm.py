@@ -27,6 +27,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled
@@ -99,14 +100,15 @@ def simulate(
     return position[:joints], state[:, :joints]
 
 
-def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> int:
-    """Return the number of substeps for a step of `step` [s] near standstill, at most `most`.
+def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> NDArray[np.int64]:
+    """Return the number of substeps for a step of `step` [s] while each joint is near standstill, at most `most`.
 
-    Within one substep, reversed dry friction may move a joint through a quarter of its step's width. The number is a
-    power of two, so that small changes of the physics seldom change it, and with it the last digits of the motion.
+    Within one substep, reversed dry friction may move a joint through a quarter of its step's width. The numbers are
+    powers of two, so that small changes of the physics seldom change them, and with them the last digits of the motion.
+    They differ between joints, since a joint with a wide step is nearly always within it.
     """
-    needed = min(4.0 * step / physics.crossing_time(), most)
-    return int(2 ** math.ceil(math.log2(max(needed, 1.0))))
+    needed = [min(4.0 * step / time, most) for time in physics.crossing_times()]
+    return np.array([2 ** math.ceil(math.log2(max(each, 1.0))) for each in needed], dtype=np.int64)
 
 
 def bump_at(ratio: float) -> float:
@@ -171,16 +173,23 @@ def _forces(p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: f
     )
 
 
-def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float, left: int) -> int:
-    """Return how many of the `left` substeps of length `piece` [s] may be taken at once: 1 near standstill.
+def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float, pieces: Any, left: int) -> int:
+    """Return how many of the `left` substeps of length `piece` [s] may be taken at once.
 
-    v1, v2: velocities [rad/s]. a1, a2: last accelerations [rad/s^2].
+    v1, v2: velocities [rad/s]. a1, a2: last accelerations [rad/s^2]. pieces: number of substeps in a step while each
+    joint is near standstill (joints,); a substep is a step divided by the larger one.
     """
     ahead = 2.0 * left * piece
     u1, u2 = v1 + ahead * a1, v2 + ahead * a2
     near_1 = (p[COULOMB] > 0.0) & ((min(abs(v1), abs(u1)) < 6.0 * p[WIDTH]) | (v1 * u1 < 0.0))
     near_2 = (p[COULOMB + 1] > 0.0) & ((min(abs(v2), abs(u2)) < 6.0 * p[WIDTH + 1]) | (v2 * u2 < 0.0))
-    return 1 if near_1 | near_2 else left
+    finest = max(pieces[0], pieces[1])
+    at_once = left
+    if near_1:
+        at_once = min(at_once, finest // pieces[0])
+    if near_2:
+        at_once = min(at_once, finest // pieces[1])
+    return at_once
 
 
 def step_on(
@@ -236,12 +245,13 @@ def step_bent(
 
 # pulls: torques of the springs if the joints were at zero (2, samples) [N m], or (2, 0) without springs.
 def _loop(
-    p: Any, bristly: bool, m: Any, state: Any, torque: Any, pulls: Any, step: float, pieces: int, position: Any
+    p: Any, bristly: bool, m: Any, state: Any, torque: Any, pulls: Any, step: float, pieces: Any, position: Any
 ) -> None:
     q1, q2, v1, v2 = state[0, 0], state[0, 1], state[1, 0], state[1, 1]
     b = state[2]
     a1 = a2 = 0.0
-    piece = step / pieces
+    finest = max(pieces[0], pieces[1])
+    piece = step / finest
     offset_1, offset_2 = p[OFFSET], p[OFFSET + 1]
     for k in range(position.shape[1]):
         position[0, k] = q1
@@ -251,9 +261,9 @@ def _loop(
             p[OFFSET + 1] = m[OFFSET + 1] = offset_2 - pulls[1, k]
         for s in range(torque.shape[2]):
             t1, t2 = torque[0, k, s], torque[1, k, s]
-            left = pieces
+            left = finest
             while left > 0:
-                n = pieces_now(p, v1, v2, a1, a2, piece, left)
+                n = pieces_now(p, v1, v2, a1, a2, piece, pieces, left)
                 q1, q2, v1, v2, a1, a2 = step_bent(p, bristly, m, b, q1, q2, v1, v2, a1, a2, t1, t2, n * piece)
                 left -= n
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2
@@ -264,4 +274,4 @@ def _loop(
 bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent = map(
     inner, (bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent)
 )
-_simulate: Callable[[Array, bool, Array, Array, Array, Array, float, int, Array], None] = compiled(_loop)
+_simulate: Callable[..., None] = compiled(_loop)

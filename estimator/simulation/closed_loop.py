@@ -155,7 +155,7 @@ def _loop(
     lag: Any,
     step: float,
     steps: int,
-    pieces: int,
+    pieces: Any,
     position: Any,
     velocity: Any,
     torque: Any,
@@ -165,7 +165,8 @@ def _loop(
     s1, s2, w1, w2 = state[3, 0], state[3, 1], state[4, 0], state[4, 1]
     b = state[5]
     a1 = a2 = 0.0
-    piece = step / pieces
+    finest = max(pieces[0], pieces[1])
+    piece = step / finest
     fallen1 = 1.0 - math.exp(-step / lag[0]) if lag[0] > 0.0 else 1.0
     fallen2 = 1.0 - math.exp(-step / lag[1]) if lag[1] > 0.0 else 1.0
     share1, share2 = fallen1 * lag[0] / step, fallen2 * lag[1] / step
@@ -192,9 +193,9 @@ def _loop(
             m2 = c2 + (t2 - c2) * share2
             t1 += (c1 - t1) * fallen1
             t2 += (c2 - t2) * fallen2
-            left = pieces
+            left = finest
             while left > 0:
-                n = pieces_now(p, v1, v2, a1, a2, piece, left)
+                n = pieces_now(p, v1, v2, a1, a2, piece, pieces, left)
                 q1, q2, v1, v2, a1, a2 = step_bent(p, bristly, m, b, q1, q2, v1, v2, a1, a2, m1, m2, n * piece)
                 left -= n
     state[0, 0], state[0, 1], state[1, 0], state[1, 1] = q1, q2, v1, v2

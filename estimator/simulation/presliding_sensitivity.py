@@ -210,7 +210,7 @@ def _loop(
     slopes: Any,
     ends: Any,
     step: float,
-    pieces: int,
+    pieces: Any,
     room: Any,
     Z: Any,
     turn: Any,
@@ -222,7 +222,8 @@ def _loop(
     count = (causes + AT_ONCE - 1) // AT_ONCE * AT_ONCE
     now = turn[0]
     faster = bristles[6]
-    piece = step / pieces
+    finest = max(pieces[0], pieces[1])
+    piece = step / finest
     for k in range(position.shape[1]):
         position[0, k], position[1, k] = x[0, 0], x[0, 1]
         for i in range(causes):
@@ -234,9 +235,9 @@ def _loop(
             t1, t2 = torque[0, k, s], torque[1, k, s]
             for cause in range(2):
                 dt[cause, 0], dt[cause, 1] = slopes[cause, 0, k, s], slopes[cause, 1, k, s]
-            left = pieces
+            left = finest
             while left > 0:
-                n = pieces_now(p, x[1, 0], x[1, 1], faster[0], faster[1], piece, left)
+                n = pieces_now(p, x[1, 0], x[1, 1], faster[0], faster[1], piece, pieces, left)
                 h = n * piece
                 _bend(p, m, b, bristles, x, t1, t2, 0.5 * h, 0.5 * h, dt, Z, count)
                 _clear(rows, now)

@@ -397,7 +397,7 @@ def _loop(
     slopes: Any,
     ends: Any,
     step: float,
-    pieces: int,
+    pieces: Any,
     room: Any,
     Z: Any,
     turn: Any,
@@ -409,7 +409,8 @@ def _loop(
     count = (causes + AT_ONCE - 1) // AT_ONCE * AT_ONCE
     now = turn[0]
     a1 = a2 = 0.0
-    piece = step / pieces
+    finest = max(pieces[0], pieces[1])
+    piece = step / finest
     for k in range(position.shape[1]):
         position[0, k], position[1, k] = x[0, 0], x[0, 1]
         for row in range(ends.shape[2]):
@@ -419,9 +420,9 @@ def _loop(
             t1, t2 = torque[0, k, s], torque[1, k, s]
             for cause in range(2):
                 dt[cause, 0], dt[cause, 1] = slopes[cause, 0, k, s], slopes[cause, 1, k, s]
-            left = pieces
+            left = finest
             while left > 0:
-                n = pieces_now(p, x[1, 0], x[1, 1], a1, a2, piece, left)
+                n = pieces_now(p, x[1, 0], x[1, 1], a1, a2, piece, pieces, left)
                 a1, a2 = arm_step(p, x, t1, t2, n * piece, now, room)
                 left -= n
                 now = 1 - now

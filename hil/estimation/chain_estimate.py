@@ -184,6 +184,12 @@ def _verdict(
             f"The recording hardly determines {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
             "wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
         )
+    if not estimate.reached:
+        trust = "with care" if trust == "yes" else trust
+        sentences.append(
+            "The fit stopped before its minimum, where a joint sticks and breaks away; the standard errors include the "
+            "distance that remains. Use faster motion ([joint_path]), so that fewer joints stick."
+        )
     if estimate.unseen:
         sentences.append(
             f"In this motion gravity does not reveal {', '.join(estimate.unseen)}: they are not identifiable, and are "

@@ -7,6 +7,7 @@ too, only the planned torque is known: the first motion then trains the model, a
 
 import math
 import operator
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -45,6 +46,16 @@ _LAG_S = 0.012
 """Time constant with which a torque step appears in the velocity [s]: current loop and velocity filter."""
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
+JOLT_S, JOLT_BACK_S = 0.01, 0.15
+"""Time in which the velocity of a joint that slips changes, and after which it is back at the latest [s]."""
+
+JOLT_RAD_S, JOLT_TIMES = 1.2, 5.0
+"""Smallest change of velocity in `JOLT_S` that is a jolt [rad/s], and its smallest ratio to the RMS of the usual ones.
+"""
+
+_USUAL_S = 1.0
+_GAP = 3.0
+"""Number of intervals between two samples after which changes of velocity are not judged."""
 _WINDOW_S = 0.3
 """Time over which a message reports the torques commanded to a stationary joint [s]: a multisine often crosses zero."""
 
@@ -72,6 +83,53 @@ class _Ranges:
     def of(self, joint: int) -> tuple[float, float]:
         low, high = self._former
         return min(low[joint], self._low[joint]), max(high[joint], self._high[joint])
+
+
+class Jolts:
+    """Detects a joint that jerks and is at its old velocity again a moment later, as one whose horn slips.
+
+    A motor cannot do this, whatever the arm: it would have to accelerate and brake much harder than ever before. So it
+    is known without any knowledge of the arm. Velocities are compared over `JOLT_S`, with their usual changes.
+
+    interval: time between two exchanges [s].
+    """
+
+    def __init__(self, interval: float) -> None:
+        back = max(1, round(JOLT_S / interval))
+        self._least = JOLT_RAD_S * max(1.0, interval / JOLT_S)
+        self._former: deque[float] = deque(maxlen=back)
+        self._square = self._age = self._change = 0.0
+        self._squared = self._since = 0.0
+        self._begun = -math.inf
+
+    def look(self, velocity: float, seconds: float, now: float) -> float | None:
+        """Process a velocity [rad/s], `seconds` after the previous one [s]; return the change of velocity of a jolt."""
+        former = self._former
+        if len(former) < former.maxlen:  # type: ignore[operator]
+            former.append(velocity)
+            return None
+        change = velocity - former[0]
+        former.append(velocity)
+        most = max(self._least, JOLT_TIMES * math.sqrt(self._square))
+        is_jolt = not -most <= change <= most
+        is_open = now - self._begun <= JOLT_BACK_S
+        if is_jolt and is_open and change * self._change < 0.0:
+            return self._change
+        if is_jolt and not is_open:
+            self._begun, self._change, is_open = now, change, True
+        # What may be the beginning of a jolt counts as usual only once it has turned out to be none.
+        self._squared += seconds * min(change * change, most * most)
+        self._since += seconds
+        if not is_open:
+            self._age += self._since
+            share = min(1.0, self._since / min(self._age, _USUAL_S))
+            self._square += share * (self._squared / self._since - self._square)
+            self._squared = self._since = 0.0
+        return None
+
+    def forget(self) -> None:
+        """Begin anew: nothing is known about the motion since the previous sample."""
+        self._former.clear()
 
 
 class ModelWatch:
@@ -103,6 +161,8 @@ class ModelWatch:
         self._commanded = _Ranges(len(largest))
         self._stands_for = 0.0
         self._long = max(interval, _VAGUE_S)
+        self._jolts = [Jolts(interval) for _ in largest]
+        self._longest_gap = _GAP * interval
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
@@ -121,6 +181,7 @@ class ModelWatch:
         if self._follows < 1.0:
             follows = self._follows
             torque = self._felt = [felt + follows * (to - felt) for felt, to in zip(self._felt, torque, strict=True)]
+        self._look_for_jolts(state, seconds)
         self._commanded.add(torque, now)
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
         if joint < 0:
@@ -132,6 +193,19 @@ class ModelWatch:
             if self._stands_for < _STEP_S:
                 return
         self._raise(joint, state)
+
+    def _look_for_jolts(self, state: State, seconds: float) -> None:
+        for joint, (jolts, velocity) in enumerate(zip(self._jolts, state.velocity, strict=True)):
+            if seconds > self._longest_gap:
+                jolts.forget()
+            change = jolts.look(velocity, seconds, self._seen_at)
+            if change is not None:
+                raise SafetyStop(
+                    f"{self._names[joint]} jerked: its velocity changed by {change:+.1f} rad/s and back within "
+                    f"{1e3 * JOLT_BACK_S:.0f} ms, which no motor does. Its horn slips on the shaft, something hit it, "
+                    "or its encoder is wrong.",
+                    Cause.UNEXPECTED,
+                )
 
     def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]

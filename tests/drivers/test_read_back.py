@@ -115,3 +115,20 @@ def test_a_servo_that_does_not_answer_is_left_to_the_next_cycle(fake_config: Mak
         assert state.missing == (False, True)
         bus.port._serial.bus.servos[2].connected = True
         assert bus.exchange([0.1, 0.1]).missing == (False, False)
+
+
+@pytest.mark.parametrize(("every", "phase"), [(2, 0), (2, 1), (3, 0), (3, 1), (3, 2)])
+def test_a_program_that_overwrites_some_goals_regularly_is_found_within_half_a_second(
+    fake_config: Make, every: int, phase: int
+) -> None:
+    times = iter(range(10_000))
+
+    def sometimes(servos: Any) -> None:
+        if next(times) % every == phase:
+            servos[2].write(102, b"\xf9\xff")
+
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        start = bus.port.clock.now()
+        with pytest.raises(BusShared, match="Goal Current reads -7"):
+            after_each(bus, sometimes, 100)
+        assert bus.port.clock.now() - start < 0.5

@@ -45,9 +45,8 @@ class Kill:
     answered_after: float
     ended: str = ""
 
-    @property
-    def counts(self) -> bool:
-        return not self.ended and self.answered_after <= ANSWERED_BEFORE_S
+    def counts(self, answered_before: float = ANSWERED_BEFORE_S) -> bool:
+        return not self.ended and self.answered_after <= answered_before
 
     @property
     def safe(self) -> bool:
@@ -56,8 +55,10 @@ class Kill:
         return all(not torque or (watchdog in {-1, 255} and goal == 0) for watchdog, torque, goal in servos)
 
 
-def kill_campaign(kills: int, folder: Path, seed: int = 1) -> list[Kill]:
+def kill_campaign(kills: int, folder: Path, seed: int = 1, answered_before: float = ANSWERED_BEFORE_S) -> list[Kill]:
     """Kill child processes that run an experiment on the pty until `kills` of them count; all kills are returned.
+
+    answered_before: time after a kill [s] within which the servos must have answered for it to count.
 
     Raises RuntimeError if too few kills count, with the messages of the experiments.
     """
@@ -68,11 +69,12 @@ def kill_campaign(kills: int, folder: Path, seed: int = 1) -> list[Kill]:
         place.mkdir()
         with fake_arm(place / "arm"):
             done.append(_kill_once(pty_config(place / "arm"), place, random.uniform(0.0, LONGEST_S)))
-        if sum(kill.counts for kill in done) == kills:
+        if sum(kill.counts(answered_before) for kill in done) == kills:
             return done
     ended = [kill.ended for kill in done if kill.ended]
     raise RuntimeError(
-        f"{sum(kill.counts for kill in done)} of {len(done)} kills count, {kills} are needed; is the computer busy? "
+        f"{sum(kill.counts(answered_before) for kill in done)} of {len(done)} kills count, {kills} are needed; "
+        "is the computer busy? "
         f"Latest answer {max(1e3 * kill.answered_after for kill in done):.0f} ms after a kill; {len(ended)} "
         "runs ended by themselves, with:\n" + "\n".join(sorted(set(ended)))
     )

@@ -63,6 +63,9 @@ class ChainProblem:
     `steps` is 1."""
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; less near the minimum."""
+    prior_weight: float = 1.0
+    """Factor of the prior's precision: above 1 while model errors exceed the noise that the weights assume, so that
+    the prior still decides what the data do not determine."""
     added: tuple[Array | None, ...] = ()
     """Known base parameters of what was added to the arm in each period (base parameters,) [SI]; None for nothing."""
     _latest: _Latest = field(init=False, repr=False, compare=False, default_factory=_Latest)
@@ -153,6 +156,21 @@ class ChainProblem:
         return minimise(
             self.evaluate, x, ftol, damping, at, move=self.coordinates.moved, limits=limits, options=options
         )
+
+    def cost(self, x: Array) -> float:
+        """Return the sum of squares at `x` alone; infinite if the motion diverges."""
+        nothing = np.zeros((x.size, x.size))
+        total = self._add_prior(x, nothing, nothing[0])
+        parameters = self.parameters(x)
+        for index, (period, weight) in enumerate(zip(self.periods, self.weights, strict=True)):
+            run = self.run_of(period, parameters)
+            moved = self._of_period(index, parameters)
+            simulation = Simulation(self.model.base, moved, self.start(x, index), self.gain(period))
+            position, _ = simulation.go_on(run, slice(0, len(run.measured)))
+            if position is None:
+                return np.inf
+            total += float(np.nansum(np.square(weight[:: self.every][: len(position)] * (position - run.measured))))
+        return total
 
     def positions(self, x: Array) -> tuple[Array, ...] | None:
         """Return the predicted positions of each period (joints, samples) [rad]; None if a motion diverges."""
@@ -255,20 +273,20 @@ class ChainProblem:
 
     def _add_prior(self, x: Array, normal: Array, gradient: Array) -> float:
         """Add the prior's contribution to `normal` and `gradient` in place; return its sum of squares."""
-        base, count = self.model.base.count, self.count
+        base, count, factor = self.model.base.count, self.count, self.prior_weight
         value, slope = self.coordinates.values(x[:count]), self.coordinates.slopes(x[:count])
         at = np.arange(base)
         miss, by = (value[:base] - self.prior.value) / self.prior.std, slope[:base] / self.prior.std
-        normal[at, at] += by * by
-        gradient[at] += by * miss
+        normal[at, at] += factor * by * by
+        gradient[at] += factor * by * miss
         shapes, likely, spread = self.coordinates.likely
         away = (x[shapes] - likely) / spread
-        normal[shapes, shapes] += 1.0 / spread**2
-        gradient[shapes] += away / spread
+        normal[shapes, shapes] += factor / spread**2
+        gradient[shapes] += factor * away / spread
         cost = float(miss @ miss) + float(away @ away)
         precision, scales = self.prior.scale_precision, self.coordinates.torque_scales
         if precision is not None and scales.size:
-            normal[np.ix_(scales, scales)] += precision
-            gradient[scales] += precision @ x[scales]  # the coordinates are logarithms
+            normal[np.ix_(scales, scales)] += factor * precision
+            gradient[scales] += factor * precision @ x[scales]  # the coordinates are logarithms
             cost += float(x[scales] @ precision @ x[scales])
-        return cost
+        return factor * cost

@@ -61,8 +61,8 @@ class ChainOptions:
     """Minimum width of every Coulomb step [rad/s]: hardly distinguishable from friction that truly sticks."""
     initial_width: float = 0.03
     """Initial width of the smoothed Coulomb step [rad/s]."""
-    other_initial_width: float = 0.005
-    """Initial width of a second fit, if the first does not explain the motion [rad/s]."""
+    other_initial_widths: tuple[float, ...] = (0.005, 0.001)
+    """Initial widths of further fits, while none explains the motion [rad/s]."""
     min_initial_lag: float = 5e-4
     """Minimum initial guess of the lag [s]."""
     reach: float = 0.3
@@ -129,30 +129,34 @@ def fit_periods(
     prior: Prior,
     options: ChainOptions = DEFAULTS,
     added: Sequence[Array | None] = (),
+    near: ChainFit | None = None,
 ) -> ChainFit:
     """Return the maximum-likelihood parameters of `model`, starting from stage 1's result `linear`.
 
-    added: see `fit_lines`. Raises ConvergenceError.
+    added: see `fit_lines`. near: an earlier fit of the same model, from which the fit starts instead, but with Coulomb
+    steps no wider than `options.initial_width`. Raises ConvergenceError.
     """
     problem, x = _problem(periods, model, linear, prior, options)
     problem = replace(problem, added=tuple(added))
     # Undivided steps cannot resolve friction near standstill: its shape, fitted to them, would end up far away in a
     # curved valley, along which the later fits progress slowly.
     coarse = replace(problem, steps=_steps(periods, options.coarse_step), reach=0.0)
-    x = _towards_prior(coarse, x, options)
-    soft, softness, spent = _softened(coarse, x, options)
+    if near is None:
+        x = _towards_prior(coarse, x, options)
+        soft, softness, spent = _softened(coarse, x, options)
+    else:
+        soft, softness, spent = _narrowed(problem, near, options), near.softness, near.iterations
     resolved = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
-    floors = np.maximum(resolved, options.width_floor)
-    bounded = replace(problem.coordinates, width_floor=floors)
+    bounded = replace(problem.coordinates, width_floor=np.maximum(resolved, options.width_floor))
     soft = bounded.raised(soft)
     sticking = replace(coarse, coordinates=bounded, softness=softness, finer=options.finer, reach=1.0)
-    near = sticking.minimise(soft, options.ftol_near)
-    positions = sticking.positions(near.x)
+    rough = _tempered(sticking, soft).minimise(soft, options.ftol_near)
+    positions = sticking.positions(rough.x)
     assert positions is not None  # the minimum's motion is finite
     weights, outliers = noise_weights(periods, positions, options.outlier_threshold)
     weights = tuple((weight * _repeated(each)).T for weight, each in zip(weights, periods, strict=True))
     nearer = replace(sticking, weights=weights, reach=options.reach).minimise(
-        near.x, options.ftol_nearer, options=NEARER
+        rough.x, options.ftol_nearer, options=NEARER
     )
     last = replace(sticking, weights=weights, steps=problem.steps, finer=options.finest, reach=options.reach)
     damped = last.minimise(nearer.x, options.ftol, options=LAST)
@@ -162,7 +166,7 @@ def fit_periods(
     if not damped.stalled:
         minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
         spent += minimum.iterations
-    spent += near.iterations + nearer.iterations + damped.iterations
+    spent += rough.iterations + nearer.iterations + damped.iterations
     if _remaining(minimum)[1] > options.unfinished:
         last = replace(last, steps=2 * last.steps)
         minimum = last.minimise(minimum.x, options.ftol, MINIMISER.min_damping, LAST)
@@ -181,6 +185,14 @@ def _remaining(minimum: Minimum) -> tuple[Array, float]:
     return step, -float(step @ at.gradient)
 
 
+def _narrowed(problem: ChainProblem, near: ChainFit, options: ChainOptions) -> Array:
+    """Return the coordinates of an earlier fit, with Coulomb steps no wider than the initial width."""
+    kinds = np.array([kind_of(name) for name in problem.coordinates.names])
+    value = np.where(kinds == "coulomb_width", np.minimum(near.value, options.initial_width), near.value)
+    starts = [start.reshape(-1) / problem.state_scale for start in near.starts]
+    return np.concatenate((problem.coordinates.coordinates(value), *starts))
+
+
 def _softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Array, float, int]:
     """Return the minimum with the softest observer that follows the motion, its softness and the number of simulations.
 
@@ -193,7 +205,7 @@ def _softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Ar
     for frequency in options.softness:
         last = frequency == options.softness[-1]
         every = 1 if last or coarse.steps > 1 else skip
-        trial = replace(coarse, softness=frequency, every=every)
+        trial = _tempered(replace(coarse, softness=frequency, every=every), x)
         try:
             found = trial.minimise(x, options.ftol_coarse)
         except ConvergenceError:
@@ -206,6 +218,12 @@ def _softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Ar
             break
         x, softness, cost = found.x, frequency, found.at.cost * every
     return x, softness, spent
+
+
+def _tempered(problem: ChainProblem, x: Array) -> ChainProblem:
+    """Return the problem with a prior that counts as much more as the residual at `x` exceeds the assumed noise."""
+    samples = sum(np.count_nonzero(weight[:: problem.every]) for weight in problem.weights)
+    return replace(problem, prior_weight=max(1.0, replace(problem, prior_weight=0.0).cost(x) / samples))
 
 
 def _problem(

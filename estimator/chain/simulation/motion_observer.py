@@ -68,7 +68,10 @@ class ChainObserver:
         self._first = np.array((FIRST_NOISE_SHARE * largest) ** 2)
         self._memory[NOISE, :n] = self._first
         drift = LEAST_DRIFT**2 * np.diag(covariance)
-        self._constants = FLOOR_SHARE * largest, (0.01 * largest) ** 2, drift, interval
+        # A joint that has moved one way only does not tell dry friction from an offset, so what may hold it at rest is
+        # never taken as less than the friction that was expected.
+        expected = np.maximum(mean[base.count + n : base.count + 2 * n], 0.0)
+        self._constants = FLOOR_SHARE * largest, (0.01 * largest) ** 2, drift, interval, expected
         self._chain = base.chain.arrays, places(n, base.columns), base.count
         self._work = room(n), np.zeros((n, base.count + 1)), np.zeros(count), np.zeros(count), np.zeros((n, 10))
         self._joints = n
@@ -117,7 +120,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
     dt: float,
     is_free: bool,
 ) -> int:
-    floor, least_noise, drift, interval = constants
+    floor, least_noise, drift, interval, expected = constants
     arrays, column, base = chain
     rooms, Y, row, gain, _ = work
     n, count = q.size, theta.size
@@ -176,7 +179,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
             left_open += row[i] * total
         memory[LACKING, j] = lacking
         friction = base + n + j
-        dry = max(theta[friction] + math.sqrt(max(covariance[friction, friction], 0.0)), 0.0)
+        dry = max(theta[friction] + math.sqrt(max(covariance[friction, friction], 0.0)), expected[j])
         holds = STATIC * dry * min(max(memory[STANDS, j], 0.0), 1.0)
         # Error of the acceleration due to the velocity's rounding, times the joint's own inertia.
         inertia = 0.0

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.dry_run.bounded_energy import boundary
+from hil.dry_run.bounded_energy import Boundary, boundary
 from hil.dry_run.ensemble import prior_ensemble
 from hil.dry_run.stopping_distance import Stopping, stopping_distance
 from hil.estimator.models.parameters import Physics
@@ -97,7 +97,7 @@ def test_overshoots_are_the_same_with_and_without(monkeypatch: pytest.MonkeyPatc
         return stopping_distance(config, plan, ensemble, np.array([3.0, 2.0]))
 
     judged = found()
-    monkeypatch.setattr("hil.dry_run.bounded_energy.Boundary.holds", lambda *_: False)
+    monkeypatch.setattr(Boundary, "holds", lambda *_: False)
     simulated = found()
     for ways in ("planned", "passed"):
         here, there = getattr(judged, ways), getattr(simulated, ways)

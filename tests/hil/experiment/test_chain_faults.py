@@ -8,7 +8,6 @@ from benchmarks.spatial.chain_faults import NAMES, figures, inject
 EACH = 6
 FIRST = 3000
 RATE = 200
-OVERRULED_MS = 350
 
 
 @pytest.mark.long
@@ -17,9 +16,5 @@ def test_random_faults_end_safe_and_where_possible_lying() -> None:
     told = "\n\n".join(map(str, outcomes))
     counted = figures(outcomes)
     assert not any(counted[bad] for bad in ("misleading", "unreadable", "not_restored")), told
-    overruled = [each for each in outcomes if each.overruled_ms > each.cut_ms]
-    assert counted["unsafe"] == len(overruled), told
-    # Required: none. A servo that another program switched to another mode is detected later (docs/benchmarks.md).
-    assert all(each.overruled_ms <= OVERRULED_MS for each in overruled), told
-    assert len(overruled) <= 1, told
+    assert not counted["unsafe"], told
     assert counted["lying"] == counted["could_command"] > 0, told

@@ -12,7 +12,7 @@ from hil.dry_run.ensemble import prior_ensemble
 from hil.errors import Cause, SafetyStop
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.closed_loop import Feedback, respond, resting
-from hil.experiment.model_watch import ModelWatch
+from hil.experiment.model_watch import JOLT_BACK_S, JOLT_RAD_S, JOLT_TIMES, Jolts, ModelWatch
 from tests.support.paths import CONFIGS
 
 RATE = 400.0
@@ -150,3 +150,55 @@ def test_a_pendulum() -> None:
     for index in range(400):
         now = index / RATE
         watch.look(State(now, now + 1e-3, (0.0,), (0.0,), (0.0,), (rest,), (0,), (False,)))
+
+
+def jolt(velocities: list[float], interval: float = 0.01, jolts: Jolts | None = None) -> tuple[int, float] | None:
+    """Index at which these velocities count as a jolt, and the change that began it."""
+    jolts = Jolts(interval) if jolts is None else jolts
+    for index, velocity in enumerate(velocities):
+        change = jolts.look(velocity, interval, index * interval)
+        if change is not None:
+            return index, change
+    return None
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize(("interval", "back"), [(0.01, 1), (0.0025, 4), (0.05, 1)])
+def test_a_velocity_that_jumps_and_is_back_is_a_jolt(sign: float, interval: float, back: int) -> None:
+    jump = 1.05 * sign * JOLT_RAD_S * max(1.0, interval / 0.01)
+    out, there = 40, 2 * back
+    assert jolt([0.0] * out + [jump] * there + [0.0] * 20, interval) == (out + there, pytest.approx(jump))
+    assert jolt([0.0] * out + [0.95 / 1.05 * jump] * there + [0.0] * 20, interval) is None
+
+
+def test_a_velocity_that_stays_or_comes_back_slowly_or_later_is_none() -> None:
+    assert jolt([0.0] * 40 + [2.0] * 100) is None
+    assert jolt([0.0] * 40 + [2.0, *np.linspace(2.0, 0.0, 20).tolist()]) is None
+    late = round(JOLT_BACK_S / 0.01) + 1
+    assert jolt([0.0] * 40 + [2.0] * late + [0.0] * 20) is None
+    assert jolt([0.0] * 40 + [2.0] * (late - 2) + [0.0] * 20) is not None
+
+
+def test_a_jolt_is_large_compared_with_the_usual_changes() -> None:
+    usual = [0.0, 0.5] * 100
+    assert jolt([*usual, 0.0, 0.0 + 0.9 * 0.5 * JOLT_TIMES, 0.0, 0.0]) is None
+    assert jolt([*usual, 0.0, 0.0 + 1.2 * 0.5 * JOLT_TIMES, 0.0, 0.0]) is not None
+
+
+def test_over_a_gap_nothing_is_known_of_the_velocity() -> None:
+    jolts = Jolts(0.01)
+    assert jolt([0.0] * 40, jolts=jolts) is None
+    jolts.forget()
+    assert jolts.look(2.0, 0.05, 0.45) is None and jolts.look(0.0, 0.01, 0.46) is None, "one change only"
+
+
+def test_a_horn_that_slips_at_the_first_motion_of_an_arm_without_a_description_is_found(config: Config) -> None:
+    undescribed = config.model_copy(update={"arm": config.arm.model_copy(update={"link_lengths": None})})
+    watch = ModelWatch(undescribed, [0.3, 0.2], interval=0.01)
+    with pytest.raises(SafetyStop, match=r"'elbow'.* jerked: its velocity changed by \+2\.0 rad/s.*horn") as stopped:
+        for index in range(40):
+            speed = 2.0 if 20 <= index < 25 else 0.0
+            turned = 0.02 * min(max(index - 20, 0), 5)
+            now, nothing = 0.01 * index, (0.0, 0.0)
+            watch.look(State(now, now + 1e-3, nothing, nothing, (0.0, speed), (-1.57, turned), (0, 0), (False, False)))
+    assert stopped.value.cause is Cause.UNEXPECTED

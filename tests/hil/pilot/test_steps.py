@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -30,11 +31,13 @@ from hil.runs.run_folder import RunFolder
 from tests.support.dry_runs import worst_relative_std
 from tests.support.paths import CONFIGS
 
+Writes = Counter[tuple[int, str]]
+"""Writes of each servo's EEPROM registers by instructions, counted by ID and register."""
 
-@pytest.fixture(scope="module")
-def eeprom_writes() -> Iterator[Counter[tuple[int, str]]]:
-    """Writes of each servo's EEPROM registers by instructions, counted by ID and register."""
-    written: Counter[tuple[int, str]] = Counter()
+
+@contextmanager
+def counted_eeprom_writes() -> Iterator[Writes]:
+    written: Writes = Counter()
     write = EmulatedServo._write
 
     def counting(servo: EmulatedServo, register: Register, value: int) -> None:
@@ -48,22 +51,29 @@ def eeprom_writes() -> Iterator[Counter[tuple[int, str]]]:
 
 
 @pytest.fixture(scope="module")
-def in_steps(
-    tmp_path_factory: pytest.TempPathFactory, eeprom_writes: Counter[tuple[int, str]]
-) -> tuple[SettledResult, Path, list[str]]:
+def in_steps_counted(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[tuple[SettledResult, Path, list[str]], Writes]:
     config = load_config(CONFIGS / "first_time.toml")
     assert config.experiment.peak_torque is None and config.arm.prior is None
     run = RunFolder.create(tmp_path_factory.mktemp("steps") / "run", config)
     said: list[str] = []
-    _, result = identify_in_steps(config, run, config.path, lambda _: None, said.append)
-    return result, run.path, said
+    with counted_eeprom_writes() as written:
+        _, result = identify_in_steps(config, run, config.path, lambda _: None, said.append)
+    return (result, run.path, said), written
+
+
+@pytest.fixture(scope="module")
+def in_steps(in_steps_counted: Any) -> Any:
+    return in_steps_counted[0]
 
 
 def test_a_whole_identification_writes_four_eeprom_registers_a_joint_at_most(
-    in_steps: Any, eeprom_writes: Counter[tuple[int, str]]
+    in_steps_counted: Any,
 ) -> None:
     """Mode and current limit, set once and restored once, whatever the number of steps."""
-    assert len(in_steps[0].steps) >= 2
+    (result, _, _), eeprom_writes = in_steps_counted
+    assert len(result.steps) >= 2
     assert {servo_id for servo_id, _ in eeprom_writes} == {1, 2}
     for servo_id in (1, 2):
         assert sum(count for (owner, _), count in eeprom_writes.items() if owner == servo_id) <= 4, eeprom_writes

@@ -44,6 +44,20 @@ def test_friction_is_learned_while_the_joint_slides() -> None:
     assert abs(looks.parameters[dry] - DRY) < 0.02
 
 
+def test_a_joint_that_has_moved_one_way_only_is_not_believed_to_be_without_friction() -> None:
+    """It cannot tell friction from an offset: torque that friction takes up afterwards is no alarm."""
+    looks, dry = observer(DRY)
+    angle = 0.0
+    for k in range(2000):
+        velocity = 0.6 + 0.2 * np.sin(4.0 * k * INTERVAL)
+        angle += velocity * INTERVAL
+        torque = 0.008 * np.cos(4.0 * k * INTERVAL) + 0.03 * velocity
+        assert looks.observe([angle], [velocity], [torque], INTERVAL, True) == -1
+    assert looks.parameters[dry] < 0.5 * DRY
+    for _ in range(400):
+        assert looks.observe([angle], [0.0], [1.3 * DRY], INTERVAL, True) == -1
+
+
 def test_a_blocked_joint_is_still_noticed() -> None:
     looks, _ = observer(0.1)
     alarms = [looks.observe([0.5], [0.0], [0.6], INTERVAL, True) for _ in range(400)]

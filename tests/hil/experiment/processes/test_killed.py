@@ -11,10 +11,13 @@ from hil.config.schema import Config
 from tests.support import kills
 from tests.support.kills import Kill, kill_campaign
 
+BUSY_S = 5.0
+
 
 def test_a_killed_program_leaves_servos_that_stop_themselves(tmp_path: Path) -> None:
-    done = kill_campaign(2, tmp_path)
-    assert sum(kill.counts for kill in done) == 2
+    # When the watchdogs trip is tested in virtual time: a busy computer may ask later.
+    done = kill_campaign(2, tmp_path, answered_before=BUSY_S)
+    assert sum(kill.counts(BUSY_S) for kill in done) == 2
     unsafe = [kill for kill in done if not kill.safe]
     assert not unsafe, "\n".join(f"{kill.watchdogs} {kill.torque} {kill.goals} {kill.ended}" for kill in unsafe)
 
@@ -24,7 +27,7 @@ def test_a_kill_that_finds_current_or_an_armed_watchdog_is_not_safe() -> None:
     assert not Kill([255, 4], [1, 1], [0, 0], 0.106).safe
     assert not Kill([255, 255], [1, 1], [0, 3], 0.106).safe
     assert Kill([0, 255], [0, 1], [3, 0], 0.106).safe, "a goal without torque moves nothing"
-    assert not Kill([255, 255], [1, 1], [0, 0], 0.130).counts
+    assert not Kill([255, 255], [1, 1], [0, 0], 0.130).counts()
 
 
 def test_the_campaign_says_why_an_experiment_would_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,107 @@
+"""Harsh but healthy arms: how many are stopped although nothing is wrong with them.
+
+    python benchmarks/safety/healthy.py [--arms 60] [--first 0] [--show]
+
+Each arm is a bundled planar configuration at 100 or 400 Hz with ramps of only 0.3 s. Its masses, torque constants and
+friction differ from the description by up to a factor of 2.2, 1.5 and 2.5, and it has play, presliding, cogging and
+cables that no description mentions. Each is recorded twice: with and without `arm.link_lengths`. Limits are wide, so
+only a check that takes a healthy arm for a broken one can stop it.
+"""
+
+import argparse
+import json
+import sys
+from collections import Counter
+from functools import partial
+from pathlib import Path
+from random import Random
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from benchmarks.fault_campaign.arms import Setting, make_document, names
+from benchmarks.fault_campaign.campaign import DoesNotRun, prepare
+
+RATES = (100, 400)
+PERIOD_S = 1.2
+MASSES, TORQUES, FRICTION = 2.2, 1.5, 2.5
+WIDE_RAD, WIDE_RAD_S = 3.1, 25.0
+
+_SKIPPED = frozenset({"fake_inverted", "paper_two_link"})
+"""Arms whose motion only their own description keeps bounded, and one that hangs from a third joint's limits."""
+
+
+def draw(seed: int, setting: Setting, period: float, *, described: bool) -> dict[str, Any]:
+    """The configuration of a healthy arm that differs from what `setting` describes."""
+    random = Random(f"healthy {seed}")
+    document = make_document(setting, period)
+    fake = document["fake"]["arm"]
+    about = random.uniform(-1.0, 1.0)
+    peaks, poses = document["experiment"]["peak_torque"], document["arm"]["rest_pose"]
+    for link, drive, peak, rest in zip(fake["links"], fake["drives"], peaks, poses, strict=True):
+        heavier = MASSES ** (0.7 * about + 0.3 * random.uniform(-1.0, 1.0))
+        for name in ("mass", "inertia"):
+            link[name] *= heavier
+        drive["torque_constant"] *= TORQUES ** random.uniform(-1.0, 1.0)
+        for name in ("coulomb", "viscous"):
+            drive[name] = drive.get(name, 0.0) * FRICTION ** random.uniform(-1.0, 1.0)
+        if random.random() < 0.4:
+            drive["backlash"] = random.uniform(1e-3, 3e-3)
+        if random.random() < 0.3:
+            stiffness = random.uniform(20.0, 200.0) * max(drive["coulomb"], 0.01)
+            drive |= {"presliding_stiffness": stiffness, "coulomb_width": 0.0}
+        if random.random() < 0.4:
+            drive |= {"cogging": 0.1 * random.random() * peak, "cogging_cycles": float(random.choice((1, 3, 7)))}
+        if random.random() < 0.3:
+            drive |= {"cable_stiffness": 0.1 * random.random() * peak, "cable_angle": rest + random.uniform(-0.1, 0.1)}
+    for joint, rest in zip(document["joints"], poses, strict=True):
+        joint |= {"position_limit": [rest - WIDE_RAD, rest + WIDE_RAD], "velocity_limit": WIDE_RAD_S}
+    document["arm"].pop("link_lengths", None)
+    document["arm"].pop("prior", None)
+    if described:
+        document["arm"]["link_lengths"] = [link["length"] for link in fake["links"]]
+    return document
+
+
+def stopped(seed: int, *, described: bool) -> tuple[str, str]:
+    """Record one arm; return its setting, and what was said if it did not end as planned."""
+    random = Random(f"setting {seed}")
+    setting = Setting(random.choice([name for name in names() if name not in _SKIPPED]), random.choice(RATES))
+    try:
+        prepare(setting, PERIOD_S, partial(draw_again, seed, described))
+    except DoesNotRun as error:
+        return f"{setting.name} {setting.rate} Hz", str(error)
+    return f"{setting.name} {setting.rate} Hz", ""
+
+
+def draw_again(seed: int, described: bool, setting: Setting, period: float) -> dict[str, Any]:
+    """`draw` in the order of arguments that `prepare` expects."""
+    return draw(seed, setting, period, described=described)
+
+
+def cause(said: str) -> str:
+    """One or two words for a stop."""
+    for words in ("position limit", "velocity limit", "any arm consistent", "does not repeat", "against its command"):
+        if words in said:
+            return words
+    return "other" if said else "none"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arms", type=int, default=60)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--show", action="store_true", help="print what stopped each arm")
+    options = parser.parse_args()
+    for described in (True, False):
+        counted: Counter[str] = Counter()
+        for seed in range(options.first, options.first + options.arms):
+            setting, said = stopped(seed, described=described)
+            counted[cause(said)] += 1
+            if said and options.show:
+                print(f"arm {seed}, {setting}: {' '.join(said.split())[:400]}", flush=True)
+        print(json.dumps({"link_lengths": described, **counted}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
