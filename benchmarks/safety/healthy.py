@@ -1,6 +1,6 @@
 """Harsh but healthy arms: how many are stopped although nothing is wrong with them.
 
-    python benchmarks/safety/healthy.py [--arms 60] [--first 0] [--show]
+    python benchmarks/safety/healthy.py [--arms 60] [--first 0] [--show] [--json]
 
 Each arm is a bundled planar configuration at 100 or 400 Hz with ramps of only 0.3 s. Its masses, torque constants and
 friction differ from the description by up to a factor of 2.2, 1.5 and 2.5, and it has play, presliding, cogging and
@@ -92,15 +92,22 @@ def main() -> None:
     parser.add_argument("--arms", type=int, default=60)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--show", action="store_true", help="print what stopped each arm")
+    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    found = []
     for described in (True, False):
         counted: Counter[str] = Counter()
         for seed in range(options.first, options.first + options.arms):
             setting, said = stopped(seed, described=described)
             counted[cause(said)] += 1
             if said and options.show:
-                print(f"arm {seed}, {setting}: {' '.join(said.split())[:400]}", flush=True)
-        print(json.dumps({"link_lengths": described, **counted}), flush=True)
+                print(f"arm {seed}, {setting}: {' '.join(said.split())[:400]}", file=sys.stderr, flush=True)
+        found.append({"link_lengths": described, **counted})
+        if not options.json:
+            stops = ", ".join(f"{number} {what}" for what, number in sorted(counted.items()))
+            print(f"{'with' if described else 'without'} link lengths, stops: {stops}", flush=True)
+    if options.json:
+        print(json.dumps(found))
 
 
 if __name__ == "__main__":
