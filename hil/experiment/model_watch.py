@@ -7,8 +7,9 @@ too, only the planned torque is known: the first motion then trains the model, a
 
 import math
 import operator
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from struct import Struct
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble, prior_ensemble
 from hil.errors import Cause, SafetyStop
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 from hil.estimator.models.momentum_observer import NAMES, MomentumObserver
 from hil.estimator.models.parameters import CONSTANTS
 
@@ -85,51 +87,80 @@ class _Ranges:
         return min(low[joint], self._low[joint]), max(high[joint], self._high[joint])
 
 
+_JOLT = np.dtype([(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun")])
+"""What is known of a joint's changes of velocity.
+
+square: mean square of the usual ones [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may yet
+belong to a jolt, and its duration [s]. change: first change of what may be a jolt [rad/s]. begun: its time [s].
+"""
+
+
 class Jolts:
     """Detects a joint that jerks and is at its old velocity again a moment later, as one whose horn slips.
 
     A motor cannot do this, whatever the arm: it would have to accelerate and brake much harder than ever before. So it
     is known without any knowledge of the arm. Velocities are compared over `JOLT_S`, with their usual changes.
 
-    interval: time between two exchanges [s].
+    count: number of joints. interval: time between two exchanges [s].
     """
 
-    def __init__(self, interval: float) -> None:
+    def __init__(self, count: int, interval: float) -> None:
         back = max(1, round(JOLT_S / interval))
         self._least = JOLT_RAD_S * max(1.0, interval / JOLT_S)
-        self._former: deque[float] = deque(maxlen=back)
-        self._square = self._age = self._change = 0.0
-        self._squared = self._since = 0.0
-        self._begun = -math.inf
+        self._joints = np.zeros(count, _JOLT)
+        self._joints["begun"] = -np.inf
+        self._former = np.zeros((back, count))
+        self._known = np.zeros(2, dtype=np.int64)
+        self._velocity = np.zeros(count)
+        self._pack = Struct(f"{count}d").pack_into
+        self._bytes = memoryview(self._velocity.data).cast("B")
+        self.look([0.0] * count, 0.0, 0.0)  # compile
+        self.forget()
 
-    def look(self, velocity: float, seconds: float, now: float) -> float | None:
-        """Process a velocity [rad/s], `seconds` after the previous one [s]; return the change of velocity of a jolt."""
-        former = self._former
-        if len(former) < former.maxlen:  # type: ignore[operator]
-            former.append(velocity)
-            return None
-        change = velocity - former[0]
-        former.append(velocity)
-        most = max(self._least, JOLT_TIMES * math.sqrt(self._square))
-        is_jolt = not -most <= change <= most
-        is_open = now - self._begun <= JOLT_BACK_S
-        if is_jolt and is_open and change * self._change < 0.0:
-            return self._change
-        if is_jolt and not is_open:
-            self._begun, self._change, is_open = now, change, True
-        # What may be the beginning of a jolt counts as usual only once it has turned out to be none.
-        self._squared += seconds * min(change * change, most * most)
-        self._since += seconds
-        if not is_open:
-            self._age += self._since
-            share = min(1.0, self._since / min(self._age, _USUAL_S))
-            self._square += share * (self._squared / self._since - self._square)
-            self._squared = self._since = 0.0
-        return None
+    def look(self, velocity: Sequence[float], seconds: float, now: float) -> tuple[int, float] | None:
+        """Process velocities [rad/s], `seconds` after the previous ones [s]; return the joint and change of a jolt."""
+        self._pack(self._bytes, 0, *velocity)
+        joint = _jolting(self._joints, self._former, self._known, self._velocity, seconds, now, self._least)
+        return None if joint < 0 else (joint, float(self._joints["change"][joint]))
 
     def forget(self) -> None:
         """Begin anew: nothing is known about the motion since the previous sample."""
-        self._former.clear()
+        self._known[:] = 0
+
+
+def _jolting_loop(joints: Any, former: Any, known: Any, velocity: Any, seconds: float, now: float, least: float) -> int:
+    # known: number of former velocities, and the row of the oldest.
+    back, row = former.shape[0], known[1]
+    known[1] = (row + 1) % back
+    if known[0] < back:
+        former[row] = velocity
+        known[0] += 1
+        return -1
+    found = -1
+    for index in range(len(joints)):
+        joint = joints[index]
+        change = velocity[index] - former[row, index]
+        former[row, index] = velocity[index]
+        most = max(least, JOLT_TIMES * math.sqrt(joint.square))
+        is_jolt = not -most <= change <= most
+        is_open = now - joint.begun <= JOLT_BACK_S
+        if is_jolt and is_open and change * joint.change < 0.0:
+            found = index if found < 0 else found
+            continue
+        if is_jolt and not is_open:
+            joint.begun, joint.change, is_open = now, change, True
+        # What may be the beginning of a jolt counts as usual only once it has turned out to be none.
+        joint.squared += seconds * min(change * change, most * most)
+        joint.since += seconds
+        if not is_open:
+            joint.age += joint.since
+            share = min(1.0, joint.since / min(joint.age, _USUAL_S))
+            joint.square += share * (joint.squared / joint.since - joint.square)
+            joint.squared = joint.since = 0.0
+    return found
+
+
+_jolting: Callable[..., int] = compiled(_jolting_loop)
 
 
 class ModelWatch:
@@ -161,7 +192,7 @@ class ModelWatch:
         self._commanded = _Ranges(len(largest))
         self._stands_for = 0.0
         self._long = max(interval, _VAGUE_S)
-        self._jolts = [Jolts(interval) for _ in largest]
+        self._jolts = Jolts(len(largest), interval)
         self._longest_gap = _GAP * interval
 
     def look(self, state: State) -> None:
@@ -195,17 +226,16 @@ class ModelWatch:
         self._raise(joint, state)
 
     def _look_for_jolts(self, state: State, seconds: float) -> None:
-        for joint, (jolts, velocity) in enumerate(zip(self._jolts, state.velocity, strict=True)):
-            if seconds > self._longest_gap:
-                jolts.forget()
-            change = jolts.look(velocity, seconds, self._seen_at)
-            if change is not None:
-                raise SafetyStop(
-                    f"{self._names[joint]} jerked: its velocity changed by {change:+.1f} rad/s and back within "
-                    f"{1e3 * JOLT_BACK_S:.0f} ms, which no motor does. Its horn slips on the shaft, something hit it, "
-                    "or its encoder is wrong.",
-                    Cause.UNEXPECTED,
-                )
+        if seconds > self._longest_gap:
+            self._jolts.forget()
+        if (found := self._jolts.look(state.velocity, seconds, self._seen_at)) is not None:
+            joint, change = found
+            raise SafetyStop(
+                f"{self._names[joint]} jerked: its velocity changed by {change:+.1f} rad/s and back within "
+                f"{1e3 * JOLT_BACK_S:.0f} ms, which no motor does. Its horn slips on the shaft, something hit it, "
+                "or its encoder is wrong.",
+                Cause.UNEXPECTED,
+            )
 
     def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]

@@ -154,11 +154,11 @@ def test_a_pendulum() -> None:
 
 def jolt(velocities: list[float], interval: float = 0.01, jolts: Jolts | None = None) -> tuple[int, float] | None:
     """Index at which these velocities count as a jolt, and the change that began it."""
-    jolts = Jolts(interval) if jolts is None else jolts
+    jolts = Jolts(1, interval) if jolts is None else jolts
     for index, velocity in enumerate(velocities):
-        change = jolts.look(velocity, interval, index * interval)
-        if change is not None:
-            return index, change
+        found = jolts.look([velocity], interval, index * interval)
+        if found is not None:
+            return index, found[1]
     return None
 
 
@@ -186,10 +186,10 @@ def test_a_jolt_is_large_compared_with_the_usual_changes() -> None:
 
 
 def test_over_a_gap_nothing_is_known_of_the_velocity() -> None:
-    jolts = Jolts(0.01)
+    jolts = Jolts(1, 0.01)
     assert jolt([0.0] * 40, jolts=jolts) is None
     jolts.forget()
-    assert jolts.look(2.0, 0.05, 0.45) is None and jolts.look(0.0, 0.01, 0.46) is None, "one change only"
+    assert jolts.look([2.0], 0.05, 0.45) is None and jolts.look([0.0], 0.01, 0.46) is None, "one change only"
 
 
 def test_a_horn_that_slips_at_the_first_motion_of_an_arm_without_a_description_is_found(config: Config) -> None:
