@@ -9,7 +9,7 @@ which also reaches lower peaks (1.40 instead of 1.44 for 25 lines) and takes a t
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 import numpy.typing as npt
@@ -127,7 +127,7 @@ def design_multisine(
     torque = np.empty((len(lines), samples))
     for joint, (harmonics, peak) in enumerate(zip(lines, peak_torque, strict=True)):
         order = np.asarray(harmonics, dtype=np.int64)
-        phase = _low_crest_phases(order, np.random.default_rng((seed, joint)))
+        phase = _low_crest_phases(tuple(order.tolist()), seed, joint)
         wave = _wave(order, phase, samples)
         amplitude = peak / float(np.abs(wave).max())
         torque[joint] = amplitude * wave
@@ -180,8 +180,10 @@ def _wave(order: Harmonics, phase: Array, samples: int) -> Array:
     return np.fft.irfft(spectrum, samples)
 
 
-def _low_crest_phases(order: Harmonics, random: np.random.Generator) -> Array:
+@lru_cache(maxsize=64)  # a search for the largest torque scales the same wave again and again
+def _low_crest_phases(harmonics: tuple[int, ...], seed: int, joint: int) -> Array:
     """Return the best phases [rad] of several optimisations, from randomised Schroeder phases and from random ones."""
+    order, random = np.asarray(harmonics, dtype=np.int64), np.random.default_rng((seed, joint))
     count = order.size
     schroeder = -np.pi * np.arange(count) * np.arange(1, count + 1) / count
     # Plain Schroeder phases would give every seed the same wave, so they are shifted in time and perturbed.
@@ -195,7 +197,9 @@ def _low_crest_phases(order: Harmonics, random: np.random.Generator) -> Array:
 
     best = min((_flattened(order, start, coarse, NORMS) for start in starts), key=peak)
     best = min((best, _flattened(order, best, fine, FINAL_NORMS)), key=peak)
-    return np.asarray(np.mod(best, 2.0 * np.pi))
+    phases = np.asarray(np.mod(best, 2.0 * np.pi))
+    phases.flags.writeable = False
+    return phases
 
 
 def _flattened(order: Harmonics, phase: Array, samples: int, norms: tuple[int, ...]) -> Array:
