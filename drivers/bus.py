@@ -298,15 +298,17 @@ class ServoBus:
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def check_not_overruled(self, due: float) -> None:
-        """Check that the servos hold this program's goals and modes, if that is due and possible before `due` [s].
+        """Check that the servos hold this program's goals and modes, if that is possible before `due` [s].
 
         Raises PortLost; BusShared if another master has written to a servo.
         """
         exchange = self.prepared
         if (found := exchange.overruled(due)) is not None:
             raise overruled(self._drives[found.place], found)
-        if exchange.is_in_doubt:
-            exchange.read_status_next()  # it tells goals that are lost from those of another master
+        if exchange.is_in_doubt and exchange.read_back_at <= self.port.clock.now():
+            # The status tells goals that are lost from those of another master. It takes the time of the next
+            # read-back, so it is only asked for right after one.
+            exchange.read_status_next()
 
     @property
     def heard_instead(self) -> str:

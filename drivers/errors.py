@@ -76,7 +76,9 @@ class ServoFault(DriverError):
 
 
 class BusShared(DriverError):
-    """Another master sends instructions on this bus. Example: a controller board wired next to the adapter."""
+    """Another master sends instructions on this bus, or has written goals or modes. Example: a controller board wired
+    next to the adapter.
+    """
 
 
 class WrongModel(DriverError):

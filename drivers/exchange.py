@@ -192,8 +192,8 @@ class Exchange:
 
     @property
     def is_in_doubt(self) -> bool:
-        """Whether the latest read-back found something that was not written here."""
-        return self._read_back is not None and self._read_back.is_in_doubt
+        """Whether a read-back has just found something that was not written here."""
+        return self._read_back is not None and self._now() < self._read_back.doubts_until
 
     def overruled(self, due: float) -> Overruled | None:
         """Read goals or operating modes back if there is time before the next cycle, which is due at `due` [s].
@@ -210,18 +210,22 @@ class Exchange:
         asked = read.reply_size + (len(read.request) if self._echoes else 0)
         takes = max(self._lasted - port.wire_time(self._bytes(self._reads[0]) - self._bytes(read)), back.longest)
         if now + takes > due or self._late_possible:
+            back.took(0.0)  # a single long one, while this computer was busy, must not be the last
             self.read_back_at = now + _TRY_AGAIN_S
             return None
         port.clock.wait_until(due - takes - HOST_S)
         before = self._now()
-        received = port.ask(read.request, asked, max(due - before, takes), before)
+        if before + takes > due:  # woken up late
+            self.read_back_at = before + _TRY_AGAIN_S
+            return None
+        received = port.ask(read.request, asked, due - before, before)
         received = received.removeprefix(read.request)
         servos = read.unpack(received) or read.search(received)[0]
         now = self._now()
         if None in servos:
             self._late_possible, self._lost = True, 1
         else:
-            back.took(now - before)
+            back.took(min(now - before, 2.0 * takes))
         found = back.look(servos, self._sent, now)
         self.read_back_at = back.due
         return found
@@ -381,11 +385,7 @@ class _ReadBack:
         self._draw = Random(1)
         self._goals_sighted: list[deque[float]] = [deque() for _ in ids]
         self._modes_sighted: list[deque[float]] = [deque() for _ in ids]
-        self._doubts_until = -math.inf
-
-    @property
-    def is_in_doubt(self) -> bool:
-        return self.due < self._doubts_until
+        self.doubts_until = -math.inf
 
     @property
     def read(self) -> GroupRead:
@@ -416,13 +416,13 @@ class _ReadBack:
                 if of_modes:
                     return Overruled(place, "Operating Mode", value, self._modes[place])
                 return Overruled(place, self._goals[place], value, sent[-1][place])
-            self._doubts_until = now + _IN_DOUBT_S
+            self.doubts_until = now + _IN_DOUBT_S
             is_nearly_sure |= len(times) == most - 1
         # A change of mode resets the goal, so a foreign goal may be the first that is seen of it.
         if not is_nearly_sure:
             self._until_mode = self._draw.randint(1, _GOALS_PER_MODE) if of_modes else self._until_mode - 1
             self._is_of_modes = self._until_mode == 0
-        self.due = now if now < self._doubts_until else now + _READ_BACK_S * self._draw.uniform(0.5, 1.5)
+        self.due = now if now < self.doubts_until else now + _READ_BACK_S * self._draw.uniform(0.5, 1.5)
         return None
 
 

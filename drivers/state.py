@@ -56,8 +56,7 @@ class State(NamedTuple):
     missing: whether the servo returned no values.
     slow, status: values that are only read in some cycles, otherwise None.
     apart: for each joint, the angles of its further servos minus the first's [rad], NaN if one did not reply; None on
-    an arm with one servo per joint. Horns are mounted at any angle, so only a change is
-    meaningful.
+    an arm with one servo per joint. Horns are mounted at any angle, so only a change is meaningful.
     """
 
     time_before_write: float

@@ -248,9 +248,14 @@ def judged(config: Config, found: hil.Identification) -> dict[str, float]:
     wrong = Y @ np.array([found.parameters[name].value for name in known.base.names]) - right
     error = wrong.std(axis=1) / right.std(axis=1)
     within = [found.covariance.names.index(name) for name in known.base.names]
-    covariance = np.nan_to_num(found.covariance.array(), posinf=1e6)[np.ix_(within, within)]
-    expected = np.sqrt(np.einsum("jsp,pq,jsq->js", Y, covariance, Y).mean(axis=1)) / right.std(axis=1)
-    worst = int(np.argmax(error))
+    covariance = found.covariance.array()[np.ix_(within, within)]
+    known_ones = np.isfinite(np.diag(covariance))
+    covariance = np.where(np.outer(known_ones, known_ones), covariance, 0.0)
+    about = Y - Y.mean(axis=1, keepdims=True)
+    expected = np.sqrt(np.einsum("jsp,pq,jsq->js", about, covariance, about).mean(axis=1)) / right.std(axis=1)
+    # The worst joint is the one that is farthest beyond both criteria.
+    beyond = np.minimum(100 * error / WRONG_TORQUE, error / np.maximum(expected, 1e-12) / WRONG_STDS)
+    worst = int(np.argmax(beyond))
     away = np.array([abs(each.value - truth[name]) / each.std for name, each in found.parameters.items()])
     return {
         "torque_error_percent": round(100 * float(error[worst]), 2),

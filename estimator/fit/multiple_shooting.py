@@ -124,7 +124,8 @@ class Shooting:
         names, options = self._model.names, self._options
         scales = scales_of(names, Sizes(*self._scales, max(base["inertia_1"], 1e-6)))
         resolved = resolved_widths(names, base, options.max_step, options.coordinates.widths_per_substep)
-        return Coordinates(names, scales, options.coordinates, resolved)
+        # The regression may make a joint much too light, and its step must not stay wide for good.
+        return Coordinates(names, scales, options.coordinates, np.minimum(resolved, options.initial_width))
 
     def position(self, segment: RecordingSegment, physics: Physics, state: Array) -> Array:
         """Return the simulated positions at a segment's samples (joints, samples) [rad] from `state` (2, joints)."""

@@ -106,5 +106,6 @@ class Physics:
     def free_inertias(self) -> tuple[float, float]:
         """Return the inertia of each joint about its own axis while the other moves freely, arm straight [kg m^2]."""
         constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))
-        shared = constant["inertia_2"] ** 2 / (constant["inertia_2"] + constant["armature_2"])
-        return constant["inertia_1"] + constant["inertia_2"] - shared, constant["inertia_2"] + constant["armature_2"]
+        outer = constant["inertia_2"] + constant["armature_2"]
+        shared = constant["inertia_2"] ** 2 / outer if outer else 0.0
+        return constant["inertia_1"] + constant["inertia_2"] - shared, outer

@@ -5,9 +5,8 @@ The stop itself is simulated on the arms of an ensemble, with gravity, friction 
 planned   the run is stopped at any moment of the planned motion: by a signal, lost replies, an alert, a lost port, or
           because the program was killed
 passed    the motion differs from the plan (a blocked, reversed or unpowered joint, or an arm other than the one
-described), so
-          the guard stops it at a limit: one joint at its position limit moves outwards at its velocity limit, the
-          other is anywhere within its range
+          described), so the guard stops it at a limit: one joint at its position limit moves outwards at its velocity
+          limit, the other is anywhere within its range
 
 The simulation knows what a dry run knows: rigid links, friction, current lag, and servos that behave as their manual
 says.

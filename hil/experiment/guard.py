@@ -70,19 +70,18 @@ class Guard:
         self._lower_torque = lower
         self._commands = CommandLimits(config)
         planned = planned or _planned(config)
-        self._interval = 1.0 / rate if interval is None else interval
-        self._silence = Silence(config, self._interval, patience)
+        interval = 1.0 / rate if interval is None else interval
+        self._silence = Silence(config, interval, patience)
         self._patience = patience or float("inf")
         self._watchdog = safety.watchdog
         self._deadlines = Deadlines(config)
         self._joints = _joint_records(config, planned, left_by_a_run)
-        self._checks = JointChecks(self._joints, self._interval)
+        self._checks = JointChecks(self._joints, interval)
         self._apart = Apart()
         self._status = StatusCheck(config)
         self._missing = self._silence.counts
         self._resting: tuple[float, ...] | None = None
         self._shortest = float("inf")
-        self._unsure = 0.0
 
     def clamp(self, goals: Sequence[float]) -> list[float]:
         """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""

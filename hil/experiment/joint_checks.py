@@ -120,10 +120,10 @@ def _fault(
     joint = joints[index]
     position, velocity, goal, current = sample[0, index], sample[1, index], sample[2, index], sample[3, index]
     elapsed = now - joint.seen_at
-    # A punctual sample after a late one still represents a whole interval.
-    seconds = max(interval * (1 + missed), elapsed)
     former = joint.position
     is_first = np.isnan(former)
+    # A punctual sample after a late one still represents a whole interval; nothing is known before the first one.
+    seconds = interval * (1 + missed) if is_first else max(interval * (1 + missed), elapsed)
     if not is_first:
         joint.moved, joint.seconds = position - former, seconds
         joint.most = joint.farthest * (seconds + after - now) + JUMP_ALLOWANCE_RAD

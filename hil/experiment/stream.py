@@ -328,7 +328,6 @@ class Stream:
         deadline = self._deadline
         if deadline is not None and self._exchange.read_back_at <= deadline + later:
             self._bus.check_not_overruled(deadline + later)
-            self._awake_at = self._clock.now()
 
     def _look(self, state: State, phase: Phase, *, between: bool = False) -> None:
         former, self._state = self._state, state

@@ -132,3 +132,27 @@ def test_a_program_that_overwrites_some_goals_regularly_is_found_within_half_a_s
         with pytest.raises(BusShared, match="Goal Current reads -7"):
             after_each(bus, sometimes, 100)
         assert bus.port.clock.now() - start < 0.5
+
+
+@pytest.mark.parametrize("interval", [0.004, 0.005, 1 / 150, 0.01])
+@pytest.mark.parametrize("adapter_us", [60, 1000])
+def test_foreign_goals_are_found_at_every_rate_although_the_status_takes_time_too(
+    fake_config: Make, fake_file: Callable[..., str], interval: float, adapter_us: int
+) -> None:
+    url = fake_file(("latency_us = 60", f"latency_us = {adapter_us}"))
+    with driven(fake_config(url, interval=interval)) as bus:
+        start = bus.port.clock.now()
+        with pytest.raises(BusShared, match="another program"):
+            after_each(bus, lambda servos: servos[2].write(102, b"\xf9\xff"), 100, interval)
+        assert bus.port.clock.now() - start < 0.1
+
+
+def test_one_long_read_back_is_not_the_last(fake_config: Make) -> None:
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        after_each(bus, nothing, 20)
+        assert bus.prepared._read_back is not None
+        bus.prepared._read_back.took(0.02)  # this program was suspended during it
+        start = bus.port.clock.now()
+        with pytest.raises(BusShared):
+            after_each(bus, lambda servos: servos[2].write(102, b"\xf9\xff"), 200)
+        assert bus.port.clock.now() - start < 1.0

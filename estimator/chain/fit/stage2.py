@@ -147,7 +147,9 @@ def fit_periods(
     else:
         soft, softness, spent = _narrowed(problem, near, options), near.softness, near.iterations
     resolved = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
-    bounded = replace(problem.coordinates, width_floor=np.maximum(resolved, options.width_floor))
+    # An early fit may be far off: where it makes a joint much too light, the step must not stay wide for good.
+    floor = np.clip(resolved, options.width_floor, options.initial_width)
+    bounded = replace(problem.coordinates, width_floor=floor)
     soft = bounded.raised(soft)
     sticking = replace(coarse, coordinates=bounded, softness=softness, finer=options.finer, reach=1.0)
     rough = _tempered(sticking, soft).minimise(soft, options.ftol_near)
@@ -168,9 +170,13 @@ def fit_periods(
         spent += minimum.iterations
     spent += rough.iterations + nearer.iterations + damped.iterations
     if _remaining(minimum)[1] > options.unfinished:
-        last = replace(last, steps=2 * last.steps)
-        minimum = last.minimise(minimum.x, options.ftol, MINIMISER.min_damping, LAST)
-        spent += minimum.iterations
+        finer = replace(last, steps=2 * last.steps)
+        try:
+            minimum, last = finer.minimise(minimum.x, options.ftol, MINIMISER.min_damping, LAST), finer
+        except ConvergenceError:
+            pass  # what remains widens the standard errors
+        else:
+            spent += minimum.iterations
     return _fit(last, minimum, outliers, COVARIANCE, spent, options.unfinished)
 
 
