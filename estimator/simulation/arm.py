@@ -107,7 +107,7 @@ def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> NDA
     powers of two, so that small changes of the physics seldom change them, and with them the last digits of the motion.
     They differ between joints, since a joint with a wide step is nearly always within it.
     """
-    needed = [min(4.0 * step / time, most) for time in physics.crossing_times()]
+    needed = [min(4.0 * step / max(time, 1e-12), most) for time in physics.crossing_times()]
     return np.array([2 ** math.ceil(math.log2(max(each, 1.0))) for each in needed], dtype=np.int64)
 
 

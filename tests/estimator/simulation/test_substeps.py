@@ -1,0 +1,40 @@
+"""Steps near standstill are divided as finely as each joint needs, which changes nothing in the motion."""
+
+import numpy as np
+import pytest
+
+from hil.estimator.models.parameters import Physics
+from hil.estimator.simulation import arm
+from tests.estimator.simulation.test_closed_loop import ARM, POSE, RATE, wave
+
+STICKING, WIDE = 2e-4, 1.0
+STEP = 8e-4
+
+
+@pytest.mark.parametrize(("widths", "which"), [((STICKING, WIDE), 0), ((WIDE, STICKING), 1)])
+def test_only_the_joint_that_sticks_needs_many(widths: tuple[float, float], which: int) -> None:
+    physics = Physics.of(ARM | {"coulomb_width_1": widths[0], "coulomb_width_2": widths[1]})
+    pieces = arm.finer_pieces(physics, STEP)
+    assert pieces[which] == arm.MAX_SUBSTEPS and pieces[1 - which] == 1
+
+
+def test_a_joint_without_inertia_is_not_divided_by_zero() -> None:
+    weightless = Physics.of(ARM | {"inertia_2": 0.0, "armature_2": 0.0, "coulomb_2": 0.0, "coulomb_width_2": 0.01})
+    assert weightless.free_inertias()[1] == 0.0
+    assert (arm.finer_pieces(weightless, STEP) >= 1).all()
+
+
+@pytest.mark.parametrize("widths", [(STICKING, WIDE), (WIDE, STICKING), (STICKING, 0.01)])
+def test_the_motion_is_that_of_the_finest_substeps_for_both(
+    widths: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    physics = Physics.of(ARM | {"coulomb_width_1": widths[0], "coulomb_width_2": widths[1]})
+    steps = arm.steps_per_sample(RATE)
+    torque = np.repeat(wave(0.5).torque[:, :, None], steps, axis=2)
+    start = np.stack((POSE, np.zeros(2)))
+    found, _ = arm.simulate(physics, start, torque, 1 / (RATE * steps))
+    chosen = arm.finer_pieces(physics, 1 / (RATE * steps))
+    assert chosen.min() < chosen.max()
+    monkeypatch.setattr(arm, "finer_pieces", lambda *_: np.full(2, chosen.max()))
+    finest, _ = arm.simulate(physics, start, torque, 1 / (RATE * steps))
+    assert 0.0 < np.abs(found - finest).max() < 3e-5, "rad, a fiftieth of an encoder step"
