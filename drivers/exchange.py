@@ -16,7 +16,6 @@ import struct
 from collections import deque
 from collections.abc import Sequence
 from functools import partial
-from random import Random
 from typing import NamedTuple
 
 from fastcrc import crc16
@@ -24,7 +23,8 @@ from fastcrc import crc16
 from hil.drivers.control_table import Register
 from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction, Packet
 from hil.drivers.port import Port
-from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
+from hil.drivers.read_back import REMEMBERED, TRY_AGAIN_S, Overruled, ReadBack
+from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
 
 HOST_S = 0.75e-3
 """Time allowed for the computer itself, including USB frames, on top of wire, servos and adapter [s]."""
@@ -36,29 +36,6 @@ MOST_PATIENCE_S = 0.02
 """Upper limit of the minimum reply timeout [s]: in slow cycles too, a silent servo must not delay the others."""
 
 _NEVER = 1 << 62
-_READ_BACK_S = 0.015
-"""Mean time between two read-backs [s]."""
-
-_GOALS_PER_MODE = 2
-"""Largest number of read-backs of goals between two of modes.
-
-Number and times are drawn, because a regular pattern might never see a program that overwrites every other goal.
-"""
-
-_REMEMBERED = 4
-"""Number of latest goals that a servo may still hold if writes are lost; more are a matter of the status."""
-
-_GOAL_SIGHTINGS, _MODE_SIGHTINGS, _SIGHTED_S = 3, 2, 0.5
-"""Read-backs of a foreign goal or mode that prove another writer, and the time within which they must be made [s].
-
-With three, goals that are lost are noticed first, by the status.
-"""
-
-_TRY_AGAIN_S = 0.005
-_FADES = 0.98
-_IN_DOUBT_S = 0.1
-"""Time after a sighting during which every cycle is followed by a read-back [s]."""
-
 _DOUBTS = 3
 _PART_OF_A_REPLY = 8  # bytes; the header of a fast answer whose first servos were heard
 
@@ -81,15 +58,6 @@ class Reply(NamedTuple):
 
 
 _reply = partial(tuple.__new__, Reply)  # half the time of Reply(...)
-
-
-class Overruled(NamedTuple):
-    """A servo (by its place among the IDs) that holds a goal or an operating mode that this program did not write."""
-
-    place: int
-    register: str
-    value: int
-    written: int
 
 
 class Exchange:
@@ -155,9 +123,9 @@ class Exchange:
         self._slow = 0
         self._lost = 0
         self._late_possible = False
-        self._sent: deque[Sequence[int]] = deque(maxlen=_REMEMBERED)
+        self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
         self._lasted = math.inf
-        self._read_back: _ReadBack | None = None
+        self._read_back: ReadBack | None = None
         self.read_back_at = math.inf
         """When `overruled` should be called again, before the next cycle [s on the port's clock]."""
 
@@ -186,7 +154,7 @@ class Exchange:
 
     def add_read_back(self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[int]) -> None:
         """Prepare `overruled`. goal, mode: spans that end with the goal, and with Operating Mode. modes: those set."""
-        self._read_back = _ReadBack(self.ids, goal, mode, modes, fast=self.fast)
+        self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
         self._expected = self._expected.union(*(read.expected for read in self._read_back.reads))
         self.read_back_at = -math.inf
 
@@ -211,12 +179,12 @@ class Exchange:
         takes = max(self._lasted - port.wire_time(self._bytes(self._reads[0]) - self._bytes(read)), back.longest)
         if now + takes > due or self._late_possible:
             back.took(0.0)  # a single long one, while this computer was busy, must not be the last
-            self.read_back_at = now + _TRY_AGAIN_S
+            self.read_back_at = now + TRY_AGAIN_S
             return None
         port.clock.wait_until(due - takes - HOST_S)
         before = self._now()
         if before + takes > due:  # woken up late
-            self.read_back_at = before + _TRY_AGAIN_S
+            self.read_back_at = before + TRY_AGAIN_S
             return None
         received = port.ask(read.request, asked, due - before, before)
         received = received.removeprefix(read.request)
@@ -359,71 +327,6 @@ class Exchange:
 
     def _bytes(self, read: GroupRead) -> int:
         return sum(write.size for write in (self._write, *self._more_writes)) + len(read.request) + read.reply_size
-
-
-class _ReadBack:
-    """Looks in turn at the goals and at the operating modes that the servos hold right before a cycle."""
-
-    def __init__(
-        self,
-        ids: Sequence[int],
-        goal: Span | Sequence[Span],
-        mode: Span | Sequence[Span],
-        modes: Sequence[int],
-        *,
-        fast: bool,
-    ) -> None:
-        kind = FastSyncRead if fast else SyncRead
-        self.reads: tuple[GroupRead, GroupRead] = kind(ids, goal), kind(ids, mode)
-        self.due = -math.inf
-        self.longest = 0.0
-        """Duration of the longest read-back, which fades from memory [s]."""
-        self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
-        self._modes = tuple(modes)
-        self._is_of_modes = True
-        self._until_mode = 0
-        self._draw = Random(1)
-        self._goals_sighted: list[deque[float]] = [deque() for _ in ids]
-        self._modes_sighted: list[deque[float]] = [deque() for _ in ids]
-        self.doubts_until = -math.inf
-
-    @property
-    def read(self) -> GroupRead:
-        """The next group read."""
-        return self.reads[self._is_of_modes]
-
-    def took(self, seconds: float) -> None:
-        self.longest = max(_FADES * self.longest, seconds)
-
-    def look(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float) -> Overruled | None:
-        """Compare the answers with what was written; return what only another master can have written."""
-        # A servo that was given its neighbour's goal is not one that another master commands.
-        own = {tick for goals in sent for tick in goals}
-        of_modes = self._is_of_modes
-        is_nearly_sure = False
-        for place, answer in enumerate(servos):
-            if answer is None or len(answer) == 1:
-                continue
-            value = answer[-1]
-            if value == self._modes[place] if of_modes else value in own:
-                continue
-            times = (self._modes_sighted if of_modes else self._goals_sighted)[place]
-            while times and now - times[0] > _SIGHTED_S:
-                times.popleft()
-            times.append(now)
-            most = _MODE_SIGHTINGS if of_modes else _GOAL_SIGHTINGS
-            if len(times) >= most:
-                if of_modes:
-                    return Overruled(place, "Operating Mode", value, self._modes[place])
-                return Overruled(place, self._goals[place], value, sent[-1][place])
-            self.doubts_until = now + _IN_DOUBT_S
-            is_nearly_sure |= len(times) == most - 1
-        # A change of mode resets the goal, so a foreign goal may be the first that is seen of it.
-        if not is_nearly_sure:
-            self._until_mode = self._draw.randint(1, _GOALS_PER_MODE) if of_modes else self._until_mode - 1
-            self._is_of_modes = self._until_mode == 0
-        self.due = now if now < self.doubts_until else now + _READ_BACK_S * self._draw.uniform(0.5, 1.5)
-        return None
 
 
 class _GoalWrite:

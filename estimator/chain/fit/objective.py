@@ -161,14 +161,8 @@ class ChainProblem:
 
     def cost(self, x: Array) -> float:
         """Return the sum of squares at `x` alone; infinite if the motion diverges."""
-        nothing = np.zeros((x.size, x.size))
-        total = self._add_prior(x, nothing, nothing[0])
-        parameters = self.parameters(x)
-        for index, (period, weight) in enumerate(zip(self.periods, self.weights, strict=True)):
-            run = self.run_of(period, parameters)
-            moved = self._of_period(index, parameters)
-            simulation = Simulation(self.model.base, moved, self.start(x, index), self.gain(period))
-            position, _ = simulation.go_on(run, slice(0, len(run.measured)))
+        total = self._add_prior(x, np.zeros((x.size, x.size)), np.zeros(x.size))
+        for (run, position), weight in zip(self._motions(x), self.weights, strict=True):
             if position is None:
                 return np.inf
             total += float(np.nansum(np.square(weight[:: self.every][: len(position)] * (position - run.measured))))
@@ -176,17 +170,21 @@ class ChainProblem:
 
     def positions(self, x: Array) -> tuple[Array, ...] | None:
         """Return the predicted positions of each period (joints, samples) [rad]; None if a motion diverges."""
-        parameters = self.parameters(x)
         found = []
-        for index, period in enumerate(self.periods):
-            run = self.run_of(period, parameters)
-            moved = self._of_period(index, parameters)
-            simulation = Simulation(self.model.base, moved, self.start(x, index), self.gain(period))
-            position, _ = simulation.go_on(run, slice(0, period.samples))
+        for _, position in self._motions(x):
             if position is None:
                 return None
             found.append(position.T)
         return tuple(found)
+
+    def _motions(self, x: Array) -> Iterator[tuple[ChainRun, Array | None]]:
+        """Yield each period's run and its simulated positions (samples, joints) [rad], None if they diverge."""
+        parameters = self.parameters(x)
+        for index, period in enumerate(self.periods):
+            run = self.run_of(period, parameters)
+            moved = self._of_period(index, parameters)
+            simulation = Simulation(self.model.base, moved, self.start(x, index), self.gain(period))
+            yield run, simulation.go_on(run, slice(0, len(run.measured)))[0]
 
     def scatter(self, x: Array, lags: int) -> Array:
         """Return the sum of products of the scores, in coordinates; see `hil.estimator.fit.covariance`."""
