@@ -4,7 +4,7 @@ import functools
 import operator
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from hil.drivers.control_table import ControlTable
 from hil.drivers.exchange import Reply
@@ -161,11 +161,13 @@ class Converter:
         before, after, span, servos = reply
         sent = tuple(map(operator.mul, self._drive_units, ticks))
         try:
-            if span == 0:  # most cycles: every servo answers with its ERR byte and the three values that are always read
+            if span == 0:
+                # Most cycles: each servo answers with its ERR byte and the three values that are always read.
+                answers = cast("Sequence[tuple[int, int, int, int]]", servos)
                 values = [
                     (raw_drive * drive, raw_velocity * velocity, (raw_position - zero) * position, error)
                     for (error, raw_drive, raw_velocity, raw_position), (drive, velocity, position, zero) in zip(
-                        servos, self._scales, strict=True
+                        answers, self._scales, strict=True
                     )
                 ]
                 return _state((before, after, sent, *zip(*values, strict=True), self._none_missing, None, None, None))

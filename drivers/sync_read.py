@@ -197,14 +197,16 @@ class FastSyncRead:
     def unpack(self, received: bytes) -> list[Answer] | None:
         if len(received) != self.reply_size or not received.startswith(self._front):
             return None
-        if received[_FAST_ID :: self._part] != self._id_bytes or _crc(received[:-2]) != received[-2] | received[-1] << 8:
+        if (
+            received[_FAST_ID :: self._part] != self._id_bytes
+            or _crc(received[:-2]) != received[-2] | received[-1] << 8
+        ):
             return None
         fields, width = self._whole.unpack(received), self._width
-        answers: list[Answer] = [fields[at : at + width] for at in range(0, len(fields), width)]
-        for answer in answers:
-            if answer[0] & _ERROR_BITS:
+        for error in fields[::width]:
+            if error & _ERROR_BITS:
                 return None
-        return answers
+        return [fields[at : at + width] for at in range(0, len(fields), width)]
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
         at = received.find(self._front)
