@@ -36,7 +36,7 @@ class ChainEstimate(FittedParameters):
     position: Array
     """One-step-ahead prediction of the first period (joints, samples) [rad]."""
     positions: tuple[Array, ...]
-    """The same of each period."""
+    """The same for each period."""
     iterations: int
     outliers: int
     white_std: Array

@@ -1,4 +1,4 @@
-"""Chains estimated from recordings of any motion: no settled period, any experiment.
+"""Chains estimated from recordings of arbitrary motion, from any experiment: no settled period is needed.
 
 Stage 1 is filtered inverse dynamics. Stage 2 is the same likelihood as for settled periods: its observer needs no
 periodic motion, only torque that was commanded. A measured torque already responds to the motion, so a simulation
@@ -63,7 +63,7 @@ class MotionPiece(SettledPeriod):
 
 @dataclass(frozen=True)
 class RecordedChain:
-    """Parameters of a chain estimated from recordings of any motion."""
+    """Parameters of a chain estimated from recordings of arbitrary motion."""
 
     model: ChainModel
     names: tuple[str, ...]
@@ -98,7 +98,7 @@ class RecordedChain:
 
 @one_blas_thread
 def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> RecordedChain:
-    """Estimate the parameters of `model` from recordings of any motion.
+    """Estimate the parameters of `model` from recordings of arbitrary motion.
 
     Raises ModelError for other numbers of joints, RecordingError if a recording cannot be filtered, ConvergenceError if
     no minimum is found.
@@ -164,7 +164,7 @@ def _regression(recordings: Sequence[Recording], model: ChainModel, prior: Prior
 
 
 def _repeated(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> float:
-    """Return the factor by which correlation of the torque residual widens the variance of the parameters.
+    """Return the factor by which correlation of the torque residual increases the variance of the parameters.
 
     The sum of the autocorrelation up to its first negative value, of the worst joint. Errors of the regressor itself
     are not included.

@@ -7,7 +7,7 @@ windows of L samples, of the window's score times itself, divided by L: one pass
 
 A model error is not only correlated: it repeats at every reversal, so averaging does not remove it, and the part that
 resembles a parameter leaves no residual at all. Therefore the non-white part of the residual widens the errors further:
-1.4 standard deviations reach as far as the parameters can move before the motion changes (RMS) by as much as that part
+1.4 standard deviations cover every change of the parameters that alters the motion (RMS) by no more than that part
 (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
 """
 

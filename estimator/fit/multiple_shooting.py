@@ -98,7 +98,7 @@ class Shooting:
     ) -> None:
         """Cut the recordings into segments.
 
-        most: maximum number of segments, evenly chosen; by default all. step: longest integration step [s].
+        most: maximum number of segments, evenly spread; by default all. step: longest integration step [s].
         """
         self._options = options
         self._recordings = recordings

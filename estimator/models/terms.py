@@ -269,7 +269,7 @@ _DECLARED = (
     Term(
         "back_emf",
         "1",
-        "share of viscous friction due to back-EMF, which passes the drive's lag like the voltage",
+        "share of viscous friction due to back-EMF, which is subject to the drive's lag like the voltage",
         part="voltage",
         initial=0.92,
         log_spread=0.08,

@@ -128,7 +128,7 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence,
     left = validation.residual_over_floor
     joint = int(np.argmax(left))
     error = float(validation.levels.model_error.max())
-    moves = "is not explained to the last step" if trust == "yes" else "moves in a way that the model cannot explain"
+    moves = "is not fully explained" if trust == "yes" else "moves in a way that the model cannot explain"
     subject = f"The motion of joint {joint + 1}" if trust == "yes" else f"Joint {joint + 1}"
     said = (
         f"{subject} {moves}: its residual is {left[joint]:.1f} times the noise, a model error of {error:.2g} encoder "

@@ -30,7 +30,7 @@ class AmplitudeOptions:
     max_rounds: int = 12
     """Maximum number of iterations of the search, and of reductions after it."""
     max_polishing_rounds: int = 4
-    """Maximum number of final raises of single joints."""
+    """Maximum number of final torque increases, one joint at a time."""
     close: float = 0.94
     """Fraction of the limits, at the required probability, at which they count as reached."""
     over: float = 0.97
@@ -43,7 +43,7 @@ class AmplitudeOptions:
     """Factor on the exponent of each further correction."""
     min_exponent: float = 0.4
     polishing_ratio: float = 1.06
-    """Ratio of torques of a final raise."""
+    """Ratio by which such an increase raises the torque."""
     back_off: float = 0.93
     """Ratio of torques after the check on all arms has failed."""
     torque_share: float = 0.97

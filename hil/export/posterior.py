@@ -80,7 +80,8 @@ def draw_arms(source: Source, samples: int, seed: int = 1, *, torque_constants: 
 def export_samples(
     run: Path, formats: Sequence[str], out: Path, samples: int, seed: int = 1, link_length: float | None = None
 ) -> Drawn:
-    """Draw arms and write them to the folder `out`: arm_0000.xml or .urdf and so on, and arms.parquet.
+    """Draw arms from the posterior and write them to the folder `out`: arm_0000.xml or .urdf and so on, and
+    arms.parquet.
 
     Raises ExportError, ResultError, RunFolderError.
     """

@@ -49,7 +49,7 @@ class PilotOptions:
     worthwhile_raise_far: float = 1.03
     """The same if more of the range is unused."""
     fair_share: float = 0.7
-    """Fraction of a limit reached by a typical arm that separates the two."""
+    """Fraction of a limit, reached by a typical arm, above which little of the range counts as unused."""
 
     wide_range: float = 0.74
     """Fraction of the position range, of the joint that uses least, below which other waves are tried."""
@@ -57,7 +57,7 @@ class PilotOptions:
     """Maximum number of other waves: either sign of each joint, and all of these reversed in time."""
 
     falling_raise: float = 1.35
-    """Maximum ratio of the torques of two runs of an arm that falls over when it is stopped."""
+    """Maximum ratio of the torques of successive runs of an arm that falls over when it is stopped."""
     falling_breakaway_raise: float = 1.2
     """Ratio of successive peak torques of a joint of such an arm that has not moved yet."""
     falling_share: float = 0.85

@@ -223,7 +223,8 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """Of `found` and, if it leaves much of the range unused, of other waves, the amplitude that leaves least.
+        """`found`; if it leaves much of the range unused, the best amplitude among other waves too, whichever leaves
+        least.
 
         Slightly more torque may tip some of the arms over: with other waves that happens at larger amplitudes, or to
         the other side.

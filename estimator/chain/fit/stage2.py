@@ -91,8 +91,8 @@ MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 NEARER, LAST = MinimiserOptions(max_damping=0.1), MinimiserOptions(max_damping=1.0)
 """Options of the last iterations with coarse steps, which fine ones follow, and with fine steps.
 
-Where a joint is on the verge of sticking, the sum of squares has small steps. A decrease that is only achieved with
-heavy damping is such a step and is not pursued.
+Where a joint is on the verge of sticking, the sum of squares is slightly discontinuous. A decrease that is only
+achieved with heavy damping is such a discontinuity and is not pursued.
 """
 
 
@@ -162,8 +162,8 @@ def fit_periods(
     )
     last = replace(sticking, weights=weights, steps=problem.steps, finer=options.finest, reach=options.reach)
     damped = last.minimise(nearer.x, options.ftol, options=LAST)
-    # Damping holds back poorly determined coordinates, so it is removed now. Without it from the beginning, many
-    # coordinates would reach their step limits and hold up the others.
+    # Damping holds back poorly determined coordinates, so it is removed now. Had it been absent from the beginning,
+    # many coordinates would reach their step limits and hold up the others.
     minimum = damped
     if not damped.stalled:
         minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
@@ -181,9 +181,9 @@ def fit_periods(
 
 
 def _remaining(minimum: Minimum) -> tuple[Array, float]:
-    """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations foresee.
+    """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations predict.
 
-    Where the sum of squares has small steps, all damped steps may fail although the gradient is not zero.
+    Where the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
     """
     at = minimum.at
     scale = np.sqrt(np.maximum(np.diag(at.normal), 1e-300))
@@ -227,7 +227,7 @@ def _softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Ar
 
 
 def _tempered(problem: ChainProblem, x: Array) -> ChainProblem:
-    """Return the problem with a prior that counts as much more as the residual at `x` exceeds the assumed noise."""
+    """Return the problem with the prior's weight raised by as much as the residual at `x` exceeds the assumed noise."""
     samples = sum(np.count_nonzero(weight[:: problem.every]) for weight in problem.weights)
     return replace(problem, prior_weight=max(1.0, replace(problem, prior_weight=0.0).cost(x) / samples))
 

@@ -19,7 +19,7 @@ WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
 
 @dataclass(frozen=True)
 class Doubts:
-    """Sentences. faults: the estimate is unusable; doubts: it may be wrong; warnings: worth knowing."""
+    """Findings, as sentences. faults: the estimate is unusable; doubts: it may be wrong; warnings: worth knowing."""
 
     faults: tuple[str, ...]
     doubts: tuple[str, ...]
