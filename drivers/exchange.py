@@ -153,7 +153,9 @@ class Exchange:
             self._until_status = min(self._until_status, 1)
 
     def add_read_back(self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[int]) -> None:
-        """Prepare `overruled`. goal, mode: spans that end with the goal, and with Operating Mode. modes: those set."""
+        """Prepare `overruled`. goal, mode: spans that end with the goal, or Operating Mode. modes: the modes that were
+        set.
+        """
         self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
         self._expected = self._expected.union(*(read.expected for read in self._read_back.reads))
         self.read_back_at = -math.inf
@@ -298,7 +300,9 @@ class Exchange:
             self.strangers += sum(self._is_strange(packet) for packet in packets)
 
     def _is_strange(self, packet: Packet) -> bool:
-        """Whether this is another master's instruction, or the answer to one. A refusal has no data."""
+        """Whether this is another master's instruction or a reply to one. A reply without data, such as an error, may
+        be ours.
+        """
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected

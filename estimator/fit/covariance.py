@@ -157,9 +157,8 @@ def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: fl
 def _measured(
     at: Quadratic, scatter: Array | None, samples: int, structured: float, prior: Array
 ) -> tuple[Mask, Array, Array, Array]:
-    """Return the covariances from the data alone: for independent errors, and the robust one.
-
-    Both are of the coordinates that influence the residual, which are the first result, and relative to the second.
+    """Return covariances from the data alone: which coordinates they cover, their scale, for independent errors,
+    robust.  They cover the coordinates that influence the residual and are relative to the scale.
     """
     norm = np.sqrt(np.diag(at.normal))
     seen: Mask = norm > 1e-12 * norm.max()

@@ -48,7 +48,7 @@ class Refined:
 
 @dataclass(frozen=True)
 class Search:
-    """The search for one set of periods."""
+    """The search for the most likely parameters for one set of periods."""
 
     periods: Sequence[SettledPeriod]
     fine: Objective

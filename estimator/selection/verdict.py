@@ -62,7 +62,9 @@ class Evidence:
     Where friction has changed since the fitted motion, with one factor per joint taken from the held-out motion itself.
     """
     held_out_as_fitted: Array | None = None
-    """The same with friction as it was in the fitted motion (joints,); None where it has not changed."""
+    """RMS error of that prediction with friction as it was in the fitted motion (joints,); None where it has not
+    changed.
+    """
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""
     drift: Drift | None = None

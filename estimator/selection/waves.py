@@ -26,8 +26,9 @@ def wave_peaks(
 ) -> dict[str, tuple[float, ...]]:
     """Return the numbers of `cycles` per turn at which a wave explains more than at neighbouring ones, best first.
 
-    What the fitted parameters explain is removed first. The result is by parameter name. Waves that the estimate's
-    model includes are left out where they are sought. While other terms have absorbed part of a wave, the best number
+    What the fitted parameters explain is removed first. The result is by parameter name. If the estimate's model
+    includes a wave that is sought, that wave is disabled first. While other terms have absorbed part of a wave, the
+    best number
     may be a wrong one: those that explain at least `COMPARABLE` of what it does are returned as well.
 
     only: joints, from 1, that are considered; by default all.

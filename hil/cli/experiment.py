@@ -41,7 +41,7 @@ Recordings = Annotated[
 ]
 ArmPath = Annotated[
     Path | None,
-    typer.Option("--config", metavar="ARM.toml", help="For recordings: its [columns] table describes them."),
+    typer.Option("--config", metavar="ARM.toml", help="TOML file whose [columns] table describes the recordings."),
 ]
 AllSamples = Annotated[
     bool, typer.Option("--all-samples", help="Use every sample, by multiple shooting; no settled period is needed.")

@@ -157,7 +157,7 @@ class _Tree:
         body = int(self.model.jnt_bodyid[found[0]])
         if self.model.body_jntnum[body] != 1:
             raise ArmFileError(
-                f'{self.path}: body "{self.name(body)}" has several joints: give each its own body, without mass'
+                f'{self.path}: body "{self.name(body)}" has several joints: give each a body of its own (without mass)'
             )
         return body
 

@@ -34,13 +34,13 @@ class AmplitudeOptions:
     close: float = 0.94
     """Fraction of the limits, at the required probability, at which they count as reached."""
     over: float = 0.97
-    """Fraction of the limits that an iteration aims at if the last torque was too large."""
+    """Fraction of the limits that the next iteration aims at if the last torque exceeded them."""
     under: float = 0.99
-    """The same if it was too small."""
+    """Fraction of the limits that the next iteration aims at if the last torque did not reach them."""
     max_ratio: float = 2.0
     """Maximum ratio of the torques of two iterations."""
     damping: float = 0.85
-    """Factor on the exponent of each further correction."""
+    """Factor by which the exponent of the corrections decreases from one iteration to the next."""
     min_exponent: float = 0.4
     polishing_ratio: float = 1.06
     """Ratio by which such an increase raises the torque."""

@@ -210,8 +210,8 @@ class Stream:
             return "Check for backlash, a dragging cable or a slipping joint; or raise max_settling_periods."
         seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
         return (
-            f"The change falls slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), as "
-            f"while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
+            f"The change decreases slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), "
+            f"as while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:

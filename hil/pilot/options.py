@@ -20,7 +20,7 @@ class PilotOptions:
     certain_share: float = 0.85
     """Fraction of a limit that a typical arm should reach; below it, uncertainty wastes too much of the range."""
     certain_share_known: float = 0.72
-    """The same if the belief comes from an earlier result: another run would hardly narrow it."""
+    """That fraction if the belief comes from an earlier result, whose uncertainty another run would hardly reduce."""
 
     pilot_period_share: float = 0.5
     """Period of a pilot, relative to experiment.period."""
@@ -41,13 +41,15 @@ class PilotOptions:
     torque_after_limit: float = 0.85
     """Cap on further torque, relative to the torque at which a limit was exceeded."""
     torque_after_unsettled: float = 0.85
-    """The same after a run that never settled: large motion with little friction may never settle."""
+    """Cap on further torque after a run that never settled, as a large motion with little friction may, relative to its
+    torque.
+    """
     torque_over_friction: float = 1.8
     """Ratio of a joint's torque to its Coulomb friction up to which a run that never settled does not lower it."""
     worthwhile_raise: float = 1.15
     """Minimum ratio of torques that justifies another run if little of the range is unused."""
     worthwhile_raise_far: float = 1.03
-    """The same if more of the range is unused."""
+    """Minimum ratio of torques that justifies another run if more of the range is unused."""
     fair_share: float = 0.7
     """Fraction of a limit, reached by a typical arm, above which little of the range counts as unused."""
 

@@ -105,9 +105,8 @@ class ChainCoordinates:
 
     @cached_property
     def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices of the parameters with their own prior: friction shapes and small angles.
-
-        With their typical coordinates and the standard deviations of these.
+        """Indices of the parameters with their own prior (friction shapes, small angles), their prior means and
+        standard deviations.
         """
         found = [
             (i, np.log(SHAPES[kind][0]), SHAPES[kind][1]) if kind in SHAPES else (i, 0.0, ANGLES[kind] / SMALL[kind])

@@ -55,7 +55,7 @@ class ChainOptions:
     finer: int = 16
     """Number of smaller steps that replace one near standstill, where friction changes fast."""
     finest: int = 64
-    """The same number in the last iterations."""
+    """Number of smaller steps that replace one near standstill in the last iterations."""
     widths_per_substep: float = CoordinateOptions.widths_per_substep
     width_floor: float = 3e-4
     """Minimum width of every Coulomb step [rad/s]: hardly distinguishable from friction that truly sticks."""

@@ -108,9 +108,9 @@ def _undetermined(result: SettledResult) -> list[str]:
 
 
 def _may_be_absent(name: str, entry: Quantity) -> bool:
-    """Whether a term's distance from no effect is below its standard error."""
+    """Whether a term differs from the value without any effect by less than its standard error."""
     kind = kind_of(name)
-    if kind == "stribeck_velocity":  # no value of the velocity means no effect
+    if kind == "stribeck_velocity":  # a term without effect has no Stribeck velocity
         return entry.std > abs(entry.value)
     return kind in TERMS and not abs(entry.value - term_of(name).absent) > entry.std
 
