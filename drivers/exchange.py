@@ -259,7 +259,9 @@ class Exchange:
         return read.unpack(received) or self._search(read, received, deadline)
 
     def _other_span(self, between: bool) -> int:
-        """Choose the span for a cycle that does not simply read the first: after a loss, a slow span, or the status."""
+        """Choose the span for a cycle that does not read the usual one: a different one after a loss, a slow one, the
+        status.
+        """
         if self._late_possible:
             self._late_possible = False
             if self._port.has_input():

@@ -33,7 +33,7 @@ TRY_AGAIN_S = 0.005
 
 _FADES = 0.98
 _IN_DOUBT_S = 0.1
-"""Time after a sighting during which every cycle is followed by a read-back [s]."""
+"""Time after a foreign value was read, during which every cycle is followed by a read-back [s]."""
 
 
 class Overruled(NamedTuple):

@@ -100,8 +100,8 @@ class RecordedChain:
 def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> RecordedChain:
     """Estimate the parameters of `model` from recordings of arbitrary motion.
 
-    Raises ModelError for other numbers of joints, RecordingError if a recording cannot be filtered, ConvergenceError if
-    no minimum is found.
+    Raises ModelError if the numbers of joints differ, RecordingError if a recording cannot be filtered,
+    ConvergenceError if no minimum is found.
     """
     for recording in recordings:
         if recording.joints != model.joints:

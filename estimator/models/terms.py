@@ -89,7 +89,7 @@ class Term:
     """
     scope: Scope = "joint"
     first_joint: int = 1
-    """First joint that has this term: 2 for terms relative to joint 1 or included in its other terms."""
+    """First joint that has this term: 2 if it is relative to joint 1, or if joint 1's is part of another term."""
     range: Range = "positive"
     """Range of values.
 

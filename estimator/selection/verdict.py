@@ -160,7 +160,7 @@ def _in_words(part: str) -> str:
 
 
 def _spoilt(validation: Validation, trust: Trust) -> str:
-    """Return which parameters the model error may have biased, judged by their widened errors."""
+    """Return which parameters the model error may have biased, judged by their inflated standard errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst and trust == "no":
         return "It may bias all parameters, whatever their standard errors say."

@@ -153,7 +153,7 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
     if run.shapes_guessed:
         lines.append(
             f"No collision geometry could be read for {', '.join(run.shapes_guessed)}: replaced by capsules from joint "
-            "to joint (a base: by nothing)."
+            "to joint (a base is left out)."
         )
     if run.as_built:
         pairs = ", ".join(f"{a} and {b}" for a, b in run.as_built)

@@ -37,7 +37,7 @@ _POSES = 20
 """Poses in which the mass matrix of a drawn spatial arm must be positive definite."""
 
 _IN_TORQUE = ("N m", "kg m^2")
-"""Parameters whose units start like this scale with the torque constant."""
+"""Beginnings of the units of parameters that scale with the torque constant."""
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,7 @@ def _undetermined(result: SettledResult) -> list[str]:
 
 
 def _may_be_absent(name: str, entry: Quantity) -> bool:
-    """Whether a term differs from the value without any effect by less than its standard error."""
+    """Whether a term is within one standard error of having no effect."""
     kind = kind_of(name)
     if kind == "stribeck_velocity":  # a term without effect has no Stribeck velocity
         return entry.std > abs(entry.value)

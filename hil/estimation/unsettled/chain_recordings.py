@@ -33,8 +33,8 @@ UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "ca
 
 @dataclass(frozen=True)
 class ChainEstimated:
-    """result: lacks what the caller adds. predicted: positions per recording (joints, samples) [rad]; NaN: no
-    prediction.
+    """result: complete except for what the caller adds. predicted: positions per recording (joints, samples) [rad];
+    NaN: no prediction.
     """
 
     result: ShootingResult
@@ -116,7 +116,7 @@ def _described(config: RecordingConfig, joints: int) -> ArmDescription:
 
 
 def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> Array | None:
-    """Return the relative torque error on the last part, of parameters from the rest; None if a part is too short."""
+    """Return the relative torque error on the last part, with parameters from the rest; None if a part is too short."""
     try:
         first = [_part(each, 0.0, FITTED_SHARE) for each in recordings]
         last = [_part(each, FITTED_SHARE, 1.0) for each in recordings]

@@ -37,8 +37,8 @@ NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 
 @dataclass(frozen=True)
 class Estimated:
-    """result: lacks what the caller adds. predicted: positions per recording (joints, samples) [rad]; NaN: no
-    prediction.
+    """result: complete except for what the caller adds. predicted: positions per recording (joints, samples) [rad];
+    NaN: no prediction.
     """
 
     result: ShootingResult

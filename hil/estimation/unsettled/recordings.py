@@ -1,4 +1,4 @@
-"""From other tools' files to a folder with a result, like that of a run."""
+"""Estimates from other tools' files, whose results are in folders like those of runs."""
 
 import json
 import re
