@@ -210,7 +210,8 @@ class CalibrationOptions:
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)
     minimiser: MinimiserOptions = MinimiserOptions()
     initial_width: float = 0.005
-    """Initial width of the smoothed Coulomb step [rad/s]; that of an estimate with wrong torque constants is of no use.
+    """Initial width of the smoothed Coulomb step [rad/s]; that of an estimate with wrong torque constants is
+    misleading.
     """
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""

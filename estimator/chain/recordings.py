@@ -187,7 +187,7 @@ def _torque_residual(recordings: Sequence[Recording], model: ChainModel, value: 
 
 
 def _beginning(piece: MotionPiece) -> PeriodicMotion:
-    """Return the motion, with velocities from smoothed angles; only its beginning and its level matter."""
+    """Return the motion, with velocities from smoothed angles; only those at its beginning and their RMS matter."""
     position = piece.filled()
     kernel = np.ones(VELOCITY_SAMPLES) / VELOCITY_SAMPLES
     padded = np.pad(position, ((0, 0), (VELOCITY_SAMPLES // 2,) * 2), mode="edge")

@@ -52,7 +52,9 @@ class Design:
 
 
 def smoothed(physics: Physics) -> Physics:
-    """Return the same arm with friction steps at least LEAST_WIDTH wide: simulates faster, nearly the same optimum."""
+    """Return the same arm with friction steps at least LEAST_WIDTH wide, which simulates faster and has nearly the same
+    optimum.
+    """
     vector = physics.vector.copy()
     for joint in (1, 2):
         index = CONSTANTS.index(f"coulomb_width_{joint}")

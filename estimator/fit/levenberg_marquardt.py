@@ -115,7 +115,7 @@ def step_limits(x: Array, options: MinimiserOptions) -> tuple[Array, Array]:
 
 @dataclass
 class _Trials:
-    """Damped steps from one point; `evaluations` counts the normal equations that they took."""
+    """Damped steps from one point; `evaluations` counts how often normal equations were computed for them."""
 
     x: Array
     at: Quadratic

@@ -99,7 +99,7 @@ class MomentumObserver:
         )  # compiles the loop and initialises the memory
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:
-        """Process one sample; return the joint (from 0) whose motion no arm explains, or -1.
+        """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1.
 
         position: angles [rad]. velocity: velocities [rad/s]. torque: torques commanded since the previous sample [N m].
         seconds: time since the previous sample [s].

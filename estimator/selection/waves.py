@@ -14,7 +14,7 @@ from hil.estimator.selection.candidates import columns_of, simulated_run
 
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 COMPARABLE = 0.3
-"""Decrease of the sum of squares, relative to the best number's, at which another number of cycles is worth a fit."""
+"""Other numbers of cycles are tried too if they decrease the sum of squares by this fraction of what the best does."""
 
 
 def wave_peaks(

@@ -45,7 +45,7 @@ class AmplitudeOptions:
     polishing_ratio: float = 1.06
     """Ratio by which such an increase raises the torque."""
     back_off: float = 0.93
-    """Ratio of torques after the check on all arms has failed."""
+    """Factor on the torque when the check on all arms has failed."""
     torque_share: float = 0.97
     """Fraction of the current limit that may be used, since clamping would distort the designed wave."""
     initial_share: float = 0.125

@@ -243,7 +243,7 @@ class Guard:
         self._stop(
             index,
             Cause.NOT_FOLLOWING,
-            f"carries {state.current[index]:.3f} where {state.goal_current[index]:.3f} is commanded, for "
+            f"carries {state.current[index]:.3f} instead of the commanded {state.goal_current[index]:.3f}, for "
             f"{1e3 * self._joints[index]['found']:.0f} ms. Its torque is off, it was rebooted, its watchdog acted, or "
             "it cannot deliver this much at its speed and supply voltage (safety.follow_share).",
         )

@@ -324,7 +324,7 @@ class Stream:
                 yield state
 
     def _look_for_another_master(self, later: float) -> None:
-        """If it is time, read back what the servos hold just before the exchange due `later` than the sample [s]."""
+        """If a read-back is due, do it just before the exchange that is due `later` [s] after the sample."""
         deadline = self._deadline
         if deadline is not None and self._exchange.read_back_at <= deadline + later:
             self._bus.check_not_overruled(deadline + later)
@@ -371,7 +371,7 @@ class Stream:
         self._told(error, f"The arm {done}.")
 
     def _way_down(self, lowering: Lowering, state: State) -> State:
-        """The last state; raises SafetyStop, StopRequested, DriverError."""
+        """Follow the path home; return the last state. Raises SafetyStop, StopRequested, DriverError."""
         asked = max(1, self._stop.count)
         for index in range(lowering.begin(state, self._goal)):
             for checked in self._between_samples() if index else ():

@@ -39,7 +39,7 @@ class Search:
     belief: Belief
     steps: list[Step] = field(default_factory=list)
     cap: Array | None = None
-    """Torque (joints,) [N m] that must not be exceeded, because a limit was."""
+    """Torque (joints,) [N m] that must not be exceeded, because an earlier run exceeded a limit."""
     pose: Array | None = None
     """Last rest position of the arm (joints,) [rad]."""
     swing: Array | None = None

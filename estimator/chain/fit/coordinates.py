@@ -65,7 +65,7 @@ class ChainCoordinates:
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
-        """Return the point reached by `step` from `x`; other coordinates may follow both.
+        """Return the point reached by `step` from `x`; both may be followed by other coordinates.
 
         If a recording hardly determines the torque of some joints relative to that of the first, their torque scales
         and all parameters of their links change by a common factor. The scales are exponential. Unless the

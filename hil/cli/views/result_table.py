@@ -54,7 +54,7 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
         print("Regression on the measured torque: no motion was simulated, so there is no position residual.")
     if result.model_choice is not None:
         choice = result.model_choice
-        times = f"error {choice.error_divided_by:.3g} times smaller than with the plainest model"
+        times = f"error {choice.error_divided_by:.3g} times smaller than with the simplest model"
         print(f"Chosen on held-out segments: {choice.chosen}, {times}.")
     if result.physical is not None:
         print("\n".join(physical_lines(result.physical)))
