@@ -17,7 +17,8 @@ NAN = float("nan")
 
 
 class Slow(NamedTuple):
-    """Values that are read in turn, a few times a second; NaN if not read in this cycle, or if the servo did not reply.
+    """Values that are read alternately, a few times a second; NaN if not read in this cycle, or if the servo did not
+    reply.
 
     tick: the servo's own clock [s], which wraps at 32.768 s. voltage: supply [V]. temperature: [degrees C].
     """

@@ -41,7 +41,9 @@ class Span:
         spans = {cls._in(table, registers) for table in tables}
         if len(spans) != 1:
             models = ", ".join(sorted({table.model for table in tables}))
-            raise ValueError(f"{models} do not have {', '.join(registers)} at the same addresses: no common Sync Read.")
+            raise ValueError(
+                f"{models} do not have {', '.join(registers)} at the same addresses: they need separate reads."
+            )
         return spans.pop()
 
     @classmethod

@@ -54,7 +54,7 @@ class CoordinateOptions:
     width_floor: float
     """Lower bound of the width of every smoothed Coulomb step [rad/s]."""
     widths_per_substep: float = 2.0
-    """Widths of the Coulomb step through which reversed friction may move a joint within the shortest substep.
+    """Number of Coulomb step widths through which a reversal of friction may take a joint in the shortest substep.
 
     Beyond about ten, the simulation jumps back and forth across the step: its motion hardly changes, but its
     derivatives grow without limit.
@@ -120,7 +120,7 @@ class LikelihoodOptions:
     least_inflation: float = 2.0
     """Factor by which the data's variance must exceed that of independent errors for priors to be given more weight."""
     least_tempering: float = 1e-4
-    """Least increase of the sum of squares, as a fraction of it, for which the fit is repeated with such priors."""
+    """Minimum relative increase of the sum of squares for which the fit is repeated with such priors."""
 
     initial_widths: tuple[float, ...] = (0.005, 0.05)
     """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried.
@@ -184,7 +184,7 @@ class ShootingOptions:
     coarse_step: float = 2.6e-3
     """Longest integration step of the earlier fits [s]: three times as fast, off by hundredths of a standard error."""
     start_segments: int = 80
-    """Maximum number of segments, evenly chosen, in the fits that only need to come close to a minimum."""
+    """Maximum number of segments, evenly spread, in the fits that only need to come close to a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-3)
     """A width below 3e-3 rad/s is slow to simulate and has no visible effect in a second of motion."""
     minimiser: SegmentedMinimiserOptions = SegmentedMinimiserOptions()
@@ -210,7 +210,8 @@ class CalibrationOptions:
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)
     minimiser: MinimiserOptions = MinimiserOptions()
     initial_width: float = 0.005
-    """Initial width of the smoothed Coulomb step [rad/s]; that of an estimate with wrong torque constants is of no use.
+    """Initial width of the smoothed Coulomb step [rad/s]; that of an estimate with wrong torque constants is
+    misleading.
     """
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""

@@ -23,7 +23,7 @@ LESS_RESIDUAL = 0.6
 """A combination is credible if its residual is below this fraction of the residual with the signs as given."""
 
 SAME_RESIDUAL = 1.05
-"""If it also makes negative inertia or friction positive, this fraction of that residual is sufficient."""
+"""The same fraction for a combination that also makes a negative inertia or friction positive."""
 
 _POSITIVE = ("inertia", "viscous", "coulomb")
 _STANDARD_ERRORS = 3.0

@@ -47,7 +47,7 @@ def settling_difference(former: Array, latest: Array) -> float:
 
     The worst joint counts. Only the second halves are compared: if they agree, the previous period ended settled, so
     the whole latest one is settled even if the previous one began with the transient of the ramp. This saves a whole
-    period of arm time.
+    period of the experiment.
     """
     half = former.shape[1] // 2
     return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())

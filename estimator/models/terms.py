@@ -89,7 +89,7 @@ class Term:
     """
     scope: Scope = "joint"
     first_joint: int = 1
-    """First joint that has this term: 2 for terms relative to joint 1 or included in its other terms."""
+    """First joint that has this term: 2 if it is relative to joint 1, or if joint 1's is part of another term."""
     range: Range = "positive"
     """Range of values.
 
@@ -269,7 +269,7 @@ _DECLARED = (
     Term(
         "back_emf",
         "1",
-        "share of viscous friction due to back-EMF, which passes the drive's lag like the voltage",
+        "share of viscous friction due to back-EMF, which is subject to the drive's lag like the voltage",
         part="voltage",
         initial=0.92,
         log_spread=0.08,

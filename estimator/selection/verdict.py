@@ -62,7 +62,9 @@ class Evidence:
     Where friction has changed since the fitted motion, with one factor per joint taken from the held-out motion itself.
     """
     held_out_as_fitted: Array | None = None
-    """The same with friction as it was in the fitted motion (joints,); None where it has not changed."""
+    """RMS error of that prediction with friction as it was in the fitted motion (joints,); None where it has not
+    changed.
+    """
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""
     drift: Drift | None = None
@@ -128,7 +130,7 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence,
     left = validation.residual_over_floor
     joint = int(np.argmax(left))
     error = float(validation.levels.model_error.max())
-    moves = "is not explained to the last step" if trust == "yes" else "moves in a way that the model cannot explain"
+    moves = "is not fully explained" if trust == "yes" else "moves in a way that the model cannot explain"
     subject = f"The motion of joint {joint + 1}" if trust == "yes" else f"Joint {joint + 1}"
     said = (
         f"{subject} {moves}: its residual is {left[joint]:.1f} times the noise, a model error of {error:.2g} encoder "
@@ -158,7 +160,7 @@ def _in_words(part: str) -> str:
 
 
 def _spoilt(validation: Validation, trust: Trust) -> str:
-    """Return which parameters the model error may have biased, judged by their widened errors."""
+    """Return which parameters the model error may have biased, judged by their inflated standard errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst and trust == "no":
         return "It may bias all parameters, whatever their standard errors say."

@@ -91,7 +91,7 @@ class Motor:
         """Torque constant, offset, Coulomb level, Stribeck rise, 1 / Stribeck velocity."""
         self.viscous = drive.viscous * viscous
         self.plain = (*self.constants, self.viscous, self._lag)
-        """`constants`, viscous friction [N m s/rad] and current lag [s]: all that counts while the drive is plain."""
+        """`constants`, viscous friction [N m s/rad] and current lag [s]: all that matters while the drive is plain."""
 
     @property
     def is_plain(self) -> bool:

@@ -209,7 +209,7 @@ def _run(  # noqa: PLR0915
 
 
 def _lag(step: float, seconds: float) -> tuple[float, float]:
-    """As `Motor.lag`, for a lag of `seconds`."""
+    """Return what `Motor.lag` returns, for a lag of `seconds`."""
     if not seconds:
         return 0.0, 0.0
     fallen = -expm1(-step / seconds)

@@ -186,7 +186,7 @@ class RecordingConfig(BaseModel):
 
 
 def load_recording_config(path: Path) -> RecordingConfig:
-    """Read and check; raises ConfigError."""
+    """Read and check the file; raises ConfigError."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -195,7 +195,7 @@ def load_recording_config(path: Path) -> RecordingConfig:
 
 
 def parse_recording_config(text: str, path: Path) -> RecordingConfig:
-    """The same, from the contents of `path`; raises ConfigError."""
+    """Check `text`, the contents of `path`; raises ConfigError."""
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

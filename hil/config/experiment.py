@@ -111,7 +111,7 @@ class ModelConfig(Table):
     cable: bool = Field(False, description=OPTIONS["cable"])
     encoder: bool = Field(False, description=OPTIONS["encoder"])
     lags: bool = Field(False, description=OPTIONS["lags"])
-    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, as far as gravity shows it")
+    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, as far as gravity reveals it")
 
     @property
     def fixed_friction(self) -> Friction:

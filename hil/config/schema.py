@@ -140,7 +140,9 @@ class SafetyConfig(Table):
     lower_speed: PositiveFloat = Field(
         0.6, le=5, description="rad/s at which a stop lowers a spatial arm to its rest pose"
     )
-    lower_time: PositiveFloat = Field(10.0, le=60, description="s: longest time for that; longer paths are faster")
+    lower_time: PositiveFloat = Field(
+        10.0, le=60, description="s: longest duration of that; on longer paths the arm moves faster"
+    )
     limit_chance: float = Field(
         0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"
     )

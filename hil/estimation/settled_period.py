@@ -113,8 +113,8 @@ def _stabilised(config: Config, rows: NDArray[np.void], torque: NDArray[np.float
 
 
 def scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Standard deviation of each joint's mean over periods, (periods, joints, samples) to (joints,) [rad]; None for
-    one.
+    """Standard deviation of each joint's mean over periods, (periods, joints, samples) to (joints,) [rad]; None for a
+    single period.
     """
     count = len(position)
     if count < 2:

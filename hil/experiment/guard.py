@@ -47,8 +47,8 @@ class Guard:
     interval: time between two exchanges [s]; by default, that between two samples. patience: how long an exchange waits
     for missing replies [s].
 
-    left_by_a_run: whether the arm stands where a run just before this one left it. One that was stopped at a limit may
-    have come to rest a little beyond it: such a joint may move back in, but no farther out.
+    left_by_a_run: whether the arm is where an immediately preceding run left it. One that was stopped at a limit may
+    have come to rest slightly beyond it: such a joint may move back in, but no farther out.
     """
 
     def __init__(
@@ -240,7 +240,7 @@ class Guard:
         self._stop(
             index,
             Cause.NOT_FOLLOWING,
-            f"carries {state.current[index]:.3f} where {state.goal_current[index]:.3f} is commanded, for "
+            f"carries {state.current[index]:.3f} instead of the commanded {state.goal_current[index]:.3f}, for "
             f"{1e3 * self._joints[index]['found']:.0f} ms. Its torque is off, it was rebooted, its watchdog acted, or "
             "it cannot deliver this much at its speed and supply voltage (safety.follow_share).",
         )
@@ -308,7 +308,7 @@ class Guard:
 
 
 def _joint_records(config: Config, planned: Sequence[float], left_by_a_run: bool) -> np.ndarray:
-    """What `joint_checks` needs to know of each joint."""
+    """What `joint_checks` needs to know about each joint."""
     joints = np.zeros(len(config.joints), JOINT)
     safety = config.safety
     for record, joint, peak in zip(joints, config.joints, planned, strict=True):

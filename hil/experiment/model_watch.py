@@ -1,7 +1,7 @@
 """Check during the experiment that the motion is consistent with some arm of the dry run's ensemble.
 
 The prior knowledge is that of the dry run: an ensemble of arms from `[arm.prior]` or from an earlier result. Its mean
-and widened covariance initialise `hil.estimator.models.momentum_observer`. Without link lengths, which a dry run needs
+and inflated covariance initialise `hil.estimator.models.momentum_observer`. Without link lengths, which a dry run needs
 too, only the planned torque is known: the first motion then trains the model, and only later motion is judged.
 """
 
@@ -31,15 +31,16 @@ WIDENED = 1.5
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
 _FRICTIONS = 8.0
-"""Smallest torque scale, in multiples of the mean dry friction, so that less than twice the friction causes no alarm.
+"""Lower bound on the torque scale, in multiples of the mean dry friction: up to twice that friction must not raise an
+alarm.
 """
 _TILT_SHARE = 0.2  # standard deviation of gravity perpendicular to the assumed direction, relative to gravity
 _FRICTION_SPREAD = 3.0
-"""Multiple of the spread of servo friction that is allowed for friction elsewhere in an arm without a description."""
+"""Factor on the spread of servo friction for an arm without a description, to allow for friction outside its servos."""
 _UNDESCRIBED = {"gravity": 10.0, "viscous": 6.0, "offset": 0.3}
 """Standard deviations for an arm without a description, as multiples of the planned torque in SI units; others 1.
 
-A small first torque moves an arm by a tenth of a radian: its gravity is ten times as large.
+A small first torque moves an arm by a tenth of a radian: its gravity torque is ten times as large.
 """
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
@@ -50,36 +51,39 @@ _LAG_S = 0.012
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 JOLT_S, JOLT_BACK_S = 0.01, 0.15
-"""Time in which the velocity of a joint that slips changes, and after which it is back at the latest [s]."""
+"""Time within which a slipping joint's velocity changes, and within which it returns [s]."""
 
 JOLT_RAD_S, JOLT_TIMES = 1.2, 5.0
-"""Smallest change of velocity in `JOLT_S` that is a jolt [rad/s], and its smallest ratio to the RMS of the usual ones.
+"""Smallest change of velocity in `JOLT_S` that counts as a jolt [rad/s], and its smallest ratio to the RMS of ordinary
+ones.
 """
 
 _USUAL_S = 1.0
 _GAP = 3.0
-"""Number of intervals between two samples after which changes of velocity are not judged."""
+"""Gap between two samples, in sample intervals, beyond which changes of velocity are not judged."""
 _WINDOW_S = 0.3
-"""Time over which a message reports the torques commanded to a stationary joint [s]: a multisine often crosses zero."""
+"""Time over which a message about a stationary joint gives the range of its torque [s]: a single value may be near
+zero.
+"""
 
 
 _JOLT = np.dtype(
     [(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun")]
     + [("count", "i8"), ("oldest", "i8")]
 )
-"""What is known of a joint's changes of velocity.
+"""Statistics of a joint's changes of velocity.
 
-count, oldest: number of former velocities, and the row of the oldest.
-square: mean square of the usual ones [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may yet
-belong to a jolt, and its duration [s]. change: first change of what may be a jolt [rad/s]. begun: its time [s].
+square: mean square of ordinary ones [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may still
+turn out to belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s]. begun: its time
+[s]. count, oldest: number of earlier velocities stored, and the row of the oldest.
 """
 
 
 class Jolts:
-    """Detects a joint that jerks and is at its old velocity again a moment later, as one whose horn slips.
+    """Detects a joint whose velocity jumps and returns a moment later, as when its horn slips.
 
-    A motor cannot do this, whatever the arm: it would have to accelerate and brake much harder than ever before. So it
-    is known without any knowledge of the arm. Velocities are compared over `JOLT_S`, with their usual changes.
+    No motor can do this on any arm: it would have to accelerate and brake much harder than ever before. The check
+    therefore needs no knowledge of the arm. Changes of velocity over `JOLT_S` are compared with ordinary ones.
 
     count: number of joints. interval: time between two exchanges [s].
     """
@@ -103,7 +107,7 @@ class Jolts:
         return None if joint < 0 else (joint, float(self._joints["change"][joint]))
 
     def forget(self) -> None:
-        """Begin anew: nothing is known about the motion since the previous sample."""
+        """Start over: nothing is known about the motion since the previous sample."""
         self._joints["count"] = 0
 
 
@@ -127,7 +131,7 @@ def _jolting_loop(joints: Any, former: Any, velocity: Any, seconds: float, now: 
             continue
         if is_jolt and not is_open:
             joint.begun, joint.change, is_open = now, change, True
-        # What may be the beginning of a jolt counts as usual only once it has turned out to be none.
+        # A possible beginning of a jolt only counts as ordinary motion once it has turned out not to be one.
         joint.squared += seconds * min(change * change, most * most)
         joint.since += seconds
         if not is_open:

@@ -33,7 +33,8 @@ _SUMS = np.dtype(
 """Running sums of one joint.
 
 lowest, highest: range of its positions [rad]. first: first one compared, which is subtracted from the others to avoid
-cancellation. sum, sum_of_squares, seen: of the others. squared, pairs: of changes from the period before.
+cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of squares
+and number of changes from the period before.
 """
 
 
@@ -113,7 +114,7 @@ def _relative(sums: Any) -> float:
 def _add_loop(
     former: Any, all_sums: Any, allowed: Any, unlike_for: Any, position: Any, index: int, compared: bool, anew: bool
 ) -> int:
-    """Add one sample; return the joint that has been unlike the period before for longest."""
+    """Add one sample; return the joint that has differed from the previous period for longest."""
     longest = 0
     for joint in range(len(position)):
         sums, latest, before = all_sums[joint], position[joint], former[joint, index]

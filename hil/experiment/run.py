@@ -108,7 +108,7 @@ def _close(recorder: Recorder, torque: str) -> None:
 
 
 def _check_still_wanted(stop: StopRequest, torque: str) -> None:
-    """Raise a stop request that arrived while torque was being cut: the recording stays, but nothing follows."""
+    """Raise a stop request that arrived while torque was being cut: the recording is kept, but nothing more is run."""
     try:
         stop.check()
     except StopRequested as request:

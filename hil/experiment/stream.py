@@ -40,7 +40,7 @@ from hil.setup.servo_session import has_moved
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
 _FORGETS = 0.98
-"""Factor per exchange by which the memory of the longest one fades."""
+"""Decay factor, per exchange, of the longest duration of an exchange that is remembered."""
 
 
 class Progress(NamedTuple):
@@ -209,8 +209,8 @@ class Stream:
             return "Check for backlash, a dragging cable or a slipping joint; or raise max_settling_periods."
         seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
         return (
-            f"The change falls slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), as "
-            f"while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
+            f"The change decreases slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), "
+            f"as while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:
@@ -321,7 +321,7 @@ class Stream:
                 yield state
 
     def _look_for_another_master(self, later: float) -> None:
-        """If it is time, read back what the servos hold just before the exchange due `later` than the sample [s]."""
+        """If a read-back is due, do it just before the exchange that is due `later` [s] after the sample."""
         deadline = self._deadline
         if deadline is not None and self._exchange.read_back_at <= deadline + later:
             self._bus.check_not_overruled(deadline + later)
@@ -368,7 +368,7 @@ class Stream:
         self._told(error, f"The arm {done}.")
 
     def _way_down(self, lowering: Lowering, state: State) -> State:
-        """The last state; raises SafetyStop, StopRequested, DriverError."""
+        """Follow the path home; return the last state. Raises SafetyStop, StopRequested, DriverError."""
         asked = max(1, self._stop.count)
         for index in range(lowering.begin(state, self._goal)):
             for checked in self._between_samples() if index else ():

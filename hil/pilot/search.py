@@ -39,7 +39,7 @@ class Search:
     belief: Belief
     steps: list[Step] = field(default_factory=list)
     cap: Array | None = None
-    """Torque (joints,) [N m] that must not be exceeded, because a limit was."""
+    """Torque (joints,) [N m] that must not be exceeded, because an earlier run exceeded a limit."""
     pose: Array | None = None
     """Last rest position of the arm (joints,) [rad]."""
     swing: Array | None = None
@@ -117,8 +117,8 @@ class Search:
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
         """The largest safe amplitude for all plausible arms.
 
-        If there is none, the amplitude of the last run is used, which the real arm has shown to be safe, or less if it
-        was not. Raises NoSafeTorque if there was no run yet.
+        If there is none, the amplitude of the last run is used if the real arm has shown it to be safe, otherwise a
+        smaller one. Raises NoSafeTorque if there was no run yet.
         """
         ensemble, options = self.belief.ensemble(self._farther), self.options
         cap = self.cap
@@ -223,7 +223,8 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """Of `found` and, if it leaves much of the range unused, of other waves, the amplitude that leaves least.
+        """`found`; if it leaves much of the range unused, the best amplitude among other waves too, whichever leaves
+        least.
 
         Slightly more torque may tip some of the arms over: with other waves that happens at larger amplitudes, or to
         the other side.
@@ -321,7 +322,7 @@ def _within_limits(config: Config, pose: Array, inside: float) -> Array:
 
 
 def only_first(found: Amplitude, options: PilotOptions = DEFAULTS) -> Amplitude:
-    """The same amplitude with only the first multisine."""
+    """The amplitude `found` with only the first multisine."""
     plan = replace(
         found.plan.first_segment(), max_settling_periods=options.max_pilot_settling, periods=1, warm_up_periods=0
     )

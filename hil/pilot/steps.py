@@ -166,7 +166,7 @@ def _beside(rows: list[tuple[str, ...]]) -> list[str]:
 
 
 def _below(rows: list[tuple[str, ...]]) -> list[str]:
-    """The same with a line for each column, which fits a terminal of 80 columns."""
+    """A table with one line per quantity and joint, which fits a terminal of 80 columns."""
     head, *others = rows
     width = max(map(len, head))
     return [

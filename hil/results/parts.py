@@ -90,8 +90,9 @@ class SettledFit(Fit):
 
 @dataclass(frozen=True, kw_only=True)
 class ShootingFit(Fit):
-    """Fit of any motion, cut into segments. residual_rms_rad: the residual in rad RMS, per joint; residual_rms_ticks is
-    empty where the encoders' resolution is not known."""
+    """Fit of an arbitrary motion, cut into segments. residual_rms_rad: the residual in rad RMS, per joint;
+    residual_rms_ticks is empty where the encoders' resolution is not known.
+    """
 
     residual_rms_rad: PerJoint
     residual_rms_ticks: PerJoint

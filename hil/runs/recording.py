@@ -48,9 +48,9 @@ def sample_type(joints: int) -> np.dtype[np.void]:
     """The type of one row.
 
     It contains times [s], the position in the plan, and per joint goal and measured current [A], velocity [rad/s],
-    position [rad], the servo's error byte and whether its reply is missing (the measured values are then NaN). In turn,
-    a few times a second, it also contains the servo's clock [s], supply voltage [V] and temperature [degrees C], which
-    are NaN otherwise.
+    position [rad], the servo's error byte and whether its reply is missing (the measured values are then NaN).
+    Alternately, a few times a second, it also contains the servo's clock [s], supply voltage [V] and temperature
+    [degrees C], which are NaN otherwise.
     """
     each = (joints,)
     return np.dtype(

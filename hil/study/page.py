@@ -17,7 +17,7 @@ _BINS = 24
 _MOST_ARMS = 200
 """Rows of a fleet's table on the page; the dataset has all."""
 _MANY = 100
-"""Smallest number of values for which a histogram leaves out the outermost hundredths."""
+"""Smallest number of values for which a histogram leaves out the lowest and the highest percent."""
 
 
 def write_page(table: pa.Table, title: str, path: Path) -> Figures:

@@ -105,7 +105,7 @@ class StudyTable(_Table):
 
 
 class KeepTable(_Table):
-    """`[keep]`: what is recorded of each run."""
+    """`[keep]`: what is recorded about each run."""
 
     columns: list[str] | None = Field(
         None, min_length=1, description="column names, with * as wildcard; default: those of the task"

@@ -54,7 +54,7 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
         print("Regression on the measured torque: no motion was simulated, so there is no position residual.")
     if result.model_choice is not None:
         choice = result.model_choice
-        times = f"error {choice.error_divided_by:.3g} times smaller than with the plainest model"
+        times = f"error {choice.error_divided_by:.3g} times smaller than with the simplest model"
         print(f"Chosen on held-out segments: {choice.chosen}, {times}.")
     if result.physical is not None:
         print("\n".join(physical_lines(result.physical)))
@@ -108,9 +108,9 @@ def _undetermined(result: SettledResult) -> list[str]:
 
 
 def _may_be_absent(name: str, entry: Quantity) -> bool:
-    """Whether a term's distance from no effect is below its standard error."""
+    """Whether a term is within one standard error of having no effect."""
     kind = kind_of(name)
-    if kind == "stribeck_velocity":  # no value of the velocity means no effect
+    if kind == "stribeck_velocity":  # a term without effect has no Stribeck velocity
         return entry.std > abs(entry.value)
     return kind in TERMS and not abs(entry.value - term_of(name).absent) > entry.std
 

@@ -50,7 +50,7 @@ def next_commands(data: RunData) -> Section:
     rows = (
         ("the arm for MuJoCo, or as URDF", f"hil export {run} --format mjcf --format urdf{length}"),
         (
-            "a hundred arms drawn from the error bars",
+            "a hundred arms drawn from the posterior",
             f"hil export {run} --format mjcf --samples 100 --out arms{length}",
         ),
         ("estimate again, after a change of [model] in its config.toml", f"hil estimate {run}"),
