@@ -56,7 +56,9 @@ _LAG_SHARE = 0.25
 """Allowance for a lag that is not a pure delay, as a fraction of the lag times the range of velocities."""
 
 STEP_RAD, STEP_TIMES = 0.0077, 7.0
-"""Smallest jump of a position [rad], five ticks, and its smallest ratio to the RMS of the usual differences."""
+"""Smallest difference that counts as a jump of the position [rad], five ticks, and its smallest ratio to the RMS of the
+usual differences.
+"""
 
 STEPS, STEPS_S = 4, 0.5
 """Number of jumps that counts as a fault, and the longest time between them [s]."""

@@ -94,9 +94,11 @@ class _Ranges:
 
 
 _JOLT = np.dtype([(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun")])
-"""Statistics of a joint's changes of velocity.  square: mean square of ordinary ones [rad^2/s^2], over age [s].
-squared, since: sum of squares times time that may still turn out to belong to a jolt, and its duration [s]. change:
-first change of a possible jolt [rad/s]. begun: its time [s].
+"""Statistics of a joint's changes of velocity.
+
+square: mean square of ordinary ones [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may still
+turn out to belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s]. begun: its time
+[s].
 """
 
 

@@ -100,7 +100,11 @@ class Played:
 
 @dataclass(frozen=True)
 class Player:
-    """Plays runs; knows the configuration file, the observer of the stream and the function that shows messages."""
+    """Plays runs and reports them.
+
+    shown_path: path of the configuration file, for messages. watch: observer of the sample stream. say: shows a
+    message.
+    """
 
     shown_path: Path
     watch: Watch
