@@ -23,7 +23,8 @@ LESS_RESIDUAL = 0.6
 """A combination is credible if its residual is below this fraction of the residual with the signs as given."""
 
 SAME_RESIDUAL = 1.05
-"""Largest such ratio of residuals for a combination that also makes a negative inertia or friction positive."""
+"""A combination that also makes a negative inertia or friction positive is credible up to this ratio of the residuals.
+"""
 
 _POSITIVE = ("inertia", "viscous", "coulomb")
 _STANDARD_ERRORS = 3.0

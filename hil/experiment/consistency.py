@@ -36,7 +36,7 @@ SHORT_S, LONG_S = 0.3, 1.2
 """Time constants of the memories [s]."""
 
 LONG_EVERY_S = 0.0099
-"""Shortest interval added to the long memory [s]: that of 100 Hz, regardless of rounding."""
+"""Shortest interval after which the long fading memory is updated [s]: that of 100 Hz, despite rounding errors."""
 
 UNSURE_RAD, LONG_UNSURE_RAD = 0.02, 0.045
 """Tolerances of the two memories [rad]: for rounding, encoder noise, and a velocity that is rounded towards zero."""
@@ -45,7 +45,7 @@ LAG_S = 0.03
 LEARNT_S = 1.5
 MORE_LAG_S = 0.008
 _FAST_RAD_S = 2.0
-"""Smallest range of velocities within the memory from which the lag can be estimated [rad/s]."""
+"""Smallest range of velocities within a fading memory from which the lag can be estimated [rad/s]."""
 
 _SEPARATE = 0.05
 """Determinant of the normal equations, relative to that of uncorrelated signals, below which lag and scale error cannot

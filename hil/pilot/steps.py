@@ -28,7 +28,7 @@ _AT_A_LIMIT = (Cause.POSITION, Cause.VELOCITY)
 
 
 _BESIDE = 2
-"""Number of joints up to which predicted and measured peaks fit side by side."""
+"""Largest number of joints for which the table shows predicted and measured peaks side by side."""
 
 
 @dataclass(frozen=True)
