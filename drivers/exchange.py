@@ -190,6 +190,9 @@ class Exchange:
             self.read_back_at = before + TRY_AGAIN_S
             return None
         received = port.ask(read.request, asked, due - before, before)
+        if port.overheard:
+            self._overhear(port.overheard)
+            port.overheard = b""
         received = received.removeprefix(read.request)
         servos = read.unpack(received) or read.search(received)[0]
         now = self._now()
@@ -221,7 +224,7 @@ class Exchange:
                 goals += write.pack(goal_ticks)
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
-        self._sent.append(goal_ticks)
+        self._sent.append(tuple(goal_ticks))
         timeout = self._timeouts[span]
         before = self._now()
         if self._echoes:

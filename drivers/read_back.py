@@ -81,16 +81,9 @@ class ReadBack:
 
     def look(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float) -> Overruled | None:
         """Compare the answers with what was written; return what only another master can have written."""
-        # A servo that received its neighbour's goal is not commanded by another master.
-        own = {tick for goals in sent for tick in goals}
         of_modes = self._is_of_modes
         is_nearly_sure = False
-        for place, answer in enumerate(servos):
-            if answer is None or len(answer) == 1:
-                continue
-            value = answer[-1]
-            if value == self._modes[place] if of_modes else value in own:
-                continue
+        for place, value in self._foreign(servos, sent):
             times = (self._modes_sighted if of_modes else self._goals_sighted)[place]
             while times and now - times[0] > _SIGHTED_S:
                 times.popleft()
@@ -104,7 +97,23 @@ class ReadBack:
             is_nearly_sure |= len(times) == most - 1
         # A change of mode resets the goal, so a foreign goal may be its first sign.
         if not is_nearly_sure:
-            self._until_mode = self._draw.randint(1, _GOALS_PER_MODE) if of_modes else self._until_mode - 1
+            self._until_mode = 1 + int(_GOALS_PER_MODE * self._draw.random()) if of_modes else self._until_mode - 1
             self._is_of_modes = self._until_mode == 0
-        self.due = now if now < self.doubts_until else now + _READ_BACK_S * self._draw.uniform(0.5, 1.5)
+        self.due = now if now < self.doubts_until else now + _READ_BACK_S * (0.5 + self._draw.random())
         return None
+
+    def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
+        """Place and value of each servo that holds what was not written."""
+        if self._is_of_modes:
+            return [
+                (place, answer[-1])
+                for place, (answer, mode) in enumerate(zip(servos, self._modes, strict=True))
+                if answer is not None and answer[-1] != mode and len(answer) > 1
+            ]
+        # A servo that received its neighbour's goal is not commanded by another master.
+        own = set().union(*sent)
+        return [
+            (place, answer[-1])
+            for place, answer in enumerate(servos)
+            if answer is not None and answer[-1] not in own and len(answer) > 1
+        ]

@@ -161,7 +161,7 @@ class _TwoRuns:
         scales = np.maximum(np.abs(first.value), 1e-6)
         either = [term_of(name).range == "any" for name in first.names]
         scales[either] = np.maximum(scales[either], 1e-3)
-        step = 1.0 / (periods[0].rate * steps_per_sample(periods[0].rate))
+        step = max(1.0 / (period.rate * steps_per_sample(period.rate)) for period in periods)
         resolved = resolved_widths(first.names, first.parameters, step, options.coordinates.widths_per_substep)
         self.coordinates = Coordinates(first.names, scales, options.coordinates, resolved)
         velocity = float(np.sqrt(np.mean(np.gradient(first.position, 1.0 / periods[0].rate, axis=1) ** 2)))

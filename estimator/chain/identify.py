@@ -21,7 +21,7 @@ ROUNDING = 1.0 / np.sqrt(12.0)  # standard deviation of a rounded angle [encoder
 EXPLAINED_RESIDUAL = 1.06
 """RMS residual of the worst joint, in units of encoder rounding, below which a motion counts as explained."""
 
-BELIEVED = 0.5  # standard errors above this fraction of the prior's count as coming from the prior
+BELIEVED = 0.5  # standard errors under white noise above this fraction of the prior's: values come from the prior
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class ChainEstimate(FittedParameters):
     softness: float
     """Natural frequency of the observer that couples the simulation to the measurements [Hz]."""
     reached: bool
-    """Whether the fit has reached its minimum; if not, the standard errors include what remains."""
+    """Whether the fit has reached its minimum. The standard errors include the distance that remains."""
     from_prior: tuple[str, ...]
     """Base parameters that the data hardly determine, so that their values come from the prior."""
     unseen: tuple[str, ...]
@@ -73,13 +73,14 @@ def identify_chain(
     fit = _best_fit(used, model, linear, prior, DEFAULTS, added)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     count = model.base.count
-    std = np.sqrt(np.diag(fit.covariance))
+    # The weight of the prior in the result; model errors or an unfinished fit widen the standard errors, not this.
+    std = np.sqrt(np.diag(fit.white_covariance))
     wide = std[:count] > BELIEVED * prior.std
     return ChainEstimate(
         names=model.names,
         units=model.units,
         value=fit.value,
-        covariance=fit.covariance,
+        covariance=fit.total_covariance,
         residual=np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
         position_step=used[0].position_step,
         model=model,
@@ -92,7 +93,7 @@ def identify_chain(
         white_std=np.sqrt(np.diag(fit.white_covariance)),
         correlation_time=fit.correlation_time,
         softness=fit.softness,
-        reached=fit.remaining <= DEFAULTS.unfinished,
+        reached=fit.reached,
         from_prior=tuple(name for name, open_ in zip(model.base.names, wide, strict=True) if open_),
         unseen=tuple(
             name
@@ -115,10 +116,13 @@ def _best_fit(
     Where a joint often turns or sticks, the sum of squares has several minima in the shape of its friction.
     """
     best = fit_periods(periods, model, linear, prior, options, added)
+    widths = np.array([kind_of(name) == "coulomb_width" for name in model.names])
     for width in options.other_initial_widths:
         before = _worst_residual(periods, best)
         if before <= EXPLAINED_RESIDUAL * ROUNDING:
             break
+        if np.all(best.value[widths] <= width):
+            continue  # it would start from the minimum itself
         with suppress(ConvergenceError):
             narrow = replace(options, initial_width=width)
             again = fit_periods(periods, model, linear, prior, narrow, added, best)

@@ -84,6 +84,8 @@ class RecordedChain:
     """Cut-off frequency of the regression [Hz]."""
     from_prior: tuple[str, ...]
     """Base parameters that the data hardly determine."""
+    reached: bool = True
+    """Whether the fit has reached its minimum; always so for a regression."""
 
     @property
     def std(self) -> Array:
@@ -131,13 +133,13 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
     squares = [np.square(piece.position - found) for piece, found in zip(pieces, fit.positions, strict=True)]
     rms = np.sqrt(np.nanmean(np.concatenate(squares, axis=1), axis=1))
     noise = np.sqrt(np.mean([np.square(piece.noise) for piece in pieces], axis=0))
-    spread = np.sqrt(np.diag(fit.covariance))[:count]
+    spread = np.sqrt(np.diag(fit.white_covariance))[:count]
     return RecordedChain(
         model,
         model.names,
         model.units,
         fit.value,
-        fit.covariance,
+        fit.total_covariance,
         True,
         rms / noise,
         rms,
@@ -145,6 +147,7 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
         fit.positions,
         cutoff,
         _from_prior(model, spread, prior),
+        fit.reached,
     )
 
 

@@ -85,7 +85,10 @@ def minimise(
     """
     x, here = start, evaluate(start) if at is None else at
     if not np.isfinite(here.cost):
-        raise ConvergenceError("the simulation diverges at the initial guess: check the units of torque and time")
+        raise ConvergenceError(
+            "the simulation diverges at the initial guess: too little motion was recorded, or torque or time "
+            "have other units"
+        )
     damping = options.initial_damping if damping is None else damping
     evaluations = int(at is None)
     gained = np.inf

@@ -182,7 +182,10 @@ def minimise_segmented(
         rows = _residuals(residual, shared, own, threads)
         cost = _cost(rows) + prior.cost(shared)
         if not np.isfinite(cost):
-            raise ConvergenceError("the simulation diverges at the initial guess: check the units of torque and time")
+            raise ConvergenceError(
+                "the simulation diverges at the initial guess: too little motion was recorded, or torque or time "
+                "have other units"
+            )
         damping = options.initial_damping
         for iteration in range(1, options.max_iterations + 1):
             blocks = _blocks(derivative, shared, own, threads)

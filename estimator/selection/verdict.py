@@ -206,10 +206,21 @@ def _drifted(drift: Drift | None) -> tuple[str, ...]:
         return ()
     return tuple(
         f"Friction of joint {joint + 1} {'fell' if change < 0.0 else 'rose'} by {100.0 * abs(change):.2g} % within "
-        f"{drift.seconds:.0f} s, as is typical while grease warms up: the values hold for the fitted periods. To "
-        f"obtain those of the warm arm, set experiment.warm_up = {_warm_up(drift.seconds)}."
+        f"{drift.seconds:.0f} s{_reason(change, drift.seconds)}"
         for joint, (change, std) in enumerate(zip(drift.change.tolist(), drift.std.tolist(), strict=True))
         if abs(change) > max(LEAST, 3.0 * std)
+    )
+
+
+def _reason(change: float, seconds: float) -> str:
+    """Return what may have changed friction: a servo that warms up loses some of it, and nothing healthy adds any."""
+    holds = "the values hold for the fitted periods"
+    if change < 0.0:
+        warm = f"To obtain those of the warm arm, set experiment.warm_up = {_warm_up(seconds)}."
+        return f", as is typical while grease warms up: {holds}. {warm}"
+    return (
+        f", which warming up does not explain: {holds}. Look for a cable or part that began to rub, a loose screw, "
+        "a horn that slipped, or a hot motor or falling supply, which give less torque. Then record again."
     )
 
 
@@ -271,5 +282,6 @@ def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
     if not estimate.outliers or not explained:
         return ()
     return (
-        f"{estimate.outliers} readings were outliers and downweighted; if this persists, check cables and baud rate.",
+        f"{estimate.outliers} samples are outliers and were downweighted: a jolt, play, or late or damaged readings; "
+        "the report's residuals show where.",
     )

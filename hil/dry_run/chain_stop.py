@@ -47,11 +47,14 @@ class LoweringForeseen:
     """Predicted lowering.
 
     seconds: longest duration [s]. nearest: least clearance. lies: fraction of simulations that end in the rest pose.
+    joint: name of the joint that ends farthest from it, `away` [rad].
     """
 
     seconds: float
     nearest: Nearest
     lies: float
+    joint: str
+    away: float
 
 
 @dataclass(frozen=True)
@@ -71,7 +74,12 @@ class ChainStops:
                 f"{1e3 * down.nearest.needed:.0f} mm required"
             )
         if down.lies < LAID_DOWN:
-            return f"a stop brings only {100 * down.lies:.0f} % of the simulated arms to the rest pose"
+            return (
+                f"a stop brings only {100 * down.lies:.0f} % of the simulated arms to the rest pose, of at least "
+                f"{100 * LAID_DOWN:.0f} % required: {down.joint!r} ends up to {down.away:.2g} rad away. Raise its "
+                "current_limit or safety.lower_time, choose a rest_pose in which gravity pulls it less or farther from "
+                "its limits, or give the masses more accurately"
+            )
         return ""
 
 
@@ -128,7 +136,7 @@ def _lowered(
     assert config.stabiliser is not None  # checked with the configuration
     way, space, rest = WayHome(config, plan), Space.of(config), np.array(config.arm.rest_pose)
     stiffness, damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
-    longest, lies, worst = 0.0, [], None
+    longest, lies, worst, away = 0.0, [], None, np.zeros(len(rest))
     for _, position, velocity in starts:
         home = way.path(position, velocity)
         goal = segment.thought.of(home).T + stiffness * (home.position.T - rest) + damping * home.velocity.T
@@ -137,10 +145,19 @@ def _lowered(
         longest = max(longest, len(goal) / plan.rate)
         for arm in range(arms.size):
             q = np.nan_to_num(motions.position[arm].T, nan=1e3)
-            lies.append(bool(np.abs(q[:, -1] - rest).max() < LYING_RAD))
+            off = np.abs(q[:, -1] - rest)
+            lies.append(bool(off.max() < LYING_RAD))
+            away = np.maximum(away, off)
             kept = ~space.lies(q)
             if kept.any():
                 nearest = space.nearest(q[:, kept], on_the_way=True)
                 worst = nearest if worst is None or nearest.room < worst.room else worst
     nothing = Nearest(np.inf, 0.0, ("nothing", "nothing"), 0)
-    return LoweringForeseen(longest, nothing if worst is None else worst, float(np.mean(lies)))
+    farthest = int(np.argmax(away))
+    return LoweringForeseen(
+        longest,
+        nothing if worst is None else worst,
+        float(np.mean(lies)),
+        config.joints[farthest].name,
+        float(min(away[farthest], np.pi)),
+    )

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction
-from hil.dry_run.chain_stop import ChainStops
+from hil.dry_run.chain_stop import LAID_DOWN, ChainStops
 from hil.dry_run.prediction import GUARDED, QUANTITIES, Prediction, quantities_of
 from hil.dry_run.summary import joints_json
 from hil.printing import print_fitting, say
@@ -145,7 +145,8 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         "99 %: in 99 of 100 arms, all peaks stay within these values.",
         f"Least clearance: {run.foreseen}.",
         f"A stop lowers the arm in at most {lowering.seconds:.1f} s; {100 * lowering.lies:.0f} % of the simulated arms "
-        f"reach the rest pose; least clearance on the way: {lowering.nearest}.",
+        f"reach the rest pose (at least {100 * LAID_DOWN:.0f} % are required); least clearance on the way: "
+        f"{lowering.nearest}.",
         f"Without commands (cable unplugged, program killed, servo failed) the arm falls. Hardest fall, from "
         f"{fall.moment:.1f} s into the path: {hit} after {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, "
         f"at {fall.speed:.1f} m/s.",

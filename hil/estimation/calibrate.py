@@ -46,12 +46,13 @@ class CalibrationFit:
     """Quality of the fit.
 
     residual_rms_ticks: residuals of both runs in encoder steps RMS. misfit: weighted sum of squared residuals per
-    sample; 1 is noise alone. joints: number of joints.
+    sample; 1 is noise alone. joints: number of joints. reached: whether the fit has reached its minimum.
     """
 
     residual_rms_ticks: tuple[PerJoint, ...]
     misfit: float
     joints: int
+    reached: bool = True
 
 
 @dataclass(frozen=True)
@@ -153,6 +154,7 @@ def _described_chain(config: Config, found: ChainCalibration) -> CalibrationResu
             residual_rms_ticks=tuple(map(tuple, steps.tolist())),
             misfit=float(np.mean((steps / QUANTISATION_FLOOR_TICKS) ** 2)),
             joints=len(config.joints),
+            reached=found.estimate.reached,
         ),
     )
 
@@ -183,6 +185,11 @@ def calibration_lines(result: CalibrationResult) -> list[str]:
         )
     worst = float(np.max(result.fit.residual_rms_ticks))
     lines.append(f"Largest residual of both runs: {worst:.3f} encoder steps RMS; rounding alone gives 0.289.")
+    if not result.fit.reached:
+        lines.append(
+            "The fit stopped before its minimum, where a joint sticks and breaks away; the standard errors include the "
+            "distance that remains. Record both runs again with faster motion before relying on these values."
+        )
     lines.append("The standard errors cover noise only: add the relative errors of the mass and of its distance.")
     lines.append("Set torque_constant (torque_per_volt in pwm mode) of each joint to these values and estimate again.")
     return lines

@@ -7,6 +7,7 @@ too, only the planned torque is known: the first motion then trains the model, a
 
 import math
 import operator
+from collections import deque
 from collections.abc import Callable, Sequence
 from struct import Struct
 from typing import Any
@@ -66,39 +67,15 @@ zero.
 """
 
 
-class _Ranges:
-    """Smallest and largest value of each joint within a recent window, which is between half of `_WINDOW_S` and all of
-    it long.
-    """
-
-    def __init__(self, joints: int) -> None:
-        self._began = -math.inf
-        self._low, self._high = [0.0] * joints, [0.0] * joints
-        self._former = self._low, self._high
-
-    def add(self, values: list[float], now: float) -> None:
-        if now - self._began >= 0.5 * _WINDOW_S:
-            self._former, self._began = (self._low, self._high), now
-            self._low, self._high = values.copy(), values.copy()
-            return
-        low, high = self._low, self._high
-        for joint, value in enumerate(values):
-            if value < low[joint]:
-                low[joint] = value
-            elif value > high[joint]:
-                high[joint] = value
-
-    def of(self, joint: int) -> tuple[float, float]:
-        low, high = self._former
-        return min(low[joint], self._low[joint]), max(high[joint], self._high[joint])
-
-
-_JOLT = np.dtype([(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun")])
+_JOLT = np.dtype(
+    [(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun")]
+    + [("count", "i8"), ("oldest", "i8")]
+)
 """Statistics of a joint's changes of velocity.
 
 square: mean square of ordinary ones [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may still
 turn out to belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s]. begun: its time
-[s].
+[s]. count, oldest: number of earlier velocities stored, and the row of the oldest.
 """
 
 
@@ -117,7 +94,6 @@ class Jolts:
         self._joints = np.zeros(count, _JOLT)
         self._joints["begun"] = -np.inf
         self._former = np.zeros((back, count))
-        self._known = np.zeros(2, dtype=np.int64)
         self._velocity = np.zeros(count)
         self._pack = Struct(f"{count}d").pack_into
         self._bytes = memoryview(self._velocity.data).cast("B")
@@ -127,27 +103,26 @@ class Jolts:
     def look(self, velocity: Sequence[float], seconds: float, now: float) -> tuple[int, float] | None:
         """Process velocities [rad/s], `seconds` after the previous ones [s]; return the joint and change of a jolt."""
         self._pack(self._bytes, 0, *velocity)
-        joint = _jolting(self._joints, self._former, self._known, self._velocity, seconds, now, self._least)
+        joint = _jolting(self._joints, self._former, self._velocity, seconds, now, self._least)
         return None if joint < 0 else (joint, float(self._joints["change"][joint]))
 
     def forget(self) -> None:
         """Start over: nothing is known about the motion since the previous sample."""
-        self._known[:] = 0
+        self._joints["count"] = 0
 
 
-def _jolting_loop(joints: Any, former: Any, known: Any, velocity: Any, seconds: float, now: float, least: float) -> int:
-    # known: number of earlier velocities stored, and the row of the oldest.
-    back, row = former.shape[0], known[1]
-    known[1] = (row + 1) % back
-    if known[0] < back:
-        former[row] = velocity
-        known[0] += 1
-        return -1
+def _jolting_loop(joints: Any, former: Any, velocity: Any, seconds: float, now: float, least: float) -> int:
+    back = former.shape[0]
     found = -1
     for index in range(len(joints)):
         joint = joints[index]
+        row = joint.oldest
         change = velocity[index] - former[row, index]
         former[row, index] = velocity[index]
+        joint.oldest = (row + 1) % back
+        if joint.count < back:
+            joint.count += 1
+            continue
         most = max(least, JOLT_TIMES * math.sqrt(joint.square))
         is_jolt = not -most <= change <= most
         is_open = now - joint.begun <= JOLT_BACK_S
@@ -196,7 +171,7 @@ class ModelWatch:
         held = interval < 0.99 / config.experiment.rate
         self._follows = 1.0 - math.exp(-interval / _LAG_S) if held else 1.0
         self._felt = [0.0] * len(largest)
-        self._commanded = _Ranges(len(largest))
+        self._commanded: deque[tuple[float, list[float]]] = deque(maxlen=math.ceil(_WINDOW_S / interval))
         self._stands_for = 0.0
         self._long = max(interval, _VAGUE_S)
         self._jolts = Jolts(len(largest), interval)
@@ -220,7 +195,7 @@ class ModelWatch:
             follows = self._follows
             torque = self._felt = [felt + follows * (to - felt) for felt, to in zip(self._felt, torque, strict=True)]
         self._look_for_jolts(state, seconds)
-        self._commanded.add(torque, now)
+        self._commanded.append((now, torque))
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
         if joint < 0:
             self._stands_for = 0.0
@@ -248,7 +223,8 @@ class ModelWatch:
         lacking = self._observer.lacking[joint]
         name, velocity = self._names[joint], state.velocity[joint]
         if abs(velocity) < _STILL_RAD_S:
-            low, high = self._commanded.of(joint)
+            recent = [torque[joint] for at, torque in self._commanded if self._seen_at - at <= _WINDOW_S]
+            low, high = min(recent), max(recent)
             said = (
                 f"{name} stands still, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "
                 "arm consistent with the prior and the data so far would move. Something blocks it, or its encoder is "

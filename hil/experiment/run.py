@@ -91,10 +91,20 @@ def run_experiment(
                 _play(config, plan, bus, recorder, stop, shown, note, arms)
             torque = str(bus.torque_off_report)
             note(torque)
+            _close(recorder, torque)
             with suppress(RunFolderError):  # the same information is in the recording
                 write_json(run.path / "lateness.json", lateness_histogram(recorder.samples))
         _check_still_wanted(stop, torque)
     return torque
+
+
+def _close(recorder: Recorder, torque: str) -> None:
+    """Close the recording; a failure is reported together with the state of the torque."""
+    try:
+        recorder.close()
+    except RunFolderError as error:
+        error.add_note(torque)
+        raise
 
 
 def _check_still_wanted(stop: StopRequest, torque: str) -> None:

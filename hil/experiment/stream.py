@@ -30,7 +30,6 @@ from hil.experiment.guard import Guard
 from hil.experiment.lowering import Lowering, may_lower
 from hil.experiment.model_watch import ModelWatch
 from hil.experiment.repetition import Repetition
-from hil.experiment.silence import LATE_WAKE_UP_S
 from hil.experiment.stop_request import StopRequest
 from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
@@ -278,9 +277,7 @@ class Stream:
                 self._stop.check()
         self._look_for_another_master(self._interval)
         self._deadline, now, late = self._ticks.wait()
-        overslept = now - max(self._deadline, self._awake_at)
-        if overslept >= LATE_WAKE_UP_S:
-            self._guard.woke_up(now, overslept)
+        self._guard.woke_up(now, now - max(self._deadline, self._awake_at))
         self._awake_at = now
         if late:
             # A missed tick is skipped, never made up for in a burst: the servos keep the previous goal.

@@ -5,7 +5,7 @@ Chen and D. Oliver, Mathematical Geosciences 44 (2012) 1), with itself as the pr
 the recording. Parameters that a motion does not excite keep their spread.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from scipy.signal import butter, sosfiltfilt
 
 from hil.config.schema import Config, StabiliserConfig
 from hil.dry_run.chain_prior import prior_arms
+from hil.estimator.chain.model.dynamics import TERMS
+from hil.estimator.chain.model.prior import spread_of
 from hil.estimator.chain.simulation.rollout import ChainArms, inertias, is_physical
 from hil.experiment.chain_watch import linear_parameters
 from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
@@ -33,26 +35,36 @@ _WIDTH = 0.05  # rad/s
 _LYING_RAD = 0.08
 _NOISE_TIMES = 2.0  # residuals are not white
 _LEAST_NOISE_SHARE = 0.005  # smallest noise, relative to a joint's largest torque
-_MODEL_SPREAD = 0.01  # of each parameter, for effects that the model does not include
-_RIDGE = 1e-4
+_MODEL_SPREAD = 0.01  # of each parameter of links and drives, for effects that the model does not include
 _FEWEST_ROWS = 50
 _LEAST_FRICTION_SHARE = 1e-4
 _POSES = 12
-_ARMS = 40
 _HALVINGS = 6
+_LIGHTER = 0.25
+"""Smallest plausible inertia of a joint, relative to that of the lightest arm of the prior."""
+_LIGHTER_THAN_MEAN = 0.5
+"""The same relative to the arm with the fitted parameters, if that is lighter still."""
+
+SIMULATED = 100
+"""Largest number of arms that are simulated."""
 
 
 @dataclass(frozen=True)
 class ChainBelief:
-    """An ensemble of arms, of which only the first ones are simulated."""
+    """An ensemble of arms, of which only the first ones are simulated.
+
+    lightest: smallest inertia of each joint with the others free, of all arms of the prior (joints,) [kg m^2].
+    """
 
     config: Config
     arms: ChainArms
+    lightest: Array
 
     @classmethod
     def prior(cls, config: Config) -> "ChainBelief":
         """Draw the ensemble before the first run. Raises ArmFileError."""
-        return cls(config, prior_arms(config, known_chain(config), DRAWN))
+        arms = prior_arms(config, known_chain(config), DRAWN)
+        return cls(config, arms, inertias(arms.first(SIMULATED), _poses(config))[1].min(axis=0))
 
     @property
     def torque(self) -> ChainTorque:
@@ -65,9 +77,7 @@ class ChainBelief:
         """Add stabiliser gains suited to the ensemble, unless the configuration has its own."""
         if given.stabiliser is not None:
             return given
-        low, high = np.array([joint.position_limit for joint in given.joints]).T
-        poses = np.random.default_rng(2).uniform(low, high, (_POSES, len(low)))
-        held, free = inertias(self.arms.first(_ARMS), poses)
+        held, free = inertias(self.arms.first(SIMULATED), _poses(given))
         # A damper acts one sample late: a larger gain would make a light joint oscillate.
         turn = 2.0 * np.pi * FREQUENCY
         damping = 2.0 * DAMPING_RATIO * turn * np.median(held, axis=0)
@@ -85,8 +95,11 @@ class ChainBelief:
             return self
         Y, torque = rows
         drawn = linear_parameters(self.arms)
+        count, everything = self.arms.base.count, self._links
         covariance = np.cov(drawn.T)
-        covariance += np.diag(_RIDGE * np.diag(covariance) + 1e-14)
+        covariance[:count, :count] += _MODEL_SPREAD**2 * everything @ everything.T
+        covariance += np.diag(np.concatenate((np.zeros(count), _MODEL_SPREAD**2 * np.diag(covariance)[count:])))
+        covariance += 1e-14 * np.eye(len(covariance))
         known = np.linalg.inv(covariance)
         mean = drawn.mean(axis=0)
         noise = _LEAST_NOISE_SHARE * torque_limits(config)
@@ -102,33 +115,63 @@ class ChainBelief:
         for arm, each in enumerate(drawn):
             shaken = torque + noise[:, None] * random.standard_normal(torque.shape)
             moved[arm] = each + spread @ np.einsum("jki,jk->i", Y * weight, shaken - Y @ each)
-        moved += _MODEL_SPREAD * np.abs(fitted) * random.standard_normal(moved.shape)
-        return ChainBelief(self.config, self._arms(moved))
+        # Base parameters may be large and nearly cancel, so it is the links that vary.
+        moved[:, :count] += _MODEL_SPREAD * random.standard_normal((len(moved), everything.shape[1])) @ everything.T
+        friction = _MODEL_SPREAD * np.abs(fitted[count:])
+        moved[:, count:] += friction * random.standard_normal((len(moved), friction.size))
+        return replace(self, arms=self._arms(moved))
+
+    @property
+    def _links(self) -> Array:
+        """Base parameters by parameters of links and rotors, in units of their spread (base parameters, all)."""
+        described = known_chain(self.config).described.reshape(-1, TERMS)
+        found: Array = self.arms.base.grouping * spread_of(described).reshape(-1)
+        return found
 
     def _arms(self, linear: Array) -> ChainArms:
         """Arms with these parameters, in units of the commanded torque.
 
-        Arms whose mass matrix is not physical are moved towards the mean, and discarded if that does not help.
+        A linear update may make a light joint lighter than any arm can be. Such arms are moved towards the mean, and
+        discarded if that does not help.
         """
         base, drive = self.arms.base, self.arms.drive.copy()
         n = drive.shape[2]
         least = _LEAST_FRICTION_SHARE * torque_limits(self.config)
         mean = linear.mean(axis=0)
-        low, high = np.array([joint.position_limit for joint in self.config.joints]).T
-        poses = np.random.default_rng(3).uniform(low, high, (_POSES, n))
+        good = self._plausible(linear, mean)
         for _ in range(_HALVINGS):
-            arms = ChainArms(base, linear[:, : base.count], drive)
-            bad = ~is_physical(arms, poses)
-            if not bad.any():
+            if good.all():
                 break
-            linear = np.where(bad[:, None], 0.5 * (linear + mean), linear)
-        good = is_physical(ChainArms(base, linear[:, : base.count], drive), poses)
+            linear = np.where(good[:, None], linear, 0.5 * (linear + mean))
+            good = self._plausible(linear, mean)
         linear = linear[good] if good.any() else linear_parameters(self.arms)
         drive = drive[good] if good.any() else drive
         drive[:, :3] = linear[:, base.count :].reshape(-1, 3, n)
         drive[:, :2] = np.maximum(drive[:, :2], least)
         drive[:, 4] = 1.0
         return ChainArms(base, linear[:, : base.count].copy(), drive)
+
+    def _plausible(self, linear: Array, mean: Array) -> NDArray[np.bool_]:
+        """Whether arms with these parameters have a positive definite mass matrix and no joint that is too light."""
+        count, poses = self.arms.base.count, _poses(self.config)
+
+        def arms_of(parameters: Array) -> ChainArms:  # whose drives do not matter
+            drives = np.broadcast_to(self.arms.drive[:1], (len(parameters), *self.arms.drive.shape[1:]))
+            return ChainArms(self.arms.base, parameters[:, :count], drives)
+
+        good: NDArray[np.bool_] = is_physical(arms_of(np.concatenate((mean[None], linear))), poses)
+        lightest = _LIGHTER * self.lightest
+        if good[0]:
+            lightest = np.minimum(lightest, _LIGHTER_THAN_MEAN * inertias(arms_of(mean[None]), poses)[1][0])
+        good = good[1:]
+        good[good] = (inertias(arms_of(linear[good]), poses)[1] >= lightest).all(axis=1)
+        return good
+
+
+def _poses(config: Config) -> Array:
+    """Poses within the limits, in which inertias are computed (poses, joints) [rad]."""
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    return np.random.default_rng(2).uniform(low, high, (_POSES, len(low)))
 
 
 def _rows(arms: ChainArms, config: Config, samples: NDArray[np.void]) -> tuple[Array, Array] | None:

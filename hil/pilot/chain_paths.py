@@ -20,10 +20,6 @@ Array = NDArray[np.float64]
 BAND = (0.1, 1.5)
 """Default band [Hz], if the configuration has none."""
 
-POSITION_ROOM = 0.08  # of a joint's range: reserve for errors of the assumed model
-SPEED_SHARE = 0.6  # of velocity_limit
-TORQUE_SHARE = 0.65
-EXTRA_ROOM = 0.01  # m in addition to the margin: reserve for tracking errors
 # Highest speed between rest pose and path: the smaller of this [rad/s] and this fraction of velocity_limit.
 RAMP_SPEED = 1.2
 RAMP_SPEED_SHARE = 0.35
@@ -32,33 +28,57 @@ _WAY_POSES = 40
 
 
 @dataclass(frozen=True)
+class Reserve:
+    """What a path leaves unused, for errors of the assumed model.
+
+    position: of a joint's range, at either limit. speed, torque: fractions of the limits that the path may use.
+    clearance: in addition to the margin [m]; transitions from and to the rest pose need none.
+    """
+
+    position: float = 0.08
+    speed: float = 0.6
+    torque: float = 0.65
+    clearance: float = 0.01
+
+    def larger(self, shortage: float) -> "Reserve":
+        """Return a larger reserve. shortage: by how much the predicted clearance was too small [m]; 0 if it was not."""
+        return Reserve(MORE * self.position, self.speed / MORE, self.torque / MORE, self.clearance + shortage)
+
+
+MORE = 1.4
+RESERVE = Reserve()
+
+
+@dataclass(frozen=True)
 class Paths:
     """The designed paths.
 
-    identify: optimised path. held_out: wide path around the same centre, with random phases.
+    identify: optimised path. held_out: wide path around the same centre, with random phases. reserve: what they leave
+    unused.
     """
 
     config: Config
     designer: PathDesigner
     identify: Design
     held_out: Design
+    reserve: Reserve = RESERVE
 
     @classmethod
-    def of(cls, config: Config, thought: ChainTorque) -> "Paths":
+    def of(cls, config: Config, thought: ChainTorque, reserve: Reserve = RESERVE) -> "Paths":
         """Design the paths. Raises NoSafeTorque if no path is safe, ConfigError, or ArmFileError."""
         check_rest_pose(config)
         known, space = known_chain(config), Space.of(config)
-        most, rest = TORQUE_SHARE * torque_limits(config), np.array(config.arm.rest_pose)
+        most, rest = reserve.torque * torque_limits(config), np.array(config.arm.rest_pose)
         low, high = np.array([joint.position_limit for joint in config.joints]).T
-        speed = SPEED_SHARE * np.array([joint.velocity_limit for joint in config.joints])
-        room = POSITION_ROOM * (high - low)
+        speed = reserve.speed * np.array([joint.velocity_limit for joint in config.joints])
+        room = reserve.position * (high - low)
         experiment = config.experiment
         assert experiment.band is not None  # set by `chain_config`
 
         def allowed(path: Path) -> bool:
             if (np.abs(thought.of(path)).max(axis=1) > most).any():
                 return False
-            if space.room(path.position).min() < EXTRA_ROOM:
+            if space.room(path.position).min() < reserve.clearance:
                 return False
             return bool(
                 space.room(_ways(path, rest, experiment.ramp / experiment.period), on_the_way=True).min() >= 0.0
@@ -76,7 +96,7 @@ class Paths:
                 f"{config.path}: {error}. Widen position_limit, raise current_limit, correct [clearance], or give "
                 "[joint_path] and pilot = false."
             ) from error
-        return cls(config, designer, best, other)
+        return cls(config, designer, best, other, reserve)
 
     def plan(self, config: Config, thought: ChainTorque, share: float) -> Plan:
         """Plan both paths at this fraction of their amplitude."""
@@ -94,7 +114,7 @@ def chain_config(config: Config) -> Config:
     experiment = config.experiment
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     rest = np.array(config.arm.rest_pose)
-    farthest = np.maximum(high - rest, rest - low) * (1.0 - POSITION_ROOM)
+    farthest = np.maximum(high - rest, rest - low) * (1.0 - RESERVE.position)
     fastest = np.minimum(RAMP_SPEED, RAMP_SPEED_SHARE * np.array([joint.velocity_limit for joint in config.joints]))
     ramp = max(experiment.ramp, float((_PEAK * farthest / fastest).max()))
     band = experiment.band or list(BAND)

@@ -39,7 +39,11 @@ SEARCH_ARMS, ARMS = 24, 72
 """Number of arms simulated while searching for a share, and to confirm the one found."""
 
 PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
-SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4)
+SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4, 0.28, 0.18)
+SMALL = 0.5
+"""Fraction of the wanted share below which other paths, with more reserve, are designed."""
+
+REDESIGNS = 2
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7
 RAISED = 1.3
@@ -90,27 +94,58 @@ class ChainSearch:
         return self.belief.with_stabiliser(self.given)
 
     def safe(self, config: Config, shares: tuple[float, ...]) -> Found:
-        """Find the first of the shares that is safe for all simulated arms. Raises NoSafeTorque."""
-        said = ""
+        """Find the first of the shares that is safe for all simulated arms.
+
+        If that is small, other paths with more reserve are designed, of which the most informative safe one is kept.
+        Raises NoSafeTorque if no share of any path is safe.
+        """
+        found, why, shortage = self._largest(config, shares)
+        for _ in range(REDESIGNS):
+            if found is not None and found.share >= SMALL * shares[0]:
+                break
+            former = self.paths
+            try:
+                self.paths = Paths.of(self.given, self.belief.torque, former.reserve.larger(shortage))
+            except NoSafeTorque:
+                break
+            other, other_why, shortage = self._largest(config, shares)
+            if other is None or (found is not None and self._worth(former, found) <= self._worth(self.paths, other)):
+                self.paths = replace(former, reserve=self.paths.reserve)
+            else:
+                found = other
+                self.say("Designed another path, which leaves more reserve to the limits.")
+            why = why if other is not None else other_why
+        if found is None:
+            raise NoSafeTorque(
+                f"{config.path}: no motion is safe for all arms consistent with what is known, not even "
+                f"{100 * shares[-1]:.0f} % of the designed path: {why}. {_remedy(config)}"
+            )
+        return found
+
+    def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
+        """The first safe share of the paths, why a larger one is not, and how much clearance that one lacks [m]."""
+        why, shortage = "", 0.0
         for share in shares:
             try:
                 plan = self.paths.plan(config, self.belief.torque, share)
             except NoHeadroom as error:  # the arm is heavier than the paths were designed for
-                said = said or str(error)
+                why = str(error)
                 continue
-            foreseen = predict_chain(config, plan, self.belief.arms.first(SEARCH_ARMS))
-            said = said or unsafe(config, foreseen)
-            if unsafe(config, foreseen):
-                continue
-            foreseen = predict_chain(config, plan, self.belief.arms.first(ARMS))
-            said = unsafe(config, foreseen) or self._unsafe_stop(config, plan)
-            if not said:
-                return Found(share, plan, foreseen)
-        raise NoSafeTorque(
-            f"{config.path}: no motion is safe for all arms consistent with the prior, not even "
-            f"{100 * shares[-1]:.0f} % of the designed path: {said}. Give the arm's masses more accurately, or "
-            "give it more room to move."
-        )
+            for count in (SEARCH_ARMS, ARMS):
+                foreseen = predict_chain(config, plan, self.belief.arms.first(count))
+                not_safe = unsafe(config, foreseen)
+                shortage = max(shortage, -float(foreseen.rooms.min()))
+                if not_safe:
+                    break
+            not_safe = not_safe or self._unsafe_stop(config, plan)
+            if not not_safe:
+                return Found(share, plan, foreseen), why, shortage
+            why = not_safe
+        return None, why, shortage
+
+    def _worth(self, paths: Paths, found: Found) -> float:
+        """Worst relative standard error of the base parameters after the found share of a path."""
+        return paths.designer.worth(paths.designer.scaled(paths.identify, found.share))[0]
 
     def _unsafe_stop(self, config: Config, plan: Plan) -> str:
         """Explain why a stop would not lower the arm safely; "" if it would."""
@@ -176,6 +211,16 @@ class ChainSearch:
                 f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from the "
                 "assumptions."
             )
+
+
+def _remedy(config: Config) -> str:
+    """What a user may change if no path is safe."""
+    spread = 0.3 if config.arm.prior is None else config.arm.prior.spread
+    return (
+        "What helps, depending on that reason: a rest_pose farther from limits and obstacles; a wider position_limit; "
+        "more room in [clearance] (floor, boxes, margin), if there is more; a larger current_limit or velocity_limit; "
+        f"or masses in the URDF that are known better, with [arm.prior] spread below {spread:g}."
+    )
 
 
 def identify_chain_in_steps(

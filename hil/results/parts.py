@@ -195,7 +195,7 @@ class TriedModel:
 class ModelChoice:
     """The model chosen with friction = "auto", and its gain and cost.
 
-    error_divided_by: prediction error of the first model divided by that of the chosen one. standard_errors_times:
+    error_divided_by: prediction error of the plainest model divided by that of the chosen one. standard_errors_times:
     factor by which the standard errors grew; None if that was not compared.
     """
 
@@ -203,6 +203,12 @@ class ModelChoice:
     error_divided_by: float
     standard_errors_times: float | None = None
     tried: tuple[TriedModel, ...]
+
+    @property
+    def plainest(self) -> str:
+        """The model with the fewest parameters of those that could be judged."""
+        judged = [trial for trial in self.tried if trial.score is not None]
+        return min(judged, key=lambda trial: trial.parameters).model if judged else self.chosen
 
 
 @dataclass(frozen=True)

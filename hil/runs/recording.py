@@ -14,6 +14,7 @@ from enum import IntEnum
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,8 +102,13 @@ class Recorder:
     def __enter__(self) -> "Recorder":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, _kind: object, error: BaseException | None, _traceback: object) -> None:
+        try:
+            self.close()
+        except RunFolderError as lost:
+            if error is None:
+                raise
+            error.add_note(str(lost))  # the reason for the end comes first
 
     @property
     def samples(self) -> NDArray[np.void]:
@@ -134,13 +140,33 @@ class Recorder:
         self.count += 1
 
     def close(self) -> None:
-        """Truncate the file to the recorded rows; may be called again."""
+        """Truncate the file to the recorded rows; may be called again.
+
+        Raises RunFolderError if the file was removed or renamed in the meantime; its rows are then saved in a new one.
+        """
         if self._bytes.nbytes == 0:
             return
         self._touched.close(_TOUCH_S)
         self._bytes.release()
         self._bytes = memoryview(b"")
-        self._samples = _cut(self._path, self._samples, self.count)
+        try:
+            self._samples = _cut(self._path, self._samples, self.count)
+        except FileNotFoundError:
+            self._samples = self.samples.copy()
+            self._save_again()
+
+    def _save_again(self) -> NoReturn:
+        folder = self._path.parent
+        said = f"{folder} was removed or renamed while it was being written to"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            np.save(self._path, self._samples)
+        except OSError as error:
+            raise RunFolderError(f"{said}, and its samples cannot be saved again: {error.strerror}.") from error
+        raise RunFolderError(
+            f"{said}. Its {self.count} samples have been saved again in {self._path}, but estimating from them also "
+            "needs the config.toml and run.json of the folder that is missing."
+        )
 
     def _touch(self, first: int) -> None:
         """Map the pages of a chunk of rows for writing: a page's first write can take the kernel 0.4 ms."""

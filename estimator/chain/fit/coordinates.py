@@ -84,6 +84,15 @@ class ChainCoordinates:
         y[self._widths] = np.maximum(x[self._widths], np.log(self._least[self._widths]))
         return y
 
+    def room_below(self, x: Array) -> Array:
+        """Return the largest decrease of each parameter's coordinate, as a number of at most 0 (parameters,).
+
+        Only widths have a floor; `x` may be followed by other coordinates.
+        """
+        least = np.full(len(self.names), -np.inf)
+        least[self._widths] = np.minimum(np.log(self._least[self._widths]) - x[self._widths], 0.0)
+        return least
+
     def slopes(self, x: Array) -> Array:
         """Return the derivative of each parameter by its coordinate (parameters,)."""
         slope: Array = np.where(self._positive, self.values(x), self._scales)
@@ -98,10 +107,8 @@ class ChainCoordinates:
         bound = np.where([kind in SHAPES for kind in self._kinds], reach * RESHAPING, LONGEST)
         least[:count], most[:count] = -bound, bound
         widths = self._widths
-        least[widths], most[widths] = (
-            np.clip(np.log(self._least[widths]) - x[widths], -reach * NARROWING, 0.0),
-            reach * WIDENING,
-        )
+        least[widths] = np.maximum(self.room_below(x)[widths], -reach * NARROWING)
+        most[widths] = reach * WIDENING
 
     @cached_property
     def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:

@@ -160,9 +160,13 @@ class ChainProblem:
             self.evaluate, x, ftol, damping, at, move=self.coordinates.moved, limits=limits, options=options
         )
 
+    def prior_cost(self, x: Array) -> float:
+        """Return the prior's part of the sum of squares at `x`."""
+        return self._add_prior(x, np.zeros((x.size, x.size)), np.zeros(x.size))
+
     def cost(self, x: Array) -> float:
         """Return the sum of squares at `x` alone; infinite if the motion diverges."""
-        total = self._add_prior(x, np.zeros((x.size, x.size)), np.zeros(x.size))
+        total = self.prior_cost(x)
         for (run, position), weight in zip(self._motions(x), self.weights, strict=True):
             if position is None:
                 return np.inf

@@ -20,6 +20,7 @@ from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
+from hil.estimator.fit.bounded_step import bounded_step
 from hil.estimator.fit.covariance import (
     by_parameters,
     correlation_time,
@@ -76,9 +77,9 @@ class ChainOptions:
     ftol: float = 2e-5
     towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
     """Initial guesses as fractions of the way from the prior to stage 1; the first that can be simulated is used."""
-    unfinished: float = 9.0
+    unfinished: float = 1.0
     """Decrease of the sum of squares, expected of one more step, above which the minimum counts as not reached: the
-    fit continues with shorter integration steps, and what still remains widens the standard errors."""
+    fit continues with shorter integration steps. 1 is a distance of one standard error."""
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""
     outlier_threshold: float = 4.0
@@ -103,7 +104,9 @@ class ChainFit:
     value: Array
     """Values in the order of `ChainModel.names` [SI]."""
     covariance: Array
-    """Covariance of `value`, robust to correlated errors."""
+    """Covariance at the minimum, robust to correlated errors."""
+    missing: Array
+    """Estimated distance from `value` to the minimum (parameters,) [SI]."""
     white_covariance: Array
     """Covariance of `value` if the errors of all samples were independent."""
     starts: tuple[Array, ...]
@@ -119,7 +122,17 @@ class ChainFit:
     softness: float
     """Natural frequency of the observer at the end [Hz]."""
     remaining: float
-    """Decrease of the sum of squares that is expected of one more step: how far the minimum may be."""
+    """Decrease of the sum of squares that is expected of one more step, which leads to the minimum."""
+
+    @property
+    def total_covariance(self) -> Array:
+        """Covariance of `value` about the truth: that at the minimum, widened by the distance to the minimum."""
+        return np.asarray(self.covariance + np.outer(self.missing, self.missing))
+
+    @property
+    def reached(self) -> bool:
+        """Whether the fit has reached its minimum: another step would change it by less than a standard error."""
+        return self.remaining <= DEFAULTS.unfinished
 
 
 def fit_periods(
@@ -169,7 +182,7 @@ def fit_periods(
         minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
         spent += minimum.iterations
     spent += rough.iterations + nearer.iterations + damped.iterations
-    if _remaining(minimum)[1] > options.unfinished:
+    if _remaining(minimum, bounded)[1] > options.unfinished:
         finer = replace(last, steps=2 * last.steps)
         try:
             minimum, last = finer.minimise(minimum.x, options.ftol, MINIMISER.min_damping, LAST), finer
@@ -177,18 +190,23 @@ def fit_periods(
             pass  # what remains widens the standard errors
         else:
             spent += minimum.iterations
-    return _fit(last, minimum, outliers, COVARIANCE, spent, options.unfinished)
+    return _fit(last, minimum, outliers, COVARIANCE, spent)
 
 
-def _remaining(minimum: Minimum) -> tuple[Array, float]:
+def _remaining(minimum: Minimum, coordinates: ChainCoordinates) -> tuple[Array, float]:
     """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations predict.
 
     Where the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
+    A width at its floor stays there.
     """
-    at = minimum.at
-    scale = np.sqrt(np.maximum(np.diag(at.normal), 1e-300))
-    step = -np.linalg.pinv(at.normal / np.outer(scale, scale), hermitian=True) @ (at.gradient / scale) / scale
-    return step, -float(step @ at.gradient)
+    at, least = minimum.at, np.full(minimum.x.size, -np.inf)
+    least[: len(coordinates.names)] = coordinates.room_below(minimum.x)
+    scale = np.sqrt(np.diag(at.normal))
+    scale = np.maximum(scale, 1e-12 * scale.max())
+    matrix = at.normal / np.outer(scale, scale)
+    matrix[np.diag_indices_from(matrix)] += MINIMISER.min_damping
+    step = bounded_step(matrix, at.gradient / scale, least * scale, np.full(least.size, np.inf)) / scale
+    return step, -float(step @ (2.0 * at.gradient + at.normal @ step))
 
 
 def _narrowed(problem: ChainProblem, near: ChainFit, options: ChainOptions) -> Array:
@@ -219,16 +237,25 @@ def _softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Ar
                 raise
             break
         spent += found.iterations
+        # The prior's weight differs from trial to trial, so only the residuals are compared.
+        of_data = (found.at.cost - trial.prior_cost(found.x)) * every
         growth = options.lost * (softness / frequency) ** 2
-        if cost is not None and found.at.cost * every > growth * (cost + x.size):
+        if cost is not None and of_data > growth * (cost + x.size):
             break
-        x, softness, cost = found.x, frequency, found.at.cost * every
+        x, softness, cost = found.x, frequency, of_data
     return x, softness, spent
 
 
 def _tempered(problem: ChainProblem, x: Array) -> ChainProblem:
-    """Return the problem with the prior's weight raised by as much as the residual at `x` exceeds the assumed noise."""
-    samples = sum(np.count_nonzero(weight[:: problem.every]) for weight in problem.weights)
+    """Return the problem with the prior's weight raised by as much as the residual at `x` exceeds the assumed noise.
+
+    Repeated readings count as one, as they do in the sum of squares.
+    """
+    counted = (
+        np.square(weight * period.noise)[:: problem.every]
+        for weight, period in zip(problem.weights, problem.periods, strict=True)
+    )
+    samples = max(1.0, sum(float(np.sum(each)) for each in counted))
     return replace(problem, prior_weight=max(1.0, replace(problem, prior_weight=0.0).cost(x) / samples))
 
 
@@ -296,7 +323,6 @@ def _fit(
     outliers: int,
     options: CovarianceOptions,
     iterations: int,
-    unfinished: float,
 ) -> ChainFit:
     x, count = minimum.x, problem.count
     positions = problem.positions(x)
@@ -316,13 +342,12 @@ def _fit(
     if structured > 0.0:  # a model error repeats itself, and its size may vary over time
         robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
         covariance = _larger(covariance, robust)
-    step, decrease = _remaining(minimum)
-    if decrease > unfinished:
-        covariance = covariance + np.outer(step[:count], step[:count])
+    step, decrease = _remaining(minimum, problem.coordinates)
     value = problem.coordinates.values(x[:count])
     return ChainFit(
         value,
         by_parameters(covariance, slopes, value),
+        slopes @ step[:count],
         by_parameters(white, slopes, value),
         tuple(problem.start(x, index) for index in range(len(problem.periods))),
         positions,

@@ -41,13 +41,19 @@ class Prior:
         """
         joints = base.chain.joints
         rotor = np.full(joints, 0.5 * ARMATURE) if armature is None else armature
-        every = np.column_stack((links, rotor)).reshape(-1)
-        mass = np.maximum(links[:, 0], 1e-3)[:, None]
-        least = mass * np.array([0.0, *(LEAST_OFFSET,) * 3, *(LEAST_GYRATION**2,) * 6])
-        spread = np.column_stack((np.maximum(SPREAD * np.abs(links), least), np.maximum(rotor, ARMATURE)))
-        std = np.sqrt(base.grouping**2 @ spread.reshape(-1) ** 2)
-        assert spread.shape == (joints, TERMS)
+        every = np.column_stack((links, rotor))
+        assert every.shape == (joints, TERMS)
+        std = np.sqrt(base.grouping**2 @ spread_of(every).reshape(-1) ** 2)
+        every = every.reshape(-1)
         return cls(base.of_all(every), std, None if scale_std is None else scale_precision(scale_std))
+
+
+def spread_of(described: Array) -> Array:
+    """Return the standard deviations of described links and rotor inertias (joints, TERMS) [SI]."""
+    links, rotor = described[:, :-1], described[:, -1]
+    mass = np.maximum(links[:, 0], 1e-3)[:, None]
+    least = mass * np.array([0.0, *(LEAST_OFFSET,) * 3, *(LEAST_GYRATION**2,) * 6])
+    return np.column_stack((np.maximum(SPREAD * np.abs(links), least), np.maximum(rotor, ARMATURE)))
 
 
 def scale_precision(std: Array) -> Array:

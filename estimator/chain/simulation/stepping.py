@@ -224,12 +224,13 @@ def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:
     return int(min(math.ceil(needed), most))
 
 
-def _broken(p: Any, v: Any, k: Any, solve: Any, step: float, most: int) -> int:
+def _broken(p: Any, v: Any, k: Any, t: Any, solve: Any, step: float, most: int) -> int:
     """Return the number of smaller steps, at most `most`, that replace an undivided one after its first stage.
 
     A joint that breaks away from standstill in this step was not accelerating before it, so `_pieces` cannot predict
     it. Friction at the end of the stage then differs from the tangent that the stage assumed; the velocity error
-    that this difference causes may reach CROSSED widths. k: accelerations of the stage. solve: as `_stage` left it.
+    that this difference causes may reach CROSSED widths. k: accelerations of the stage. t: motor torques. solve: as
+    `_stage` left it.
     """
     left, inverse = solve[0], solve[2]
     gh = GAMMA * step
@@ -240,7 +241,7 @@ def _broken(p: Any, v: Any, k: Any, solve: Any, step: float, most: int) -> int:
         if p[COULOMB, j] > 0.0 and (min(abs(v[j]), abs(ahead)) < NEAR * width or v[j] * ahead < 0.0):
             bend = math.tanh(ahead / width)
             steepness = (left[1, j] - p[VISCOUS, j]) * width  # level of dry friction times (1 - bend^2) before the step
-            level = p[COULOMB, j] * (1.0 + p[RISE, j] * left[2, j])
+            level = p[COULOMB, j] * (1.0 + p[RISE, j] * left[2, j]) + p[LOAD, j] * abs(p[SCALE, j] * t[j])
             wrong = abs(level * (bend - left[3, j]) - steepness * (ahead - v[j]) / width)
             inertia = 1.0 / inverse[j, j] + gh * (level * (1.0 - bend * bend) - steepness) / width
             needed = max(needed, step * wrong / (CROSSED * width * max(inertia, 1e-12)))
@@ -300,7 +301,7 @@ def _run_loop(  # noqa: PLR0912
                 if not _stage(chain, links, p, q, v, t, nothing, gh, k, work, solve):
                     return False
                 if pieces == 1 and finer > 1:
-                    pieces = _broken(p, v, k, solve, step, finer)
+                    pieces = _broken(p, v, k, t, solve, step, finer)
                     if pieces > 1:
                         continue
                 done += 1

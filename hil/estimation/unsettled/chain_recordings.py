@@ -179,6 +179,12 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         sentences.append(
             f"The recordings hardly determine {', '.join(found.from_prior)}: these values come from the URDF."
         )
+    if not found.reached:
+        trust = "with care" if trust == "yes" else trust
+        sentences.append(
+            "The fit stopped before its minimum, where a joint sticks and breaks away; the standard errors include the "
+            "distance that remains. Record faster motion, so that fewer joints stick."
+        )
     return Verdict(trust, weakest, tuple(sentences))
 
 

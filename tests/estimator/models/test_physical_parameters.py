@@ -1,18 +1,21 @@
 """Physical quantities from base parameters and other knowledge; torque constants from a known mass."""
 
+import itertools
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from hil.estimator.calibration import KnownMass, calibrate
+from hil.estimator.calibration import CalibrationOptions, KnownMass, _TwoRuns, calibrate
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ModelError
 from hil.estimator.identify import identify
 from hil.estimator.models.model import Model
 from hil.estimator.models.physical_parameters import Known, Quantities, base_of, physical_quantities
+from hil.estimator.simulation.arm import steps_per_sample
 from hil.fakes.plants.arm import Arm, base_parameters
 
 TRUE = {
@@ -109,6 +112,26 @@ def test_a_pendulum_is_calibrated_too(pendulum: Arm, recorded: Any, wave: Any) -
     runs = [replace(period, torque=1.2 * period.torque) for period in runs]
     found = calibrate(runs[0], runs[1], identify(runs[0], Model(1)), KnownMass(0.05, 0.14), 9.81)
     assert 1.2 * found.factor[0] == pytest.approx(1.0, abs=0.003)
+
+
+def test_a_calibration_resolves_friction_in_the_run_with_the_longer_steps() -> None:
+    rates = {rate: 1.0 / (rate * steps_per_sample(rate)) for rate in (200.0, 333.0, 500.0)}
+    assert len(set(rates.values())) > 1  # or the order would not matter
+    angle = 2.0 * np.pi * np.arange(1000) / 1000.0
+    first: Any = SimpleNamespace(
+        names=("inertia_1", "coulomb_1", "coulomb_width_1"),
+        value=np.array([1e-4, 0.1, 0.01]),
+        parameters={"inertia_1": 1e-4, "coulomb_1": 0.1, "coulomb_width_1": 0.01},
+        position=np.sin(angle)[None],
+    )
+    runs = [SettledPeriod(rate, np.cos(angle)[None], np.sin(angle)[None], 0.0, np.array([1e-3])) for rate in rates]
+    floors = [
+        _TwoRuns((one, other), first, {}, CalibrationOptions()).coordinates.resolved[-1]
+        for one, other in itertools.permutations(runs, 2)
+    ]
+    longest = max(rates.values())
+    for floor, pair in zip(floors, itertools.permutations(rates.values(), 2), strict=True):
+        assert floor == pytest.approx(max(floors) * max(pair) / longest)
 
 
 def test_a_mass_that_is_none_is_refused() -> None:

@@ -10,13 +10,18 @@ FREE = Nearest(0.05, 0.01, ("hand", "floor"), 0)
 
 
 def test_a_lowering_with_room_that_lays_the_arm_down_is_safe() -> None:
-    assert ChainStops(FALL, LoweringForeseen(5.0, FREE, 1.0)).unsafe == ""
+    assert ChainStops(FALL, LoweringForeseen(5.0, FREE, 1.0, "knee", 0.02)).unsafe == ""
 
 
 def test_too_little_room_on_the_way_down_is_not() -> None:
     near = Nearest(-0.005, 0.01, ("hand", "floor"), 0)
-    assert "hand and floor: -5 mm, at least 10 mm" in ChainStops(FALL, LoweringForeseen(5.0, near, 1.0)).unsafe
+    assert (
+        "hand and floor: -5 mm, at least 10 mm"
+        in ChainStops(FALL, LoweringForeseen(5.0, near, 1.0, "knee", 0.02)).unsafe
+    )
 
 
 def test_arms_that_do_not_reach_the_rest_pose_are_not() -> None:
-    assert "83 %" in ChainStops(FALL, LoweringForeseen(5.0, FREE, 0.83)).unsafe
+    why = ChainStops(FALL, LoweringForeseen(5.0, FREE, 0.83, "knee", 0.4)).unsafe
+    assert "83 %" in why
+    assert "'knee' ends up to 0.4 rad away" in why

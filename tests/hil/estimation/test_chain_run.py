@@ -1,7 +1,10 @@
 """A spatial arm from its TOML file to result, model and exports, on the fake bus."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import mujoco
@@ -13,8 +16,8 @@ from hil.chain_model import ChainArmModel
 from hil.config.schema import Config, load_config, parse_config
 from hil.description.urdf import read_urdf
 from hil.errors import ConfigError
-from hil.estimation.calibrate import AddedMass, calibrate_runs
-from hil.estimation.chain_estimate import unmoved
+from hil.estimation.calibrate import AddedMass, CalibrationFit, CalibrationResult, calibrate_runs, calibration_lines
+from hil.estimation.chain_estimate import _verdict, unmoved
 from hil.estimation.changes.diff import diff_runs
 from hil.estimation.comparison.compare import compare_run
 from hil.estimation.settled_estimate import estimate_run
@@ -25,6 +28,7 @@ from hil.experiment.run import run_experiment
 from hil.export.formats import export
 from hil.export.posterior import draw_arms
 from hil.export.source import Source
+from hil.plan.chain_model import known_chain
 from hil.plan.chain_plan import make_chain_plan
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
@@ -259,3 +263,25 @@ def test_too_little_torque_for_the_path_is_named() -> None:
     weak = TEXT.replace("current_limit = 1.2", "current_limit = 0.3")
     with pytest.raises(ConfigError, match="needs about"):
         make_chain_plan(parse_config(weak, FOUR))
+
+
+def test_an_unfinished_calibration_says_so() -> None:
+    fit = CalibrationFit(residual_rms_ticks=((0.29,), (0.29,)), misfit=1.0, joints=1)
+    result = CalibrationResult(1, {}, {}, fit)
+    said = [" ".join(calibration_lines(replace(result, fit=replace(fit, reached=each)))) for each in (True, False)]
+    assert "stopped before its minimum" not in said[0]
+    assert "stopped before its minimum" in said[1]
+
+
+def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
+    config = run.load_config()
+    known = known_chain(config)
+    explained = 0.29 * np.ones(4)
+    estimate: Any = SimpleNamespace(
+        std=0.01 * known.prior.std, residual_steps=explained, from_prior=(), unseen=(), reached=True
+    )
+    verdicts = []
+    for estimate.reached in (True, False):
+        verdicts.append(_verdict(config, estimate, known, np.full(4, 1e-3), []))
+    assert [verdict.trust for verdict in verdicts] == ["yes", "with care"]
+    assert "stopped before its minimum" in verdicts[1].sentences[-1]

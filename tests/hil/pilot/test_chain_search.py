@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hil
-from hil.config.schema import load_config, parse_config
+from hil.config.schema import Config, load_config, parse_config
 from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_summary import unsafe
@@ -128,11 +128,56 @@ def test_only_a_limit_takes_amplitude_away_not_a_joint_that_friction_holds() -> 
     assert search.cap == pytest.approx(0.21)
 
 
-def test_a_path_too_heavy_for_the_motors_is_not_safe_but_smaller_ones_are_tried() -> None:
+def search_of(config: Config, belief: ChainBelief, said: list[str]) -> ChainSearch:
+    paths = Paths.of(config, ChainBelief.prior(config).torque)
+    return ChainSearch(config, cast("Any", None), LEG, cast("Any", None), said.append, belief, paths)
+
+
+def heavier(belief: ChainBelief, times: float) -> ChainBelief:
+    return replace(belief, arms=replace(belief.arms, rigid=times * belief.arms.rigid))
+
+
+@pytest.mark.parametrize("safe_at_first", [0.0, 0.18, 0.4])
+def test_where_little_of_a_path_is_safe_another_one_with_more_reserve_is_tried(
+    monkeypatch: pytest.MonkeyPatch, safe_at_first: float
+) -> None:
+    """It is used if more is learned from it, and never if nothing of it is safe."""
     config = chain_config(load_config(LEG))
-    belief = ChainBelief.prior(config)
-    paths = Paths.of(config, belief.torque)
-    heavy = ChainBelief(config, replace(belief.arms, rigid=6.0 * belief.arms.rigid))
-    search = ChainSearch(config, cast("Any", None), LEG, cast("Any", None), print, heavy, paths)
-    with pytest.raises(NoSafeTorque, match=r"not even 90 % of the designed path: .*needs about"):
+    said: list[str] = []
+    search = search_of(config, ChainBelief.prior(config), said)
+    designed, roomier = search.paths, []
+
+    def largest(_: object, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
+        share = safe_at_first if search.paths is designed else 0.64
+        if search.paths is not designed:
+            roomier.append(search.paths.reserve)
+        found = Found(share, cast("Any", None), cast("Any", None)) if share else None
+        return found, "shank and floor: 2 mm", 0.008
+
+    monkeypatch.setattr(search, "_largest", largest)
+    found = search.safe(search.config, (1.0, 0.64, 0.4, 0.18))
+    assert found.share == 0.64
+    assert search.paths.identify is not designed.identify
+    assert said == ["Designed another path, which leaves more reserve to the limits."]
+    (reserve,) = roomier
+    assert reserve.clearance == pytest.approx(designed.reserve.clearance + 0.008)
+    assert reserve.torque < designed.reserve.torque and reserve.position > designed.reserve.position
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    room = reserve.position * (high - low)[:, None]
+    position = search.paths.identify.path.position
+    assert (position >= low[:, None] + 0.99 * room).all() and (position <= high[:, None] - 0.99 * room).all()
+
+
+def test_an_arm_too_heavy_for_any_path_is_refused_with_the_reason_and_what_helps() -> None:
+    config = chain_config(load_config(LEG))
+    search = search_of(config, heavier(ChainBelief.prior(config), 20.0), [])
+    with pytest.raises(NoSafeTorque, match=r"not even 90 % of the designed path: .*needs about.*What helps"):
         search.safe(step_config(search.config), (1.0, 0.9))
+
+
+def test_a_path_that_is_safe_is_kept() -> None:
+    config = chain_config(load_config(LEG))
+    search = search_of(config, ChainBelief.prior(config), [])
+    designed = search.paths
+    assert search.safe(step_config(search.config), (0.3,)).share == 0.3
+    assert search.paths is designed

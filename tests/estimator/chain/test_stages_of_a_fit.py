@@ -1,0 +1,165 @@
+"""How a chain's fit goes from one stage to the next: tempering, softening, restarts from narrower Coulomb steps."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import chain as bench
+from hil.estimator.chain import identify
+from hil.estimator.chain.fit import stage2
+from hil.estimator.chain.fit.objective import ChainProblem
+from hil.estimator.chain.fit.stage1 import fit_lines
+from hil.estimator.chain.fit.stage2 import DEFAULTS, REPEATED, ChainFit
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic
+
+
+@pytest.fixture(scope="module")
+def setup() -> bench.Setup:
+    return bench.set_up(bench.BENCHES[4], 1)
+
+
+def sticking(often: int) -> SettledPeriod:
+    """A period of 1 s in which each reading is repeated this many times."""
+    time = (np.arange(400) // often * often) / 400.0
+    position = 0.5 * np.sin(2.0 * np.pi * np.outer([1, 2, 3, 3], time) + 0.1)
+    return SettledPeriod(400.0, np.cos(position), position, 0.0, np.full(4, bench.TICK))
+
+
+def problem_of(setup: bench.Setup, period: SettledPeriod) -> tuple[ChainProblem, np.ndarray]:
+    model = ChainModel(setup.base)
+    return stage2._problem([period], model, fit_lines([period], model, setup.prior), setup.prior, DEFAULTS)
+
+
+@pytest.mark.parametrize("often", [1, 16, 50])
+@pytest.mark.parametrize("off", [0.5, 3.0])
+def test_the_prior_counts_as_much_more_as_the_residual_exceeds_the_noise(
+    setup: bench.Setup, monkeypatch: pytest.MonkeyPatch, often: int, off: float
+) -> None:
+    """However often a joint that sticks repeats its readings."""
+    period = sticking(often)
+    problem, x = problem_of(setup, period)
+
+    def cost(of: ChainProblem, _: np.ndarray) -> float:  # every sample is off by as many standard deviations
+        return sum(float(np.sum((weight[:: of.every] * off * period.noise) ** 2)) for weight in of.weights)
+
+    monkeypatch.setattr(ChainProblem, "cost", cost)
+    for every in (1, 2):
+        found = stage2._tempered(replace(problem, every=every), x).prior_weight
+        assert found == pytest.approx(max(1.0, off**2))
+
+
+def test_repeated_readings_count_as_a_few(setup: bench.Setup) -> None:
+    counted = [float(np.sum(stage2._repeated(sticking(often)) ** 2)) for often in (1, REPEATED, 16, 50)]
+    np.testing.assert_allclose(counted, [1600, 1600, 1600 * REPEATED / 16, 1600 * REPEATED / 50])
+
+
+@dataclass(frozen=True)
+class Softer:
+    """A problem whose minimum has a known cost under each observer, from the data and from the prior."""
+
+    costs: dict[float, tuple[float, float]]
+    periods: tuple[SettledPeriod, ...]
+    steps: int = 2
+    softness: float = 0.0
+    every: int = 1
+
+    def prior_cost(self, x: np.ndarray) -> float:
+        return self.costs[self.softness][1]
+
+    def minimise(self, x: np.ndarray, ftol: float) -> Minimum:
+        return Minimum(x + 1.0, Quadratic(sum(self.costs[self.softness]), np.eye(2), np.zeros(2)), 1)
+
+
+@pytest.mark.parametrize(
+    ("costs", "kept"),
+    [
+        ({3.0: (1e3, 0.0), 1.5: (4e3, 0.0), 1.0: (9e3, 0.0)}, 1.0),  # as much as the softness explains
+        ({3.0: (1e3, 0.0), 1.5: (4e3, 0.0), 1.0: (9e4, 0.0)}, 1.5),  # the softest observer loses the motion
+        ({3.0: (1e3, 1e6), 1.5: (9e4, 0.0), 1.0: (9e5, 0.0)}, 3.0),  # so does this, whatever the prior costs
+        ({3.0: (1e3, 0.0), 1.5: (1e3, 1e6), 1.0: (1e3, 1e6)}, 1.0),  # only the prior counts more
+    ],
+)
+def test_the_softest_observer_that_follows_is_kept(
+    monkeypatch: pytest.MonkeyPatch, costs: dict[float, tuple[float, float]], kept: float
+) -> None:
+    monkeypatch.setattr(stage2, "_tempered", lambda problem, _: problem)
+    problem: Any = Softer(costs, (sticking(1),))
+    x, softness, _ = stage2._softened(problem, np.zeros(2), DEFAULTS)
+    assert softness == kept
+    np.testing.assert_array_equal(x, 1.0 + DEFAULTS.softness.index(kept))
+
+
+def fit_of(setup: bench.Setup, period: SettledPeriod, width: float, off: float) -> ChainFit:
+    """A fit with Coulomb steps of this width whose residual is this many encoder steps."""
+    model = ChainModel(setup.base)
+    value = np.array([width if name.startswith("coulomb_width") else 0.5 for name in model.names])
+    nothing = np.zeros((value.size, value.size))
+    return ChainFit(
+        value,
+        nothing,
+        nothing[0],
+        nothing,
+        (np.zeros((2, 4)),),
+        (period.position + off * bench.TICK,),
+        outliers=0,
+        correlation_time=1.0,
+        iterations=1,
+        softness=1.0,
+        remaining=0.0,
+    )
+
+
+def restarts(
+    setup: bench.Setup, monkeypatch: pytest.MonkeyPatch, *answers: tuple[float, float]
+) -> tuple[list[tuple[float, float | None]], ChainFit]:
+    """The widths from which `_best_fit` starts, with those of the fit it starts near, and its result.
+
+    answers: width and residual of each fit.
+    """
+    period, model, tried = sticking(1), ChainModel(setup.base), []
+
+    def fit(*given: Any) -> ChainFit:
+        near: ChainFit | None = given[6] if len(given) > 6 else None
+        tried.append((given[4].initial_width, None if near is None else float(near.value[-13])))
+        return fit_of(setup, period, *answers[len(tried) - 1])
+
+    monkeypatch.setattr(identify, "fit_periods", fit)
+    found = identify._best_fit([period], model, fit_lines([period], model, setup.prior), setup.prior, DEFAULTS, ())
+    return tried, found
+
+
+def test_an_explained_motion_is_fitted_once(setup: bench.Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried, _ = restarts(setup, monkeypatch, (0.02, 0.29))
+    assert [width for width, _ in tried] == [0.03]
+
+
+def test_a_better_minimum_is_kept_and_ends_the_restarts(setup: bench.Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried, found = restarts(setup, monkeypatch, (0.02, 0.5), (0.004, 0.29))
+    assert [width for width, _ in tried] == [0.03, 0.005]
+    assert found.positions[0][0, 0] == pytest.approx(sticking(1).position[0, 0] + 0.29 * bench.TICK)
+
+
+def test_a_worse_minimum_is_dropped(setup: bench.Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    tried, found = restarts(setup, monkeypatch, (0.02, 0.5), (0.004, 0.6), (0.001, 0.7))
+    assert [width for width, _ in tried] == [0.03, 0.005, 0.001]
+    assert found.value[-13] == 0.02
+
+
+def test_a_fit_does_not_start_again_from_its_own_minimum(setup: bench.Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With all Coulomb steps as narrow already, the restart would be the same fit."""
+    tried, _ = restarts(setup, monkeypatch, (0.004, 0.5), (0.0009, 0.45))
+    assert tried == [(0.03, None), (0.001, 0.004)]
+
+
+def test_a_restart_keeps_all_but_wide_coulomb_steps(setup: bench.Setup) -> None:
+    problem, _ = problem_of(setup, sticking(1))
+    names = problem.coordinates.names
+    for width, expected in ((0.02, 0.005), (0.002, 0.002)):
+        near = fit_of(setup, sticking(1), width, 0.5)
+        x = stage2._narrowed(problem, near, replace(DEFAULTS, initial_width=0.005))
+        wanted = [expected if name.startswith("coulomb_width") else 0.5 for name in names]
+        np.testing.assert_allclose(problem.coordinates.values(x[: problem.count]), wanted)
