@@ -73,7 +73,7 @@ class ReadBack:
 
     @property
     def read(self) -> GroupRead:
-        """The next group read."""
+        """The group read to send next: that of the goals or that of the operating modes."""
         return self.reads[self._is_of_modes]
 
     def took(self, seconds: float) -> None:

@@ -97,7 +97,7 @@ class Term:
     sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of these two; for a term of each joint, terms of the same joint."""
+    """Names of the two terms of which this one is a share; for a term of each joint, terms of the same joint."""
     scale: Scale | float = 1.0
     """Typical change in the fit: the name of a scale of the arm and its motion, or a number [unit]."""
     initial: float = 0.0
@@ -115,7 +115,7 @@ class Term:
     spread: Scale | float | None = None
     """Standard deviation from its `absent` value among typical arms, as a scale or a number [unit]; None if unknown."""
     log_spread: float | None = None
-    """Standard deviation of a positive term's logarithm from that of `initial`; None if unknown."""
+    """Standard deviation of a positive term's logarithm from the logarithm of `initial`; None if unknown."""
 
     @property
     def of_torque(self) -> bool:

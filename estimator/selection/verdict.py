@@ -59,11 +59,11 @@ class Evidence:
     held_out: Array | None = None
     """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,).
 
-    Where friction has changed since the fitted motion, with one factor per joint taken from the held-out motion itself.
+    Where friction has changed since the fitted motion, the prediction uses one factor per joint taken from the held-out
+    motion itself.
     """
     held_out_as_fitted: Array | None = None
-    """RMS error of that prediction with friction as it was in the fitted motion (joints,); None where it has not
-    changed.
+    """As `held_out`, but with friction as it was in the fitted motion (joints,); None where it has not changed.
     """
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""

@@ -108,7 +108,9 @@ class Paths:
 
 
 def chain_config(config: Config) -> Config:
-    """The configuration with a band, and a ramp long enough to reach every pose within the limits slowly."""
+    """The configuration with a frequency band, and with a ramp long enough to move slowly to any pose within the
+    limits.
+    """
     experiment = config.experiment
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     rest = np.array(config.arm.rest_pose)

@@ -53,7 +53,7 @@ class Search:
     from_earlier: bool = False
     """Whether the belief comes from an earlier run that no run so far has contradicted."""
     earlier_swing: Array | None = None
-    """Range of motion of each joint in that run (joints,) [rad], if known."""
+    """Range of motion of each joint in the earlier run from which the belief comes (joints,) [rad], if known."""
 
     @classmethod
     def of(

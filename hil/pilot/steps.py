@@ -28,7 +28,7 @@ _AT_A_LIMIT = (Cause.POSITION, Cause.VELOCITY)
 
 
 _BESIDE = 2
-"""Number of joints up to which predicted and measured peaks fit side by side."""
+"""Largest number of joints for which the table shows predicted and measured peaks side by side."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,11 @@ class Played:
 
 @dataclass(frozen=True)
 class Player:
-    """Plays runs; knows the configuration file, the observer of the stream and the function that shows messages."""
+    """Plays runs and reports them.
+
+    shown_path: path of the configuration file, for messages. watch: observer of the sample stream. say: shows a
+    message.
+    """
 
     shown_path: Path
     watch: Watch
