@@ -3,6 +3,7 @@
 A run that moved nothing, exceeded a limit or never settled is informative too.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, NoReturn
 
@@ -45,8 +46,6 @@ class Search:
     swing: Array | None = None
     """Largest range of motion of each joint so far (joints,) [rad]."""
 
-    too_fast: NDArray[np.bool_] | None = None
-    """Joints that exceeded their velocity limit in the last run (joints,); None if that was not why it ended."""
     springs: NDArray[np.bool_] | None = None
     """Joints that a stabiliser held (joints,)."""
     options: PilotOptions = DEFAULTS
@@ -54,6 +53,15 @@ class Search:
     """Whether the belief comes from an earlier run that no run so far has contradicted."""
     earlier_swing: Array | None = None
     """Range of motion of each joint in the earlier run from which the belief comes (joints,) [rad], if known."""
+
+    fast: NDArray[np.bool_] = field(init=False)
+    """Joints that exceeded their velocity limit in the last run before they had moved (joints,)."""
+    calm: Array = field(init=False)
+    """Torque (joints,) [N m] below that of all runs in which a joint did so; infinite if none did."""
+
+    def __post_init__(self) -> None:
+        self.fast = np.zeros(len(self.config.joints), dtype=np.bool_)
+        self.calm = np.full(len(self.config.joints), np.inf)
 
     @classmethod
     def of(
@@ -94,8 +102,6 @@ class Search:
     def learn(self, config: Config, played: Played) -> None:
         """Update the belief with the outcome of a run of `config`."""
         self.steps.append(played.step)
-        speed_limit = np.array([joint.velocity_limit for joint in self.config.joints])
-        self.too_fast = played.step.seen[2] > speed_limit if played.passed_velocity_limit else None
         if config.stabiliser is not None:
             self.springs = np.array(config.stabiliser.stiffness) > 0.0  # a joint that had one keeps it
         if played.passed_limit and not broke_free(self.config, config, played.step.seen).any():
@@ -110,6 +116,14 @@ class Search:
         self.pose = _within_limits(self.config, played.seen.end, self.options.start_inside)
         swing = played.seen.swing
         self.swing = swing if self.swing is None else np.maximum(self.swing, swing)
+        self._slow_down(played)
+
+    def _slow_down(self, played: Played) -> None:
+        """Limit the torque of joints that exceeded their velocity limit before they had moved."""
+        limit = np.array([joint.velocity_limit for joint in self.config.joints])
+        self.fast = played.passed_velocity_limit & ~self.moved & (played.step.seen[2] > limit)
+        calmer = self.options.torque_after_limit * played.step.peak_torque
+        self.calm = np.where(self.fast, np.minimum(calmer, self.calm), self.calm)
 
     @property
     def moved(self) -> NDArray[np.bool_]:
@@ -157,30 +171,34 @@ class Search:
     def _pilot(self) -> None:
         """Play small runs until every joint moves, with more torque from run to run, up to the current limits."""
         options = self.options
-        jerked = np.zeros(len(self.config.joints), dtype=np.bool_)
         while True:
             number = len(self.steps)
             config, found = self._pilot_amplitude(pilot_config(self.held, options), number)
+            before = self.calm
             self._play(config, f"pilot-{number + 1}", "Pilot" if number == 0 else f"Pilot {number + 1}", found)
-            moved = self.moved
-            if moved.all():
+            still = ~self.moved
+            if not still.any():
                 return
-            still = _names(self.config, ~moved)
-            if self.too_fast is not None and (fast := self.too_fast & ~moved).any():
-                if (fast & jerked).any():
-                    self._refuse_velocity_limit(fast & jerked)
-                jerked |= fast
-                self.player.say(
-                    f"{_and(_names(self.config, fast))} exceeded the velocity limit before moving by {MOVED_STEPS} "
-                    f"encoder steps. Repeating with {options.torque_after_limit:.0%} of its torque."
-                )
-                continue
-            at_limit = found.peak_torque[~moved] >= options.at_limit * most_torque(config)[~moved]
-            if at_limit.all() or len(self.steps) >= options.max_pilots:
-                self._give_up(config, still)
-            self.player.say(
-                f"{_and(still)} did not move: friction is larger than this torque. Repeating with more torque."
+            if (again := self.fast & np.isfinite(before)).any():
+                self._refuse_velocity_limit(again)
+            at_limit = found.peak_torque >= options.at_limit * np.minimum(most_torque(config), before)
+            if at_limit[still].all() or len(self.steps) >= options.max_pilots:
+                if (calm := still & np.isfinite(self.calm)).any():
+                    self._refuse_velocity_limit(calm)
+                self._give_up(config, _names(self.config, still))
+            self.player.say(" ".join(self._of_still(still)))
+
+    def _of_still(self, still: NDArray[np.bool_]) -> Iterator[str]:
+        """Sentences on joints that have not moved."""
+        if self.fast.any():
+            yield (
+                f"{_and(_names(self.config, self.fast))} exceeded the velocity limit before moving by {MOVED_STEPS} "
+                "encoder steps: less torque is next."
             )
+        held = still & ~self.fast
+        if held.any():
+            said = f"{_and(_names(self.config, held))} did not move: friction is larger than this torque."
+            yield f"{said} Repeating with more torque."
 
     def _pilot_amplitude(self, config: Config, number: int) -> tuple[Config, Amplitude]:
         """Configuration and amplitude of a pilot.
@@ -207,8 +225,7 @@ class Search:
         ratio = options.falling_breakaway_raise if falls else options.breakaway_raise
         former = self.steps[-1].peak_torque
         wanted = raised(found.peak_torque, former, still, ratio, most)
-        if self.too_fast is not None:
-            wanted = np.where(self.too_fast & still, options.torque_after_limit * former, wanted)
+        wanted = np.where(still, np.minimum(wanted, self.calm), wanted)
         if (wanted == found.peak_torque).all():
             return config, found
         risky = wanted > found.peak_torque
@@ -297,7 +314,7 @@ class Search:
             if is_fast
         )
         raise ExperimentError(
-            f"{_and(_names(self.config, fast))} exceeded the velocity limit twice on breaking away, before moving far "
+            f"{_and(_names(self.config, fast))} exceeded the velocity limit on breaking away, before moving far "
             f"enough to be measured ({said}). More torque would only be faster: raise velocity_limit."
         )
 
