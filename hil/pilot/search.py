@@ -4,7 +4,7 @@ A run that moved nothing, exceeded a limit or never settled is informative too.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,8 @@ class Search:
     swing: Array | None = None
     """Largest range of motion of each joint so far (joints,) [rad]."""
 
+    too_fast: NDArray[np.bool_] | None = None
+    """Joints that exceeded their velocity limit in the last run (joints,); None if that was not why it ended."""
     springs: NDArray[np.bool_] | None = None
     """Joints that a stabiliser held (joints,)."""
     options: PilotOptions = DEFAULTS
@@ -92,6 +94,8 @@ class Search:
     def learn(self, config: Config, played: Played) -> None:
         """Update the belief with the outcome of a run of `config`."""
         self.steps.append(played.step)
+        speed_limit = np.array([joint.velocity_limit for joint in self.config.joints])
+        self.too_fast = played.step.seen[2] > speed_limit if played.passed_velocity_limit else None
         if config.stabiliser is not None:
             self.springs = np.array(config.stabiliser.stiffness) > 0.0  # a joint that had one keeps it
         if played.passed_limit and not broke_free(self.config, config, played.step.seen).any():
@@ -153,6 +157,7 @@ class Search:
     def _pilot(self) -> None:
         """Play small runs until every joint moves, with more torque from run to run, up to the current limits."""
         options = self.options
+        jerked = np.zeros(len(self.config.joints), dtype=np.bool_)
         while True:
             number = len(self.steps)
             config, found = self._pilot_amplitude(pilot_config(self.held, options), number)
@@ -160,7 +165,16 @@ class Search:
             moved = self.moved
             if moved.all():
                 return
-            still = [joint.name for joint, moves in zip(self.config.joints, moved, strict=True) if not moves]
+            still = _names(self.config, ~moved)
+            if self.too_fast is not None and (fast := self.too_fast & ~moved).any():
+                if (fast & jerked).any():
+                    self._refuse_velocity_limit(fast & jerked)
+                jerked |= fast
+                self.player.say(
+                    f"{_and(_names(self.config, fast))} exceeded the velocity limit before moving by {MOVED_STEPS} "
+                    f"encoder steps. Repeating with {options.torque_after_limit:.0%} of its torque."
+                )
+                continue
             at_limit = found.peak_torque[~moved] >= options.at_limit * most_torque(config)[~moved]
             if at_limit.all() or len(self.steps) >= options.max_pilots:
                 self._give_up(config, still)
@@ -191,7 +205,10 @@ class Search:
             return config, found
         still = ~self.moved
         ratio = options.falling_breakaway_raise if falls else options.breakaway_raise
-        wanted = raised(found.peak_torque, self.steps[-1].peak_torque, still, ratio, most)
+        former = self.steps[-1].peak_torque
+        wanted = raised(found.peak_torque, former, still, ratio, most)
+        if self.too_fast is not None:
+            wanted = np.where(self.too_fast & still, options.torque_after_limit * former, wanted)
         if (wanted == found.peak_torque).all():
             return config, found
         risky = wanted > found.peak_torque
@@ -272,6 +289,18 @@ class Search:
         """Fraction of the limit that a typical arm reaches (joints,)."""
         return np.asarray(np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0))
 
+    def _refuse_velocity_limit(self, fast: NDArray[np.bool_]) -> NoReturn:
+        said = "; ".join(
+            f"{joint.name}: velocity_limit = {joint.velocity_limit:g} rad/s, {MOVED_STEPS} encoder steps are "
+            f"{MOVED_STEPS * joint.joint.servo.position_unit:.2g} rad"
+            for joint, is_fast in zip(self.config.joints, fast.tolist(), strict=True)
+            if is_fast
+        )
+        raise ExperimentError(
+            f"{_and(_names(self.config, fast))} exceeded the velocity limit twice on breaking away, before moving far "
+            f"enough to be measured ({said}). More torque would only be faster: raise velocity_limit."
+        )
+
     def _give_up(self, config: Config, still: list[str]) -> None:
         tried = "; ".join(
             f"{step.name} {', '.join(f'{torque:.3g}' for torque in step.peak_torque)} N m" for step in self.steps
@@ -282,6 +311,10 @@ class Search:
             f"{most} N m. Move it by hand with torque off. If it is free, raise its current_limit or voltage_limit, "
             "check the supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
         )
+
+
+def _names(config: Config, chosen: NDArray[np.bool_]) -> list[str]:
+    return [joint.name for joint, is_chosen in zip(config.joints, chosen.tolist(), strict=True) if is_chosen]
 
 
 def used_range(found: Amplitude) -> Array:

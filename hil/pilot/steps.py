@@ -93,6 +93,11 @@ class Played:
         return isinstance(self.error, SafetyStop) and self.error.cause in _AT_A_LIMIT
 
     @property
+    def passed_velocity_limit(self) -> bool:
+        """Whether the guard stopped the run because a joint was too fast."""
+        return isinstance(self.error, SafetyStop) and self.error.cause is Cause.VELOCITY
+
+    @property
     def unlike_before(self) -> bool:
         """Whether the run was stopped because its motion did not repeat."""
         return isinstance(self.error, SafetyStop) and self.error.cause is Cause.UNLIKE_BEFORE
