@@ -46,7 +46,7 @@ class Search:
     """Largest range of motion of each joint so far (joints,) [rad]."""
 
     too_fast: NDArray[np.bool_] | None = None
-    """Joints that exceeded their velocity limit in the last run (joints,); None if that was not why it ended."""
+    """Joints whose excessive velocity ended the last run (joints,); None if it ended for another reason."""
     springs: NDArray[np.bool_] | None = None
     """Joints that a stabiliser held (joints,)."""
     options: PilotOptions = DEFAULTS
@@ -297,8 +297,8 @@ class Search:
             if is_fast
         )
         raise ExperimentError(
-            f"{_and(_names(self.config, fast))} exceeded the velocity limit twice on breaking away, before moving far "
-            f"enough to be measured ({said}). More torque would only be faster: raise velocity_limit."
+            f"{_and(_names(self.config, fast))} exceeded the velocity limit twice while breaking away, before moving "
+            f"far enough to be measured ({said}). More torque would only increase the speed: raise velocity_limit."
         )
 
     def _give_up(self, config: Config, still: list[str]) -> None:
