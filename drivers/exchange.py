@@ -313,7 +313,7 @@ class Exchange:
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
 
     def _overhear(self, received: bytes) -> None:
-        """Examine bytes that were pending before the request: another master's, or a late or second reply."""
+        """Examine bytes that were pending before the request: from another master, or a late or repeated reply."""
         packets = _packets_within(received)
         self._look_for_strangers(packets)
         if any(packet.is_status for packet in packets):

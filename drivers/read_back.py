@@ -103,7 +103,7 @@ class ReadBack:
         return None
 
     def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
-        """Place and value of each servo that holds what was not written."""
+        """Place and value of each servo that holds a value that this program did not write."""
         if self._is_of_modes:
             return [
                 (place, answer[-1])

@@ -240,7 +240,7 @@ def _add(
 def _is_wrong(fading: Any, unsure: float, velocity: float, lag: float, scale: float) -> bool:
     """Whether position and velocity disagree.
 
-    unsure: tolerance of this memory [rad]. lag, scale: largest accepted lag [s] and scale error.
+    unsure: tolerance of this fading memory [rad]. lag, scale: largest accepted lag [s] and scale error.
     """
     of_lag = lag * (velocity - fading.mean)
     allowed = unsure + scale * abs(fading.far) + fading.curved + fading.unknown + _LAG_SHARE * lag * fading.span

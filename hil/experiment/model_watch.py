@@ -36,16 +36,16 @@ alarm.
 """
 _TILT_SHARE = 0.2  # standard deviation of gravity perpendicular to the assumed direction, relative to gravity
 _FRICTION_SPREAD = 3.0
-"""Factor on the spread of servo friction for an arm without a description, which allows for friction elsewhere."""
+"""Factor on the spread of servo friction for an arm without a description, to allow for friction outside its servos."""
 _UNDESCRIBED = {"gravity": 10.0, "viscous": 1.0, "offset": 0.3, "tilt": 1.0}
 _INERTIA = 0.3
 """Standard deviations for an arm without a description, as multiples of the planned torque in SI units.
 
-A small first torque moves an arm by a tenth of a radian: its gravity torque is ten times as large. But it moves: a
-joint whose viscous friction or inertia were several times as large as that would not.
+If a small first torque moves an arm by a tenth of a radian, the arm's gravity torque is ten times as large. But the arm
+does move, which it would not if viscous friction or inertia were several times the planned torque.
 """
 _FLAT = 0.3
-"""Those of gravity and tilt if the arm moves in a horizontal plane."""
+"""Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the same units."""
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
 """Time for which a joint must appear stationary under a torque that is held over several exchanges [s]."""

@@ -99,7 +99,7 @@ def run_experiment(
 
 
 def _close(recorder: Recorder, torque: str) -> None:
-    """Close the recording; a failure is reported together with the state of the torque."""
+    """Close the recording; the error of a failure also states whether torque is off."""
     try:
         recorder.close()
     except RunFolderError as error:

@@ -314,8 +314,8 @@ class Search:
             if is_fast
         )
         raise ExperimentError(
-            f"{_and(_names(self.config, fast))} exceeded the velocity limit on breaking away, before moving far "
-            f"enough to be measured ({said}). More torque would only be faster: raise velocity_limit."
+            f"{_and(_names(self.config, fast))} exceeded the velocity limit while breaking away, before moving far "
+            f"enough to be measured ({said}). More torque would only increase the speed: raise velocity_limit."
         )
 
     def _give_up(self, config: Config, still: list[str]) -> None:

@@ -17,13 +17,13 @@ A stronger brake hardly stops sooner, and throws the arm back much farther if th
 """
 
 LIGHTEST = 0.5
-"""Smallest inertia that a joint may have, relative to the typical rotor inertia of its servo.
+"""Smallest inertia that a joint is assumed to have, relative to the typical rotor inertia of its servo.
 
 A light joint that is braked too hard is thrown back faster than it came before its velocity is read again.
 """
 
 LONGEST_HELD_S, DELAY_S = 0.01, 0.002
-"""Longest time between two exchanges, and the delay until a goal takes effect [s]: for that long a brake acts."""
+"""Longest time between two exchanges, and the delay until a goal takes effect [s]: a brake acts for their sum."""
 
 GETS_FASTER = 0.2
 """Increase in speed, relative to the velocity limit, at which braking is abandoned.
@@ -43,7 +43,9 @@ def may_brake(config: Config, error: BaseException) -> bool:
 
 
 def braking_gains(config: Config) -> list[float]:
-    """Braking gain of each joint [A s/rad, or V s/rad in PWM mode]: one brake at most stops the lightest joint."""
+    """Braking gain of each joint [A s/rad, or V s/rad in PWM mode]: until the next exchange, a brake at most stops the
+    lightest joint.
+    """
     held = min(1.0 / config.experiment.rate, LONGEST_HELD_S) + DELAY_S
     return [
         min(

@@ -131,7 +131,7 @@ class Jumpy(Held):
 
 def test_more_torque_does_not_help_a_joint_that_exceeds_its_velocity_limit(config: Config, tmp_path: Path) -> None:
     player = Jumpy([1e3, 0.3 * most_torque(config)[1]])
-    with pytest.raises(ExperimentError, match=r"Elbow exceeded the velocity limit on .* raise velocity_limit"):
+    with pytest.raises(ExperimentError, match=r"Elbow exceeded the velocity limit while .* raise velocity_limit"):
         searched(config, tmp_path, player)._pilot()
     torques = np.array(player.torques)[:, 1]
     first = int(np.argmax(torques > player.friction[1]))
