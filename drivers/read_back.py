@@ -19,10 +19,13 @@ _GOALS_PER_MODE = 2
 Number and times are drawn, because a regular pattern might never see a program that overwrites every other goal.
 """
 
+_GOALS_PER_MODE_IN_DOUBT = 4
+"""The same after a sighting, while every cycle is followed by a read-back."""
+
 REMEMBERED = 4
 """Number of latest goals that a servo may still hold if writes are lost; more are a matter of the status."""
 
-_GOAL_SIGHTINGS, _MODE_SIGHTINGS, _SIGHTED_S = 3, 2, 0.5
+_GOAL_SIGHTINGS, _MODE_SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Read-backs of a foreign goal or mode that prove another writer, and the time within which they must be made [s].
 
 With three, goals that are lost are noticed first, by the status.
@@ -32,7 +35,7 @@ TRY_AGAIN_S = 0.005
 """Time after which a read-back for which there was no time is tried again [s]."""
 
 _FADES = 0.98
-_IN_DOUBT_S = 0.1
+_IN_DOUBT_S = 0.3
 """Time after a sighting during which every cycle is followed by a read-back [s]."""
 
 
@@ -102,9 +105,11 @@ class ReadBack:
                 return Overruled(place, self._goals[place], value, sent[-1][place])
             self.doubts_until = now + _IN_DOUBT_S
             is_nearly_sure |= len(times) == most - 1
+        is_in_doubt = now < self.doubts_until
         # A change of mode resets the goal, so a foreign goal may be the first that is seen of it.
         if not is_nearly_sure:
-            self._until_mode = self._draw.randint(1, _GOALS_PER_MODE) if of_modes else self._until_mode - 1
+            most = _GOALS_PER_MODE_IN_DOUBT if is_in_doubt else self._draw.randint(1, _GOALS_PER_MODE)
+            self._until_mode = most if of_modes else self._until_mode - 1
             self._is_of_modes = self._until_mode == 0
-        self.due = now if now < self.doubts_until else now + _READ_BACK_S * self._draw.uniform(0.5, 1.5)
+        self.due = now if is_in_doubt else now + _READ_BACK_S * self._draw.uniform(0.5, 1.5)
         return None
