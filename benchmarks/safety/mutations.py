@@ -43,7 +43,9 @@ TESTS = {
     "hil/experiment/stop_request.py": [f"{_EXPERIMENT}/test_stop_request.py"],
     "hil/plan/silence.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/plan/brake.py": [f"{_EXPERIMENT}/test_brake.py"],
-    "hil/experiment/stream.py": [f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py"],
+    "hil/experiment/stream.py": [
+        *(f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py", f"{_EXPERIMENT}/test_lowering.py"),
+    ],
     "hil/drivers/exchange.py": ["tests/drivers/test_exchange.py", "tests/drivers/test_read_back.py"],
     "hil/drivers/torque_off.py": ["tests/drivers/test_torque_off.py"],
     "hil/runs/recording.py": ["tests/hil/runs/test_recording.py"],
