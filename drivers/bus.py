@@ -94,12 +94,13 @@ class ServoBus:
         """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
         self._exchange: Exchange | None = None
         self.exchanges_per_sample = 1
-        """Number of exchanges that keeps them CHECK_S apart, if the bus is fast enough; set by `prepare`."""
+        """Number of exchanges needed to keep them at most CHECK_S apart, if the bus is fast enough; set by `prepare`.
+        """
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._without_watchdog: set[Joint] = set()
         self._watchdog = 0.0
         self._armed: set[Joint] = set()
-        """Servos whose Bus Watchdog was armed and not switched off since."""
+        """Servos whose Bus Watchdog has been armed and not disarmed since."""
         self._last_answers: Sequence[Answer] = ()
         self.torque_off_report: TorqueOff | None = None
 
@@ -306,8 +307,8 @@ class ServoBus:
         if (found := exchange.overruled(due)) is not None:
             raise overruled(self._drives[found.place], found)
         if exchange.is_in_doubt and exchange.read_back_at <= self.port.clock.now():
-            # The status tells goals that are lost from those of another master. It takes the time of the next
-            # read-back, so it is only asked for right after one.
+            # The status distinguishes lost goals from another master's. Reading it takes the time of the next
+            # read-back, so it is only requested right after one.
             exchange.read_status_next()
 
     @property

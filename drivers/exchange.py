@@ -7,7 +7,7 @@ A Sync Write has no reply, so the group read that follows it can leave in the sa
 instead of two. All packets are prepared in advance; a cycle only packs the goals and computes one CRC.
 
 The registers that are read vary from cycle to cycle. Most cycles read `spans[0]`. Every `slow_every`-th cycle reads one
-of the other spans, in turn; every `status_every`-th cycle reads `status`, the registers that show whether torque is
+of the other spans, alternately; every `status_every`-th cycle reads `status`, the registers that show whether torque is
 still on. Every span must include what the control loop needs.
 """
 
@@ -37,7 +37,7 @@ MOST_PATIENCE_S = 0.02
 
 _NEVER = 1 << 62
 _DOUBTS = 3
-_PART_OF_A_REPLY = 8  # bytes; the header of a fast answer whose first servos were heard
+_PART_OF_A_REPLY = 8  # bytes; at least the header of a fast reply, whose first servos have then answered
 
 _crc = crc16.umts
 _pack_crc = struct.Struct("<H").pack
@@ -68,10 +68,10 @@ class Exchange:
     return_delay: the longest Return Delay Time of the servos [s].
     fast: read with Fast Sync Read.
     one_write: send both packets in one write instead of two.
-    slow_every: number of cycles between two slow spans.
+    slow_every: number of cycles between two reads of a slow span, i.e. one of `spans[1:]`.
     status_every: number of cycles between two status reads; there are none if `status` is None.
     interval: time between two cycles [s], 0 if unknown; a slow cycle can wait longer for a reply than a fast one.
-    patience: shortest time to wait for replies [s]; by default, as long as wire, servos and adapter may take.
+    patience: shortest time to wait for replies [s]; by default the longest time that wire, servos and adapter may need.
     """
 
     def __init__(
@@ -148,12 +148,14 @@ class Exchange:
         return max(self._timeouts)
 
     def read_status_next(self) -> None:
-        """Read the status in the next cycle instead of when its turn comes."""
+        """Read the status in the next cycle instead of when it is due."""
         if self._status_every < _NEVER:
             self._until_status = min(self._until_status, 1)
 
     def add_read_back(self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[int]) -> None:
-        """Prepare `overruled`. goal, mode: spans that end with the goal, and with Operating Mode. modes: those set."""
+        """Prepare `overruled`. goal, mode: spans that end with the goal and with Operating Mode. modes: the operating
+        modes that were set.
+        """
         self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
         self._expected = self._expected.union(*(read.expected for read in self._read_back.reads))
         self.read_back_at = -math.inf
@@ -166,8 +168,9 @@ class Exchange:
     def overruled(self, due: float) -> Overruled | None:
         """Read goals or operating modes back if there is time before the next cycle, which is due at `due` [s].
 
-        Goals of another master are overwritten by the next cycle, whose own answers come after that. Only what the
-        servos hold right before it shows who commands them. Missing answers are left to the next cycle to notice.
+        The next cycle overwrites another master's goals before its own replies are sampled, so only what the servos
+        hold right before a cycle shows who commands them. Missing replies are ignored here; the next cycle detects
+        them.
 
         Raises PortLost.
         """
@@ -178,7 +181,7 @@ class Exchange:
         asked = read.reply_size + (len(read.request) if self._echoes else 0)
         takes = max(self._lasted - port.wire_time(self._bytes(self._reads[0]) - self._bytes(read)), back.longest)
         if now + takes > due or self._late_possible:
-            back.took(0.0)  # a single long one, while this computer was busy, must not be the last
+            back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
             self.read_back_at = now + TRY_AGAIN_S
             return None
         port.clock.wait_until(due - takes - HOST_S)
@@ -187,6 +190,9 @@ class Exchange:
             self.read_back_at = before + TRY_AGAIN_S
             return None
         received = port.ask(read.request, asked, due - before, before)
+        if port.overheard:
+            self._overhear(port.overheard)
+            port.overheard = b""
         received = received.removeprefix(read.request)
         servos = read.unpack(received) or read.search(received)[0]
         now = self._now()
@@ -201,7 +207,8 @@ class Exchange:
     def cycle(self, goal_ticks: Sequence[int], *, between: bool = False) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.
 
-        between: an extra cycle between two samples. The slow spans wait for the next sample, which is recorded.
+        between: an extra cycle between two samples. Slow spans are left for the next sample, since only samples are
+        recorded.
 
         Raises PortLost; ValueError for the wrong number of goals or a goal that does not fit into two bytes.
         """
@@ -217,7 +224,7 @@ class Exchange:
                 goals += write.pack(goal_ticks)
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
-        self._sent.append(goal_ticks)
+        self._sent.append(tuple(goal_ticks))
         timeout = self._timeouts[span]
         before = self._now()
         if self._echoes:
@@ -255,7 +262,9 @@ class Exchange:
         return read.unpack(received) or self._search(read, received, deadline)
 
     def _other_span(self, between: bool) -> int:
-        """Choose the span for a cycle that does not simply read the first: after a loss, a slow span, or the status."""
+        """Choose the span for a cycle that does not read the usual one: another after a loss, a slow one, or the
+        status.
+        """
         if self._late_possible:
             self._late_possible = False
             if self._port.has_input():
@@ -296,13 +305,15 @@ class Exchange:
             self.strangers += sum(self._is_strange(packet) for packet in packets)
 
     def _is_strange(self, packet: Packet) -> bool:
-        """Whether this is another master's instruction, or the answer to one. A refusal has no data."""
+        """Whether this is another master's instruction or a reply to one. A reply without data, such as an error, may
+        be ours.
+        """
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
 
     def _overhear(self, received: bytes) -> None:
-        """Examine bytes that were pending before the request: another master's, or a late or second reply."""
+        """Examine bytes that were pending before the request: from another master, or a late or repeated reply."""
         packets = _packets_within(received)
         self._look_for_strangers(packets)
         if any(packet.is_status for packet in packets):

@@ -54,7 +54,9 @@ class Port:
     """
 
     overheard: bytes = b""
-    """What was pending before a request, which `ask` does not take for its reply: late replies, or other masters'."""
+    """Bytes pending before a request, which `ask` keeps apart from its reply: late replies, or replies to another
+    master.
+    """
 
     def __init__(self, url: str, baud: int, opened: Any) -> None:
         self.url = url

@@ -14,26 +14,29 @@ _READ_BACK_S = 0.015
 """Mean time between two read-backs [s]."""
 
 _GOALS_PER_MODE = 2
-"""Largest number of read-backs of goals between two of modes.
+"""Largest number of goal read-backs between two mode read-backs.
 
-Number and times are drawn, because a regular pattern might never see a program that overwrites every other goal.
+Number and times are random, because a regular pattern might never see a program that overwrites every other goal.
 """
 
+_GOALS_PER_MODE_IN_DOUBT = 4
+"""The same after a sighting, while every cycle is followed by a read-back."""
+
 REMEMBERED = 4
-"""Number of latest goals that a servo may still hold if writes are lost; more are a matter of the status."""
+"""Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
 
-_GOAL_SIGHTINGS, _MODE_SIGHTINGS, _SIGHTED_S = 3, 2, 0.5
-"""Read-backs of a foreign goal or mode that prove another writer, and the time within which they must be made [s].
+_GOAL_SIGHTINGS, _MODE_SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
+"""Read-backs of a foreign goal, or mode, that prove another writer, and the time within which they must occur [s].
 
-With three, goals that are lost are noticed first, by the status.
+Three for goals, so that the status detects lost writes first.
 """
 
 TRY_AGAIN_S = 0.005
-"""Time after which a read-back for which there was no time is tried again [s]."""
+"""Delay before a read-back that did not fit in before a cycle is tried again [s]."""
 
 _FADES = 0.98
-_IN_DOUBT_S = 0.1
-"""Time after a sighting during which every cycle is followed by a read-back [s]."""
+_IN_DOUBT_S = 0.3
+"""Time after a foreign value was read, during which every cycle is followed by a read-back [s]."""
 
 
 class Overruled(NamedTuple):
@@ -46,7 +49,7 @@ class Overruled(NamedTuple):
 
 
 class ReadBack:
-    """Looks in turn at the goals and at the operating modes that the servos hold right before a cycle."""
+    """Reads back alternately the goals and the operating modes that the servos hold right before a cycle."""
 
     def __init__(
         self,
@@ -61,7 +64,7 @@ class ReadBack:
         self.reads: tuple[GroupRead, GroupRead] = kind(ids, goal), kind(ids, mode)
         self.due = -math.inf
         self.longest = 0.0
-        """Duration of the longest read-back, which fades from memory [s]."""
+        """Duration of the longest recent read-back [s]; decays from one read-back to the next."""
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
         self._modes = tuple(modes)
         self._is_of_modes = True
@@ -73,7 +76,7 @@ class ReadBack:
 
     @property
     def read(self) -> GroupRead:
-        """The next group read."""
+        """The group read to send next: that of the goals or that of the operating modes."""
         return self.reads[self._is_of_modes]
 
     def took(self, seconds: float) -> None:
@@ -81,16 +84,9 @@ class ReadBack:
 
     def look(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float) -> Overruled | None:
         """Compare the answers with what was written; return what only another master can have written."""
-        # A servo that was given its neighbour's goal is not one that another master commands.
-        own = {tick for goals in sent for tick in goals}
         of_modes = self._is_of_modes
         is_nearly_sure = False
-        for place, answer in enumerate(servos):
-            if answer is None or len(answer) == 1:
-                continue
-            value = answer[-1]
-            if value == self._modes[place] if of_modes else value in own:
-                continue
+        for place, value in self._foreign(servos, sent):
             times = (self._modes_sighted if of_modes else self._goals_sighted)[place]
             while times and now - times[0] > _SIGHTED_S:
                 times.popleft()
@@ -102,9 +98,27 @@ class ReadBack:
                 return Overruled(place, self._goals[place], value, sent[-1][place])
             self.doubts_until = now + _IN_DOUBT_S
             is_nearly_sure |= len(times) == most - 1
-        # A change of mode resets the goal, so a foreign goal may be the first that is seen of it.
+        is_in_doubt = now < self.doubts_until
+        # A change of mode resets the goal, so a foreign goal may be its first sign.
         if not is_nearly_sure:
-            self._until_mode = self._draw.randint(1, _GOALS_PER_MODE) if of_modes else self._until_mode - 1
+            most = _GOALS_PER_MODE_IN_DOUBT if is_in_doubt else 1 + int(_GOALS_PER_MODE * self._draw.random())
+            self._until_mode = most if of_modes else self._until_mode - 1
             self._is_of_modes = self._until_mode == 0
-        self.due = now if now < self.doubts_until else now + _READ_BACK_S * self._draw.uniform(0.5, 1.5)
+        self.due = now if is_in_doubt else now + _READ_BACK_S * (0.5 + self._draw.random())
         return None
+
+    def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
+        """Place and value of each servo that holds a value that this program did not write."""
+        if self._is_of_modes:
+            return [
+                (place, answer[-1])
+                for place, (answer, mode) in enumerate(zip(servos, self._modes, strict=True))
+                if answer is not None and answer[-1] != mode and len(answer) > 1
+            ]
+        # A servo that received its neighbour's goal is not commanded by another master.
+        own = set().union(*sent)
+        return [
+            (place, answer[-1])
+            for place, answer in enumerate(servos)
+            if answer is not None and answer[-1] not in own and len(answer) > 1
+        ]

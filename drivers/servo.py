@@ -91,7 +91,7 @@ class Servo:
     def write(self, register: str, value: int, attempts: int | None = None) -> None:
         """Write a register and read it back; raises as `read`, and ServoRefused if another value is read back.
 
-        attempts: of the write and of the read; by default as many as for all set-up work.
+        attempts: how often the write, and then the read, may be tried; by default as often as in all set-up work.
         """
         attempts = _ATTEMPTS if attempts is None else attempts
         # The status packet may be lost or switched off (Status Return Level 1); what counts is the register's value.

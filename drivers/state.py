@@ -4,7 +4,7 @@ import functools
 import operator
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from hil.drivers.control_table import ControlTable
 from hil.drivers.exchange import Reply
@@ -17,7 +17,8 @@ NAN = float("nan")
 
 
 class Slow(NamedTuple):
-    """Values that are read in turn, a few times a second; NaN if not read in this cycle, or if the servo did not reply.
+    """Values that are read alternately, a few times a second; NaN if not read in this cycle, or if the servo did not
+    reply.
 
     tick: the servo's own clock [s], which wraps at 32.768 s. voltage: supply [V]. temperature: [degrees C].
     """
@@ -148,6 +149,7 @@ class Converter:
             (drive, joint.velocity_unit, joint.position_unit, joint.zero_ticks)
             for joint, drive in zip(joints, drive_units, strict=True)
         ]
+        self._none_missing = (False,) * len(self._joints)
 
     def ticks(self, goals: Sequence[float]) -> list[int]:
         """Return the goals rounded to the nearest ticks; raises ValueError for a goal that is not a finite number."""
@@ -157,7 +159,25 @@ class Converter:
             raise self._wrong(goals) from None
 
     def state(self, ticks: Sequence[int], reply: Reply) -> State:
+        before, after, span, servos = reply
         sent = tuple(map(operator.mul, self._drive_units, ticks))
+        try:
+            if span == 0:
+                # Most cycles: each servo answers with its ERR byte and the three values that are always read.
+                answers = cast("Sequence[tuple[int, int, int, int]]", servos)
+                values = [
+                    (raw_drive * drive, raw_velocity * velocity, (raw_position - zero) * position, error)
+                    for (error, raw_drive, raw_velocity, raw_position), (drive, velocity, position, zero) in zip(
+                        answers, self._scales, strict=True
+                    )
+                ]
+                return _state((before, after, sent, *zip(*values, strict=True), self._none_missing, None, None, None))
+        except (TypeError, ValueError):
+            pass  # a servo did not answer, or refused
+        return self._any_state(sent, reply)
+
+    def _any_state(self, sent: tuple[float, ...], reply: Reply) -> State:
+        """Convert a reply as `state` does, but for any span, and with answers that are missing or refusals."""
         # Additional registers precede the three that are always read, but voltage and temperature follow them.
         at = 1 if reply.span in (0, SLOW_SPANS) else 2 if reply.span == 1 else self._answer_length(reply) - 3
         drive, velocity, position, error, missing = [], [], [], [], []
@@ -176,9 +196,8 @@ class Converter:
                 error.append(answer[0])
         slow = _slow(reply) if 0 < reply.span <= SLOW_SPANS else None
         status = self._status(reply.servos) if reply.span > SLOW_SPANS else None
-        before, after = reply.time_before_write, reply.time_after_read
         measured = (tuple(drive), tuple(velocity), tuple(position), tuple(error), tuple(missing))
-        return _state((before, after, sent, *measured, slow, status, None))
+        return _state((reply.time_before_write, reply.time_after_read, sent, *measured, slow, status, None))
 
     def _status(self, answers: Sequence[Answer]) -> tuple[Status | None, ...]:
         told: list[Status | None] = []

@@ -18,6 +18,8 @@ Answer = tuple[int, ...] | None
 
 _crc = crc16.umts
 _ERROR_BITS = 0xFF & ~ALERT
+_FAST_ID = 9
+"""Index of the first servo's ID in a fast reply: behind header, broadcast ID, LEN, INST and its ERR."""
 _FORMATS = {(1, False): "B", (2, False): "H", (4, False): "I", (1, True): "b", (2, True): "h", (4, True): "i"}
 
 
@@ -39,7 +41,9 @@ class Span:
         spans = {cls._in(table, registers) for table in tables}
         if len(spans) != 1:
             models = ", ".join(sorted({table.model for table in tables}))
-            raise ValueError(f"{models} do not have {', '.join(registers)} at the same addresses: no common Sync Read.")
+            raise ValueError(
+                f"{models} do not have {', '.join(registers)} at the same addresses: they need separate reads."
+            )
         return spans.pop()
 
     @classmethod
@@ -177,11 +181,12 @@ class FastSyncRead:
         spans = one_each(span, len(self._ids))
         self._values = {servo_id: Struct(f"<Bx{own.format}") for servo_id, own in zip(ids, spans, strict=True)}
         span = spans[0]
-        # Unpack all parts at once: per servo its ERR, ID, values and CRC.
-        self._whole = Struct("<8x" + "".join(f"BB{own.format}H" for own in spans))
-        self._width = len(span.registers) + 3
+        # Unpack all parts at once: per servo its ERR and values.
+        self._whole = Struct("<8x" + "".join(f"Bx{own.format}2x" for own in spans))
+        self._width = len(span.registers) + 1
         self.request = _request(Instruction.FAST_SYNC_READ, ids, span)
-        part = span.size + 4  # ERR, ID, data, CRC
+        part = self._part = span.size + 4  # ERR, ID, data, CRC
+        self._id_bytes = bytes(ids)
         length = 1 + part * len(self._ids)
         self._front = HEADER + bytes((BROADCAST_ID,)) + length.to_bytes(2, "little") + bytes((Instruction.STATUS,))
         self._parts = [
@@ -194,18 +199,16 @@ class FastSyncRead:
     def unpack(self, received: bytes) -> list[Answer] | None:
         if len(received) != self.reply_size or not received.startswith(self._front):
             return None
-        fields = self._whole.unpack(received)
-        if fields[-1] != _crc(received[:-2]):
+        if (
+            received[_FAST_ID :: self._part] != self._id_bytes
+            or _crc(received[:-2]) != received[-2] | received[-1] << 8
+        ):
             return None
-        answers: list[Answer] = []
-        at, width = 0, self._width
-        for servo_id in self._ids:
-            error = fields[at]
-            if fields[at + 1] != servo_id or error & _ERROR_BITS:
+        fields, width = self._whole.unpack(received), self._width
+        for error in fields[::width]:
+            if error & _ERROR_BITS:
                 return None
-            answers.append((error, *fields[at + 2 : at + width - 1]))
-            at += width
-        return answers
+        return [fields[at : at + width] for at in range(0, len(fields), width)]
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
         at = received.find(self._front)

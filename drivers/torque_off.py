@@ -72,7 +72,7 @@ class TorqueOff:
         """Sentences about servos that were silent or rebooted and have answered since."""
         for joint in self.confirmed:
             if joint in self.later:
-                yield f"{joint.title} did not answer at first, and answers again."
+                yield f"{joint.title} did not answer at first, but answers again."
             if joint in self.rebooted:
                 yield (
                     f"{joint.title} was rebooted: its Bus Watchdog is no longer armed. Check its supply and its "

@@ -25,7 +25,7 @@ __all__ = [
 
 
 class EstimationError(Exception):
-    """The root: catch this to catch everything that the estimator raises."""
+    """Base class: catch it to catch everything that the estimator raises."""
 
 
 class ExcitationError(EstimationError):

@@ -58,8 +58,8 @@ class FakeSerial(SerialBase):
         **kwargs: object,
     ) -> None:
         self._description = description
-        real = isinstance(port, str) and port.endswith(REAL_TIME)
-        self.clock: Clock = clock or (WallClock() if real else VirtualClock())
+        self._may_be_real = clock is None
+        self.clock: Clock = clock or VirtualClock()
         self._bus: FakeBus | None = None
         self._pulls = 0
         super().__init__(port, *args, **kwargs)  # type: ignore[arg-type]  # pyserial's long list of settings
@@ -76,6 +76,8 @@ class FakeSerial(SerialBase):
         if self.is_open:
             raise serial.SerialException(f"{self.name or SCHEME} is already open")
         if self._bus is None:
+            if self._may_be_real and (self.port or "").endswith(REAL_TIME):
+                self.clock = WallClock()  # pyserial names the port only after its object has been created
             self._bus = self._build()
         self._bus.notice_faults()
         if self._bus.cable_is_out:

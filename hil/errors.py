@@ -139,7 +139,7 @@ class ExperimentError(HilError):
 
 
 class SafetyStop(ExperimentError):
-    """The guard stopped the arm, or a dry run forbade starting it. Example: joint 2 exceeded its position limit."""
+    """The guard stopped the arm, or a dry run ruled out starting it. Example: joint 2 exceeded its position limit."""
 
     def __init__(self, message: str, cause: Cause) -> None:
         super().__init__(message)

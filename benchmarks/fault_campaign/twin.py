@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 from hil.fakes.plants import motor
-from hil.fakes.plants.arm import Arm, Drive, Link
+from hil.fakes.plants.arm import Arm, Link
 from hil.fakes.plants.plant import make_plant
 
 Array = NDArray[np.float64]
@@ -180,7 +180,7 @@ def _altered(arm: Arm, parameters: Array) -> Arm:
             "coulomb": coulomb * drive.coulomb,
             "torque_constant": torque * drive.torque_constant,
         }
-        drives.append(Drive(**{**drive.model_dump(), **changed}))
+        drives.append(drive.model_copy(update=changed))  # not validated: configurations bound what a search may try
     start = (arm.start[0] + float(parameters[-1]), *arm.start[1:])
     return arm.model_copy(update={"links": tuple(links), "drives": tuple(drives), "start": start})
 

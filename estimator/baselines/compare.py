@@ -40,7 +40,7 @@ class Peer:
 
     name: str
     parameters: dict[str, float]
-    """Base parameters, and what else its simulation needs, by name [SI]."""
+    """Base parameters, and any others that its simulation needs, by name [SI]."""
     std: dict[str, float]
     """Standard errors as reported by the method, by name [SI]."""
     seconds: float

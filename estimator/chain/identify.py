@@ -36,7 +36,7 @@ class ChainEstimate(FittedParameters):
     position: Array
     """One-step-ahead prediction of the first period (joints, samples) [rad]."""
     positions: tuple[Array, ...]
-    """The same of each period."""
+    """One-step-ahead prediction of each period (joints, samples) [rad]."""
     iterations: int
     outliers: int
     white_std: Array

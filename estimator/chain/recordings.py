@@ -1,4 +1,4 @@
-"""Chains estimated from recordings of any motion: no settled period, any experiment.
+"""Chains estimated from recordings of arbitrary motion, from any experiment: no settled period is needed.
 
 Stage 1 is filtered inverse dynamics. Stage 2 is the same likelihood as for settled periods: its observer needs no
 periodic motion, only torque that was commanded. A measured torque already responds to the motion, so a simulation
@@ -63,7 +63,7 @@ class MotionPiece(SettledPeriod):
 
 @dataclass(frozen=True)
 class RecordedChain:
-    """Parameters of a chain estimated from recordings of any motion."""
+    """Parameters of a chain estimated from recordings of arbitrary motion."""
 
     model: ChainModel
     names: tuple[str, ...]
@@ -100,10 +100,10 @@ class RecordedChain:
 
 @one_blas_thread
 def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> RecordedChain:
-    """Estimate the parameters of `model` from recordings of any motion.
+    """Estimate the parameters of `model` from recordings of arbitrary motion.
 
-    Raises ModelError for other numbers of joints, RecordingError if a recording cannot be filtered, ConvergenceError if
-    no minimum is found.
+    Raises ModelError if the numbers of joints differ, RecordingError if a recording cannot be filtered,
+    ConvergenceError if no minimum is found.
     """
     for recording in recordings:
         if recording.joints != model.joints:
@@ -167,7 +167,7 @@ def _regression(recordings: Sequence[Recording], model: ChainModel, prior: Prior
 
 
 def _repeated(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> float:
-    """Return the factor by which correlation of the torque residual widens the variance of the parameters.
+    """Return the factor by which correlation of the torque residual increases the variance of the parameters.
 
     The sum of the autocorrelation up to its first negative value, of the worst joint. Errors of the regressor itself
     are not included.
@@ -190,7 +190,7 @@ def _torque_residual(recordings: Sequence[Recording], model: ChainModel, value: 
 
 
 def _beginning(piece: MotionPiece) -> PeriodicMotion:
-    """Return the motion, with velocities from smoothed angles; only its beginning and its level matter."""
+    """Return the motion, with velocities from smoothed angles; only those at its beginning and their RMS matter."""
     position = piece.filled()
     kernel = np.ones(VELOCITY_SAMPLES) / VELOCITY_SAMPLES
     padded = np.pad(position, ((0, 0), (VELOCITY_SAMPLES // 2,) * 2), mode="edge")

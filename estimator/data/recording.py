@@ -1,4 +1,4 @@
-"""A recording of any motion: torque and position at the actual sampling times."""
+"""A recording of arbitrary motion: torque and position at the actual sampling times."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,7 +25,7 @@ MOST_TORQUE = 1e4  # N m
 
 @dataclass(frozen=True)
 class Recording:
-    """Torque and position of an arm in any motion: ramps, swing-ups, recordings by other tools.
+    """Torque and position of an arm in arbitrary motion: ramps, swing-ups, recordings by other tools.
 
     Missing positions are NaN. Raises ShapeError for incompatible arrays; RecordingError for times that do not increase,
     non-finite values, gaps, and values that are implausible in SI units; StandstillError for a joint that moved by

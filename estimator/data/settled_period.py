@@ -98,8 +98,8 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
     """Return the period with single outliers (such as a bit error on the bus) marked as missing.
 
     A reading is an outlier if its distance from the median of itself and two neighbours on either side exceeds SPIKE
-    encoder steps and SPIKE times the typical distance. Where more than MOST_SPIKES are that far, they are no outliers:
-    the joint moves that fast, compared with the sample rate.
+    encoder steps and SPIKE times the typical distance. If the fraction of such readings exceeds MOST_SPIKES, they are
+    not outliers: the joint moves that fast, compared with the sample rate.
     """
     position = period.filled()
     away = np.abs(position - median_filter(position, size=(1, 5), mode="wrap"))

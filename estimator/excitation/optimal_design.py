@@ -52,7 +52,9 @@ class Design:
 
 
 def smoothed(physics: Physics) -> Physics:
-    """Return the same arm with friction steps at least LEAST_WIDTH wide: simulates faster, nearly the same optimum."""
+    """Return the same arm with friction steps at least LEAST_WIDTH wide, which simulates faster and has nearly the same
+    optimum.
+    """
     vector = physics.vector.copy()
     for joint in (1, 2):
         index = CONSTANTS.index(f"coulomb_width_{joint}")
@@ -146,7 +148,9 @@ class DesignProblem:
         return respond(physics, start, wave.torque, wave.rate, self.feedback).position
 
     def _columns(self, wave: Multisine, start: Array, nominal: Array) -> Array:
-        """Return the derivatives of all positions, in units of rounding, by parameters, nuisances and initial state."""
+        """Return the derivatives of all positions, in units of rounding, by parameters, nuisance parameters and initial
+        state.
+        """
         noise = (self.position_step / np.sqrt(12.0))[:, None]
 
         def by_parameter(name: str) -> Array:

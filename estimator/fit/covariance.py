@@ -7,7 +7,7 @@ windows of L samples, of the window's score times itself, divided by L: one pass
 
 A model error is not only correlated: it repeats at every reversal, so averaging does not remove it, and the part that
 resembles a parameter leaves no residual at all. Therefore the non-white part of the residual widens the errors further:
-1.4 standard deviations reach as far as the parameters can move before the motion changes (RMS) by as much as that part
+1.4 standard deviations cover every change of the parameters that alters the motion (RMS) by no more than that part
 (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
 """
 
@@ -157,9 +157,10 @@ def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: fl
 def _measured(
     at: Quadratic, scatter: Array | None, samples: int, structured: float, prior: Array
 ) -> tuple[Mask, Array, Array, Array]:
-    """Return the covariances from the data alone: for independent errors, and the robust one.
+    """Return two covariances from the data alone: for independent errors, and robust ones.
 
-    Both are of the coordinates that influence the residual, which are the first result, and relative to the second.
+    The mask that is returned first shows which coordinates they cover: those that influence the residual. Both are
+    relative to the scale that is returned next.
     """
     norm = np.sqrt(np.diag(at.normal))
     seen: Mask = norm > 1e-12 * norm.max()

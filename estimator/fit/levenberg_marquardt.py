@@ -59,8 +59,8 @@ def minimise(
 ) -> Minimum:
     """Minimise a sum of squares from `start`, in coordinates of order 1.
 
-    Where the sum alone costs much less than its normal equations, `cost` spares those of rejected steps, and a step
-    that succeeds is compared with less damped ones.
+    Where the sum alone is much cheaper to compute than its normal equations, `cost` avoids computing these for rejected
+    steps, and a step that succeeds is compared with less damped ones.
 
     Damped steps are short along weakly determined directions and would end the iteration too early there: near the
     minimum, `damping` should start at `options.min_damping`.
@@ -85,7 +85,10 @@ def minimise(
     """
     x, here = start, evaluate(start) if at is None else at
     if not np.isfinite(here.cost):
-        raise ConvergenceError("the simulation diverges at the initial guess: check the units of torque and time")
+        raise ConvergenceError(
+            "the simulation diverges at the initial guess: too little motion was recorded, or torque or time "
+            "have other units"
+        )
     damping = options.initial_damping if damping is None else damping
     evaluations = int(at is None)
     gained = np.inf
@@ -115,7 +118,7 @@ def step_limits(x: Array, options: MinimiserOptions) -> tuple[Array, Array]:
 
 @dataclass
 class _Trials:
-    """Damped steps from one point; `evaluations` counts the normal equations that they took."""
+    """Damped steps from one point; `evaluations` counts how often normal equations were computed for them."""
 
     x: Array
     at: Quadratic
@@ -143,7 +146,7 @@ class _Trials:
                 if there.cost < self.at.cost:
                     return (moved, there), max(options.min_damping, taken * trusted)
             # Also where `cost` promised a decrease that the normal equations' simulation does not confirm: damping
-            # rises from the step tried first, not from a bolder one, or the search would never end.
+            # rises from that of the step tried first, not of a less damped one, or the search would never end.
             damping = max(10.0 * damping, options.initial_damping)
         return None, damping
 
@@ -159,7 +162,7 @@ class _Trials:
         return moved, damping
 
     def _moved(self, damping: float) -> tuple[Array, float]:
-        """Return the end of a damped step, and the decrease of the sum of squares that the normal equations foresee."""
+        """Return the end of a damped step, and the decrease of the sum of squares that the normal equations predict."""
         step = _step(self.at.normal, self.at.gradient, damping, *self.limits)
         return self.move(self.x, step), -float(step @ (2.0 * self.at.gradient + self.at.normal @ step))
 

@@ -98,7 +98,7 @@ class Shooting:
     ) -> None:
         """Cut the recordings into segments.
 
-        most: maximum number of segments, evenly chosen; by default all. step: longest integration step [s].
+        most: maximum number of segments, evenly spread; by default all. step: longest integration step [s].
         """
         self._options = options
         self._recordings = recordings
@@ -137,7 +137,9 @@ class Shooting:
     def position_by_values(
         self, segment: RecordingSegment, values: Mapping[str, float], offsets: Array, own: Array
     ) -> Array:
-        """Return the same from parameters [SI], the `offsets` of the zeros and the segment's own coordinates."""
+        """Return the simulated positions from the parameters [SI], the `offsets` of the zeros and the segment's own
+        coordinates.
+        """
         state = own.reshape(2, -1) * self.state_scale
         return self.position(segment, self._with_zeros(values, segment, offsets), state)
 

@@ -48,7 +48,7 @@ class Refined:
 
 @dataclass(frozen=True)
 class Search:
-    """The search for one set of periods."""
+    """The search for the most likely parameters for one set of periods."""
 
     periods: Sequence[SettledPeriod]
     fine: Objective
@@ -65,7 +65,7 @@ class Search:
         return int(sum(period.valid.sum() for period in self.periods))
 
     def minimum(self, guesses: Sequence[Array], springs: Array) -> tuple[Refined, Minimum]:
-        """Return the best minimum from `guesses` (coordinates), the last of which has wide friction near standstill.
+        """Return the best minimum from `guesses` (coordinates), the last of which has a wide Coulomb step.
 
         springs: tracking stiffness (joints,) [N m/rad]. Raises ConvergenceError.
         """

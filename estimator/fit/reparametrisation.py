@@ -153,7 +153,7 @@ class Lever:
 
     coupling: int
     gravity: int
-    """Indices of these among the parameters."""
+    """Indices of coupling and gravity_2 among the parameters."""
     ratio: float
     """`Model.lever` [s^2]."""
     std: float
@@ -161,7 +161,7 @@ class Lever:
 
     @classmethod
     def of(cls, model: Model, gravity_2: float, sizes: "Sizes") -> "Lever | None":
-        """Return the prior of a model with a lever, otherwise None; gravity_2: rough value [N m], used as a scale."""
+        """Return the prior if `model.lever` is known, otherwise None; gravity_2: rough value [N m], used as a scale."""
         if model.lever is None or model.joints != 2:
             return None
         std = LEVER_STD * model.lever * max(abs(gravity_2), LEAST_WEIGHT * sizes.torque)

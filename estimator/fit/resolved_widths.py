@@ -1,7 +1,7 @@
 """The narrowest smoothed Coulomb step that a simulation resolves.
 
-On a light arm, friction stops a joint within microseconds. Narrower steps look the same in any recording, but their
-simulation jumps back and forth across the step: its derivatives, and the standard errors with them, mean nothing.
+On a light arm, friction stops a joint within microseconds. A narrower step looks the same in any recording, but its
+simulation jumps back and forth across it: the derivatives, and with them the standard errors, are meaningless.
 """
 
 from collections.abc import Mapping, Sequence

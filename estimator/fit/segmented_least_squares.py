@@ -21,7 +21,9 @@ Residual = Callable[[int, Array, Array], Array]
 """Returns the residuals (rows,) of one segment at the shared coordinates (shared,) and its own (own,)."""
 
 Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
-"""Returns the same residuals, and their derivatives by shared, then own coordinates (rows, shared + own)."""
+"""Returns the residuals of one segment as `Residual` does, and their derivatives by its shared, then its own
+coordinates (rows, shared + own).
+"""
 
 DEFAULTS = SegmentedMinimiserOptions()
 MIN_SEGMENTS = 3
@@ -180,7 +182,10 @@ def minimise_segmented(
         rows = _residuals(residual, shared, own, threads)
         cost = _cost(rows) + prior.cost(shared)
         if not np.isfinite(cost):
-            raise ConvergenceError("the simulation diverges at the initial guess: check the units of torque and time")
+            raise ConvergenceError(
+                "the simulation diverges at the initial guess: too little motion was recorded, or torque or time "
+                "have other units"
+            )
         damping = options.initial_damping
         for iteration in range(1, options.max_iterations + 1):
             blocks = _blocks(derivative, shared, own, threads)

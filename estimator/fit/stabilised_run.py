@@ -7,7 +7,7 @@ to the real one, and where model and arm agree the spring has no effect. The sta
 determines how fast deviations decay.
 
 The springs pull the simulated joints to where the real ones were, so the encoders' errors, as far as the model has any,
-are taken out of the measured angles; with them a spring would exert a torque that the arm never felt.
+are removed from the measured angles; otherwise a spring would exert a torque that never acted on the arm.
 """
 
 from collections.abc import Iterator

@@ -263,7 +263,9 @@ def _fit(
     options: LikelihoodOptions,
     ftol: float | None = None,
 ) -> Fit:
-    """Return the fit at `minimum`, or with reweighted priors, to the tolerance `ftol` if given, where that differs."""
+    """Return the fit at `minimum`; if `ftol` is given and reweighted priors move the minimum, at the one found with
+    them.
+    """
     objective, x, count = refined.weighted, minimum.x, refined.weighted.count
     positions = objective.positions(x)
     errors = _errors(periods, objective, x, positions, options)

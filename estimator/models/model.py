@@ -56,12 +56,12 @@ class Model:
     friction: Friction = "coulomb"
     drive: Drive = "delay"
     options: Collection[Option] = frozenset()
-    """Always a frozenset after construction."""
+    """Options of the model, as listed above; always a frozenset after construction."""
     by_voltage: Collection[int] = frozenset()
     """Joints (from 1) that are driven by voltage.
 
-    A share `back_emf` of their viscous friction passes the drive's lag (`hil.estimator.simulation.back_emf`). Always a
-    frozenset after construction.
+    A share `back_emf` of their viscous friction is subject to the drive's lag (`hil.estimator.simulation.back_emf`).
+    Always a frozenset after construction.
     """
     lever: float | None = None
     """Measured length of link 1 over gravity [s^2], if known.

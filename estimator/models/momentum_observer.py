@@ -99,7 +99,7 @@ class MomentumObserver:
         )  # compiles the loop and initialises the memory
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:
-        """Process one sample; return the joint (from 0) whose motion no arm explains, or -1.
+        """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1.
 
         position: angles [rad]. velocity: velocities [rad/s]. torque: torques commanded since the previous sample [N m].
         seconds: time since the previous sample [s].
@@ -110,7 +110,7 @@ class MomentumObserver:
 
     @property
     def lacking(self) -> list[float]:
-        """Torque missing from the commanded one to explain the latest motion (joints,) [N m]."""
+        """Commanded torque minus that which explains the latest motion (joints,) [N m]."""
         return [float(value) for value in self._memory[_SINGLE, _LACKING : _LACKING + self._joints]]
 
     @property
@@ -195,7 +195,7 @@ def _held_by_friction(m: Any, j: int) -> float:
 
 
 def _second_moment(m: Any, weight_1: float, coupling: float, weight_2: float, armature: float) -> float:
-    """Return the mean square of a weighted sum of the inertial parameters, over all arms that they may belong to."""
+    """Return the mean square of a weighted sum of the inertial parameters, given their mean and covariance."""
     mean = variance = 0.0
     weights = (weight_1, coupling, weight_2, armature)
     for i in range(4):

@@ -89,7 +89,9 @@ class Physics:
         return late
 
     def crossing_times(self) -> tuple[float, float]:
-        """Return the time in which reversed friction crosses each joint's step or bristle deflection [s]."""
+        """Return the time in which a reversal of friction takes each joint through its Coulomb step or bristle
+        deflection [s].
+        """
         constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))
         inertia = self.free_inertias()
         times = []

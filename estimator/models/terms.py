@@ -89,7 +89,7 @@ class Term:
     """
     scope: Scope = "joint"
     first_joint: int = 1
-    """First joint that has this term: 2 for terms relative to joint 1 or included in its other terms."""
+    """First joint that has this term: 2 if it is relative to joint 1, or if joint 1's is part of another term."""
     range: Range = "positive"
     """Range of values.
 
@@ -97,7 +97,7 @@ class Term:
     sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of these two; for a term of each joint, terms of the same joint."""
+    """Names of the two terms of which this one is a share; for a term of each joint, terms of the same joint."""
     scale: Scale | float = 1.0
     """Typical change in the fit: the name of a scale of the arm and its motion, or a number [unit]."""
     initial: float = 0.0
@@ -115,7 +115,7 @@ class Term:
     spread: Scale | float | None = None
     """Standard deviation from its `absent` value among typical arms, as a scale or a number [unit]; None if unknown."""
     log_spread: float | None = None
-    """Standard deviation of a positive term's logarithm from that of `initial`; None if unknown."""
+    """Standard deviation of a positive term's logarithm from the logarithm of `initial`; None if unknown."""
 
     @property
     def of_torque(self) -> bool:
@@ -269,7 +269,7 @@ _DECLARED = (
     Term(
         "back_emf",
         "1",
-        "share of viscous friction due to back-EMF, which passes the drive's lag like the voltage",
+        "share of viscous friction due to back-EMF, which is subject to the drive's lag like the voltage",
         part="voltage",
         initial=0.92,
         log_spread=0.08,

@@ -21,7 +21,7 @@ ITERATIONS = 3
 LEAST = 0.005  # minimum relative change of friction that matters
 MOST = 0.3  # maximum relative change of friction in one iteration
 SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step, tried until the prediction improves
-UNEVEN = 0.25  # relative part of a change that is not even in time, or not the same for all friction
+UNEVEN = 0.25  # relative part of a change that is not linear in time, or not the same for all friction
 SCALED = ("viscous", "coulomb", "load", "viscous_asymmetry")
 
 
@@ -42,7 +42,7 @@ class Drift:
         return bool(np.any((np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > LEAST)))
 
     def after_correction(self) -> "Drift":
-        """Return what a correction for this change may leave: its own error, and change that is not even in time."""
+        """Return the change that may remain after a correction: its error, and the part that is not linear in time."""
         return replace(self, change=np.hypot(self.std, UNEVEN * self.change))
 
     def at_the_later(self, estimate: Estimate) -> Estimate:
@@ -57,7 +57,7 @@ class Drift:
 
 
 def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
-    """Return the covariance (parameters, parameters) including that friction changed while `period` was recorded.
+    """Return the covariance (parameters, parameters) including the effect of friction that changed during `period`.
 
     The fit assumes constant friction. Where friction changes at the rate of `drift`, other parameters follow the slow
     change of torque, above all those that also act slowly, such as gravity on an arm that is hardly affected by it. The
@@ -119,7 +119,7 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
 
 @dataclass(frozen=True)
 class _Later:
-    """The later period as predicted by an estimate; names: its parameters of friction that change."""
+    """The later period as predicted by an estimate; names: the friction parameters that change."""
 
     estimate: Estimate
     run: Run

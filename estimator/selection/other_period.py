@@ -52,7 +52,7 @@ def _free(physics: Physics, other: SettledPeriod, state: Array) -> list[Array]:
 
 
 def _held(physics: Physics, other: SettledPeriod, stabiliser: Stabilised, start: Array) -> list[Array]:
-    """As `_free`, with the stabiliser's feedback from the simulated state."""
+    """Return the simulated periods, with the stabiliser's feedback computed from the simulated state."""
     former = np.stack((start[0] - start[1] / other.rate, start[1]))
     state = np.concatenate((start, stabiliser.former_torque[None], former))
     periods = []

@@ -226,7 +226,7 @@ class Selection:
         return trial
 
     def _use(self, periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, drift: Drift | None) -> None:
-        """Fit these periods from now on; earlier trials and fits already started belong to others."""
+        """Fit these periods from now on; earlier trials and fits already started are for other periods."""
         self._periods = list(periods)
         self._fitting = replace(self._fitting, periods=self._periods, held_out=held_out, drift=drift)
         self.trials = []

@@ -59,10 +59,12 @@ class Evidence:
     held_out: Array | None = None
     """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,).
 
-    Where friction has changed since the fitted motion, with one factor per joint taken from the held-out motion itself.
+    Where friction has changed since the fitted motion, the prediction uses one factor per joint taken from the held-out
+    motion itself.
     """
     held_out_as_fitted: Array | None = None
-    """The same with friction as it was in the fitted motion (joints,); None where it has not changed."""
+    """As `held_out`, but with friction as it was in the fitted motion (joints,); None where it has not changed.
+    """
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""
     drift: Drift | None = None
@@ -128,7 +130,7 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence,
     left = validation.residual_over_floor
     joint = int(np.argmax(left))
     error = float(validation.levels.model_error.max())
-    moves = "is not explained to the last step" if trust == "yes" else "moves in a way that the model cannot explain"
+    moves = "is not fully explained" if trust == "yes" else "moves in a way that the model cannot explain"
     subject = f"The motion of joint {joint + 1}" if trust == "yes" else f"Joint {joint + 1}"
     said = (
         f"{subject} {moves}: its residual is {left[joint]:.1f} times the noise, a model error of {error:.2g} encoder "
@@ -158,7 +160,7 @@ def _in_words(part: str) -> str:
 
 
 def _spoilt(validation: Validation, trust: Trust) -> str:
-    """Return which parameters the model error may have biased, judged by their widened errors."""
+    """Return which parameters the model error may have biased, judged by their inflated standard errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst and trust == "no":
         return "It may bias all parameters, whatever their standard errors say."
@@ -204,10 +206,23 @@ def _drifted(drift: Drift | None) -> tuple[str, ...]:
         return ()
     return tuple(
         f"Friction of joint {joint + 1} {'fell' if change < 0.0 else 'rose'} by {100.0 * abs(change):.2g} % within "
-        f"{drift.seconds:.0f} s, as is typical while grease warms up: the values hold for the fitted periods. To "
-        f"obtain those of the warm arm, set experiment.warm_up = {_warm_up(drift.seconds)}."
+        f"{drift.seconds:.0f} s{_reason(change, drift.seconds)}"
         for joint, (change, std) in enumerate(zip(drift.change.tolist(), drift.std.tolist(), strict=True))
         if abs(change) > max(LEAST, 3.0 * std)
+    )
+
+
+def _reason(change: float, seconds: float) -> str:
+    """Return the possible cause of a change of friction, as the end of a sentence. While a servo warms up, its friction
+    falls; a rise always indicates a fault.
+    """
+    holds = "the values hold for the fitted periods"
+    if change < 0.0:
+        warm = f"To obtain those of the warm arm, set experiment.warm_up = {_warm_up(seconds)}."
+        return f", as is typical while grease warms up: {holds}. {warm}"
+    return (
+        f", which warming up does not explain: {holds}. Look for a cable or part that began to rub, a loose screw, "
+        "a horn that slipped, or a hot motor or falling supply, which give less torque. Then record again."
     )
 
 
@@ -269,5 +284,6 @@ def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
     if not estimate.outliers or not explained:
         return ()
     return (
-        f"{estimate.outliers} readings were outliers and downweighted; if this persists, check cables and baud rate.",
+        f"{estimate.outliers} samples are outliers and were downweighted: a jolt, backlash, or late or damaged "
+        "readings; the report's residuals show where.",
     )

@@ -14,7 +14,7 @@ from hil.estimator.selection.candidates import columns_of, simulated_run
 
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 COMPARABLE = 0.3
-"""Decrease of the sum of squares, relative to the best number's, at which another number of cycles is worth a fit."""
+"""Other numbers of cycles are tried too if they decrease the sum of squares by this fraction of what the best does."""
 
 
 def wave_peaks(
@@ -26,8 +26,9 @@ def wave_peaks(
 ) -> dict[str, tuple[float, ...]]:
     """Return the numbers of `cycles` per turn at which a wave explains more than at neighbouring ones, best first.
 
-    What the fitted parameters explain is removed first. The result is by parameter name. Waves that the estimate's
-    model includes are left out where they are sought. While other terms have absorbed part of a wave, the best number
+    What the fitted parameters explain is removed first. The result is by parameter name. If the estimate's model
+    includes a wave that is sought, that wave is disabled first. While other terms have absorbed part of a wave, the
+    best number
     may be a wrong one: those that explain at least `COMPARABLE` of what it does are returned as well.
 
     only: joints, from 1, that are considered; by default all.

@@ -1,6 +1,5 @@
 """Servo-side receiver: extracts instruction packets from the bytes on the wire."""
 
-from collections.abc import Iterator
 from functools import partial
 from struct import Struct
 
@@ -28,17 +27,19 @@ class Receiver:
         self._asked: dict[bytes, Packet] = {}
         """Cache of group reads by their bytes: a host sends the same ones again and again."""
 
-    def feed(self, data: bytes) -> Iterator[tuple[Packet, int]]:
-        """Take bytes as they arrive; yield each complete packet and the number of bytes that follow it."""
+    def feed(self, data: bytes) -> list[tuple[Packet, int]]:
+        """Take bytes as they arrive; return each complete packet and the number of bytes that follow it."""
         framer = self._framer
+        found: list[tuple[Packet, int]] = []
         at, size = 0, len(data)
         if not framer.pending:
             while at < size and (packet := self._whole(data, at, size)) is not None:
                 at += self._length
-                yield packet, size - at
+                found.append((packet, size - at))
         if at < size:
             for packet in framer.feed(data[at:]):
-                yield packet, framer.pending
+                found.append((packet, framer.pending))
+        return found
 
     @property
     def pending(self) -> int:

@@ -4,6 +4,7 @@ They return the same bytes as the general path in `hil.fakes.bus.instructions`, 
 of its time here.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
 
@@ -81,15 +82,14 @@ class StateReads:
         """Return the parts of the reply to a Fast Sync Read; None if it needs the general path."""
         parts = self._parts(body, by_id)
         positions, velocities, currents = self._joints.joints()
-        size = 1 + len(parts) * (_SIZE + 4)
-        whole = HEADER + bytes((BROADCAST_ID, size & 0xFF, size >> 8, Instruction.STATUS))
+        whole = _fast_front(len(parts))
         replies = []
         sent = 0
         for servo, place, _, id_byte in parts:
             if servo.heard_at != now or not servo.status_return_level or not servo.has_fast_reads:
                 return None
             state = servo.present.state(positions[place], velocities[place], currents[place])
-            whole += _ALERT[servo.alert] + id_byte + state
+            whole = b"".join((whole, _ALERT[servo.alert], id_byte, state))
             whole += crc(whole).to_bytes(2, "little")
             replies.append((servo.id, servo.return_delay_s, whole[sent:]))
             sent = len(whole)
@@ -118,3 +118,10 @@ class StateReads:
             front = encode_status(servo_id, 0, bytes(_SIZE))[:_FRONT_LENGTH]
             parts.append(_Part(servos[0], self._servos.index(servos[0]), front, bytes((servo_id,))))
         return tuple(parts)
+
+
+@functools.cache
+def _fast_front(servos: int) -> bytes:
+    """Beginning of the reply to a fast read of this many servos: header, ID, LEN, INST."""
+    size = 1 + servos * (_SIZE + 4)
+    return HEADER + bytes((BROADCAST_ID, size & 0xFF, size >> 8, Instruction.STATUS))

@@ -59,7 +59,7 @@ class Drive(Described):
     stribeck_velocity: Positive = Field(
         0.1, le=5, description="velocity at which stribeck_rise has fallen to 1/e [rad/s]"
     )
-    load: NotNegative = Field(0.0, le=1, description="additional dry friction per motor torque [N m per N m]")
+    load: NotNegative = Field(0.0, le=1, description="additional dry friction per unit of motor torque [N m per N m]")
     presliding_stiffness: NotNegative = Field(
         0.0, le=100000, description="stiffness of the presliding contact; 0 for rigid stiction [N m/rad]"
     )
@@ -75,7 +75,7 @@ class Drive(Described):
     ripple_cycles: Positive = Field(7.0, description="cycles of torque ripple per turn of the joint")
     cogging: NotNegative = Field(0.0, le=10, description="amplitude of the cogging torque at the output shaft [N m]")
     cogging_cycles: Positive = Field(1.0, description="cycles of cogging per turn of the joint")
-    backlash: NotNegative = Field(0.0, le=0.2, description="total play of the gears [rad]")
+    backlash: NotNegative = Field(0.0, le=0.2, description="total backlash of the gears [rad]")
     gear_stiffness: Positive = Field(
         1500.0, le=1e06, description="stiffness of the gears in contact; only with backlash [N m/rad]"
     )
@@ -116,9 +116,7 @@ class Drive(Described):
         if self.stops is not None and self.stops[0] >= self.stops[1]:
             raise ValueError(f"stops = [{self.stops[0]:g}, {self.stops[1]:g}]: the first must be less than the second")
         if self.backlash and not self.rotor_inertia:
-            raise ValueError(
-                "backlash needs a rotor_inertia greater than 0: within the play the rotor moves on its own"
-            )
+            raise ValueError("backlash needs a rotor_inertia greater than 0: within the gap the rotor moves on its own")
         return self
 
 

@@ -17,7 +17,7 @@ and just large enough to bring the joint to rest, so stiction is exact. A step i
 is split there.
 
 In a process that has loaded numba anyway, as hil's own experiments do, the loop is compiled for arms with plain drives.
-Its results are the same to the last bit, so a fake that is used on its own does without.
+Its results are the same to the last bit, so a fake that is used on its own is not compiled.
 """
 
 import sys
@@ -209,7 +209,7 @@ def _run(  # noqa: PLR0915
 
 
 def _lag(step: float, seconds: float) -> tuple[float, float]:
-    """As `Motor.lag`, for a lag of `seconds`."""
+    """Return what `Motor.lag` returns, for a lag of `seconds`."""
     if not seconds:
         return 0.0, 0.0
     fallen = -expm1(-step / seconds)

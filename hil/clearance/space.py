@@ -19,22 +19,24 @@ from hil.errors import ConfigError
 Array = NDArray[np.float64]
 
 ALWAYS_SHARE = 0.75
-"""Two capsules with one link in between that are closer than BUILT_NEAR in at least this fraction of poses are taken to
-meet by construction."""
+"""Two capsules with one link in between that are closer than BUILT_NEAR in at least this fraction of poses are assumed
+to touch by design.
+"""
 
 ALWAYS_SHARE_OF_OTHERS = 0.98
 BUILT_NEAR = 0.02  # m beyond the margin
 
 RANDOM_POSES = 400
 AT_REST_SLACK = 0.008
-"""Distance [m] by which pairs may be closer on the way to or from the rest pose than they are in it, if that is less
-than the margin."""
+"""If a pair is closer than the margin in the rest pose, it may be closer still by this distance [m] on the way to or
+from that pose.
+"""
 
 AT_REST_INSIDE = 0.02
 """Largest accepted overlap in the rest pose [m]: capsules are larger than the parts they enclose."""
 
 LYING_RAD = 0.12
-"""An arm within this angle of its rest pose in every joint counts as at rest, which its owner declares safe."""
+"""An arm within this angle of its rest pose in every joint counts as at rest; the user declares that pose safe."""
 
 
 @dataclass(frozen=True)

@@ -118,13 +118,16 @@ def setup(
     port: PortOrFile,
     servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's current ID.")],
     baud: Annotated[int, typer.Option("--baud", help="Its current baud rate.")] = 1_000_000,
-    new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252)] = None,
-    new_baud: Annotated[int | None, typer.Option("--new-baud")] = None,
+    new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252, help="ID to set.")] = None,
+    new_baud: Annotated[int | None, typer.Option("--new-baud", help="Baud rate to set.")] = None,
     return_delay_us: Annotated[
-        int | None, typer.Option("--return-delay-us", min=0, max=508, help="Recommended: 0.")
+        int | None, typer.Option("--return-delay-us", min=0, max=508, help="Return delay to set; recommended: 0.")
     ] = None,
     secondary_id: Annotated[
-        int | None, typer.Option("--secondary-id", min=0, max=255, help="255 disables it (recommended).")
+        int | None,
+        typer.Option(
+            "--secondary-id", min=0, max=255, help="Secondary ID to set; 255, which disables it, is recommended."
+        ),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Answer yes to every question.")] = False,
     json_only: Json = False,

@@ -59,11 +59,13 @@ def calibrate(
     ] = 0.0,
     at: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--at", metavar="X Y Z", help="Spatial arm: its position in the frame of its link, in m."),
+        typer.Option("--at", metavar="X Y Z", help="Spatial arm: position of the mass in its link's frame, in m."),
     ] = None,
     joint: Annotated[
         str | None,
-        typer.Option("--joint", metavar="NAME", help="Spatial arm: joint that moves that link; default: the last."),
+        typer.Option(
+            "--joint", metavar="NAME", help="Spatial arm: the joint that moves that link; default: the last one."
+        ),
     ] = None,
     json_only: Json = False,
 ) -> None:

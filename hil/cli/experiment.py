@@ -29,7 +29,7 @@ Live = Annotated[
     typer.Option(
         "--live",
         metavar="WHERE",
-        help="Where to watch: terminal, or rerun (its viewer), rerun:FILE.rrd, rerun:URL; see docs/commands.md.",
+        help="Where to show the run: terminal, rerun (its viewer), rerun:FILE.rrd or rerun:URL; see docs/commands.md.",
     ),
 ]
 Recordings = Annotated[
@@ -41,7 +41,7 @@ Recordings = Annotated[
 ]
 ArmPath = Annotated[
     Path | None,
-    typer.Option("--config", metavar="ARM.toml", help="For recordings: its [columns] table describes them."),
+    typer.Option("--config", metavar="ARM.toml", help="TOML file whose [columns] table describes the recordings."),
 ]
 AllSamples = Annotated[
     bool, typer.Option("--all-samples", help="Use every sample, by multiple shooting; no settled period is needed.")

@@ -55,7 +55,9 @@ def hand(
     device: Annotated[Path, typer.Argument(metavar="DEVICE", help="The device that `hil fake --pty` serves.")],
     moves: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[ID:to=RAD]...", help="Target: an angle, or ID:ticks=POSITION; also at, duration."),
+        typer.Argument(
+            metavar="[ID:to=RAD]...", help="Servo and target angle, or ID:ticks=POSITION; optional: ,at=S,duration=S."
+        ),
     ] = None,
     release: Annotated[list[int] | None, typer.Option(metavar="ID", help="Release this servo's joint.")] = None,
 ) -> None:

@@ -137,7 +137,7 @@ def _would_show(detectable: "Mapping[str, float]") -> list[str]:
     never = [name for name, percent in detectable.items() if percent > _WHOLE]
     lines = []
     if least:
-        known = "Smallest changes of one term alone that 95 of 100 such pairs reveal"
+        known = "Smallest changes of single terms that 95 of 100 such pairs of runs reveal"
         lines.append(f"{known}: {', '.join(least)}.")
     if never:
         lines.append(f"Not even a doubling would be detected: {', '.join(never)}.")

@@ -24,7 +24,8 @@ def study(
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue a study that was interrupted.")] = False,
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help='"tcp://HOST:8786", or "slurm".')
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help='Dask scheduler, such as "tcp://HOST:8786", or "slurm".'),
     ] = None,
     workers: Annotated[
         int | None, typer.Option("--workers", min=1, help="Local processes; default: one per core.")

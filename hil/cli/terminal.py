@@ -137,7 +137,7 @@ def _bar(console: Console) -> Progress:
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=20),
-        TextColumn("{task.completed:.0f} of about {task.total:.0f} s of arm time,"),
+        TextColumn("{task.completed:.0f} of about {task.total:.0f} s of experiment time,"),
         TimeRemainingColumn(),
         TextColumn("left"),
         console=console,

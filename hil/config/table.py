@@ -22,7 +22,7 @@ OneOrList = Annotated[
 ]
 """A single value or a list; validation errors refer to the form that was given."""
 Angle = Annotated[float, Field(ge=-4 * math.pi, le=4 * math.pi)]
-"""An angle of a joint [rad]: up to two turns, so that degrees are noticed."""
+"""An angle of a joint [rad]: up to two turns, so that values in degrees are detected."""
 
 Turned = Annotated[float, Field(ge=-2 * math.pi, le=2 * math.pi)]
 """An angle by which something is mounted [rad]."""

@@ -19,7 +19,7 @@ def read_arm(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
 
 
 def is_mjcf(path: Path) -> bool:
-    """Whether the file is MJCF; one that cannot be read is not."""
+    """Whether the file is MJCF; False if it cannot be read."""
     try:
         return _MJCF.search(path.read_text(encoding="utf-8")) is not None
     except (OSError, UnicodeDecodeError):

@@ -26,7 +26,7 @@ COUPLED = 2  # an equality of two joints' angles
 def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
     """The arm of these joints, from the base outwards; of all hinges if none are named. The base is MuJoCo's world.
 
-    Raises ArmFileError as `hil.description.urdf.read_urdf` does, and where mujoco is not installed.
+    Raises ArmFileError as `hil.description.urdf.read_urdf` does, and if MuJoCo is not installed.
     """
     tree = _Tree(_compiled(path), path)
     names = list(joints) if joints is not None else tree.hinges
@@ -157,7 +157,7 @@ class _Tree:
         body = int(self.model.jnt_bodyid[found[0]])
         if self.model.body_jntnum[body] != 1:
             raise ArmFileError(
-                f'{self.path}: body "{self.name(body)}" has several joints: give each its own body, without mass'
+                f'{self.path}: body "{self.name(body)}" has several joints: give each a body of its own (without mass)'
             )
         return body
 

@@ -30,22 +30,22 @@ class AmplitudeOptions:
     max_rounds: int = 12
     """Maximum number of iterations of the search, and of reductions after it."""
     max_polishing_rounds: int = 4
-    """Maximum number of final raises of single joints."""
+    """Maximum number of final torque increases, one joint at a time."""
     close: float = 0.94
     """Fraction of the limits, at the required probability, at which they count as reached."""
     over: float = 0.97
-    """Fraction of the limits that an iteration aims at if the last torque was too large."""
+    """Fraction of the limits that the next iteration aims at if the last torque exceeded them."""
     under: float = 0.99
-    """The same if it was too small."""
+    """Fraction of the limits that the next iteration aims at if the last torque did not reach them."""
     max_ratio: float = 2.0
     """Maximum ratio of the torques of two iterations."""
     damping: float = 0.85
-    """Factor on the exponent of each further correction."""
+    """Factor by which the exponent of the corrections decreases from one iteration to the next."""
     min_exponent: float = 0.4
     polishing_ratio: float = 1.06
-    """Ratio of torques of a final raise."""
+    """Ratio by which one of the final increases raises a joint's torque."""
     back_off: float = 0.93
-    """Ratio of torques after the check on all arms has failed."""
+    """Factor on the torque when the check on all arms has failed."""
     torque_share: float = 0.97
     """Fraction of the current limit that may be used, since clamping would distort the designed wave."""
     initial_share: float = 0.125

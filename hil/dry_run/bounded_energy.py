@@ -15,7 +15,7 @@ from hil.estimator.models.parameters import CONSTANTS, Physics
 Array = NDArray[np.float64]
 
 _POINTS = 181
-"""Poses of the other joint at which the potential energy on the boundary is evaluated."""
+"""Number of poses of the other joint at which the potential energy on the boundary is evaluated."""
 _MARGIN = 0.05
 """Share of the largest potential energy that is kept as a margin, for the grid and the integration."""
 
@@ -56,7 +56,9 @@ def _by_name(physics: Physics) -> dict[str, float]:
 
 
 def _only_dissipates(p: dict[str, float], joints: int) -> bool:
-    """Whether no term of the drive stores energy or returns it to the arm; springs and offsets count as potential."""
+    """Whether no term of the drive stores energy or returns it to the arm; springs and offsets count as potential
+    energy.
+    """
     return all(
         p[f"viscous_{k}"] >= abs(p[f"viscous_asymmetry_{k}"])
         and p[f"coulomb_{k}"] >= 0.0

@@ -22,7 +22,7 @@ class ChainDryRun:
 
     config: with the path and stabiliser that would be used. share: fraction of the designed path's amplitude; 1 if
     [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of links with parts
-    that touch by construction and are not checked.
+    that touch by design and are not checked.
     """
 
     config: Config
@@ -71,7 +71,7 @@ def unsafe(config: Config, foreseen: ChainPrediction) -> str:
 
 
 def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
-    """Form the JSON object: verdict, clearance, stops, and every predicted quantity per joint."""
+    """Return the JSON object: verdict, clearance, stops, and every predicted quantity per joint."""
     config, peaks, fall, lowering = run.config, run.prediction, run.stops.fall, run.stops.lowering
     return {
         "schema": 1,
@@ -154,12 +154,12 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
     if run.shapes_guessed:
         lines.append(
             f"No collision geometry could be read for {', '.join(run.shapes_guessed)}: replaced by capsules from joint "
-            "to joint (a base: by nothing)."
+            "to joint (a base is left out)."
         )
     if run.as_built:
         pairs = ", ".join(f"{a} and {b}" for a, b in run.as_built)
         lines.append(
-            "Parts of these links that touch in nearly every pose, by construction, are not checked; the other parts "
+            "Parts of these links that touch in nearly every pose, by design, are not checked; the other parts "
             f"of them are: {pairs}."
         )
     if run.share < 1.0:

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 QUANTITIES = ("lowest position", "highest position", "velocity", "current", "torque", "power")
 UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")
 GUARDED = 3
-"""Number of leading quantities with a limit at which the guard stops; current is clamped, torque and power follow it.
+"""Number of quantities, from the first, at whose limits the guard stops; current is clamped, the others follow from it.
 """
 
 QUANTILE = 0.99

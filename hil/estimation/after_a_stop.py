@@ -31,7 +31,7 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
 
 
 def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
-    """The same after a stop by the guard or a servo's failure: nothing moves again before the arm has been checked."""
+    """What is kept after the guard or a failed servo ended a run, and a next command that checks the arm first."""
     if can_be_estimated(run.path):
         return ["The recording is kept and complete enough for an estimate.", next_step("estimate", run.path)]
     return [f"The recording until then is kept in {run.path}.", next_step("check", shown)]

@@ -98,7 +98,7 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, added: AddedMass) -
         return _described_chain(config, calibrate_chain_runs((without, with_mass), (config, other), mass))
     if added.distance is None or added.at is not None or added.joint is not None:
         raise ConfigError(
-            "a planar arm: give --distance, of the mass from the last joint, instead of --at and --joint."
+            "a planar arm: give --distance (from the last joint to the mass) instead of --at and --joint."
         )
     length = added.length
     if length is None and config.known is not None and config.known.length_1 is not None:

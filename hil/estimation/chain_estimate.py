@@ -198,8 +198,8 @@ def _verdict(
     if not estimate.reached:
         trust = "with care" if trust == "yes" else trust
         sentences.append(
-            "The fit stopped before its minimum, where a joint sticks and breaks away; the standard errors include the "
-            "distance that remains. Use faster motion ([joint_path]), so that fewer joints stick."
+            "The fit stopped short of its minimum, where a joint sticks and breaks away; the standard errors include "
+            "the distance that remains. Use faster motion ([joint_path]), so that fewer joints stick."
         )
     if estimate.unseen:
         sentences.append(

@@ -1,4 +1,4 @@
-"""What limited the torque that a pilot found: advice to raise peak_torque would be of no use there."""
+"""What limited the torque that a pilot found: advice to raise peak_torque would not help then."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from hil.drivers.servo_model import Mode
 def torque_limit(config: Config, samples: NDArray[np.void], index: int | None = None) -> str:
     """The setting whose limit the joint `index`, or any joint, came closest to, and the share of it that was used.
 
-    Without a pilot, "": then peak_torque was given.
+    Without a pilot it is "", since the user gave peak_torque.
     """
     if not config.experiment.pilot or not len(samples):
         return ""

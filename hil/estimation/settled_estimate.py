@@ -120,8 +120,8 @@ def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tup
 
 
 def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift, is_corrected: bool) -> PlayedPeriod:
-    """Predict the held-out period with the friction at its time, which varies within it if the fitted one
-    `is_corrected`.
+    """Predict the held-out period with the friction at that time. is_corrected: correct it for friction that changes
+    within the period, as the fitted one was.
     """
     later = drift.at_the_later(estimate) if drift.is_seen else estimate
     predicted = predict_period(later, steadied(other, later, drift) if is_corrected else other)
@@ -129,7 +129,9 @@ def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift, is_correc
 
 
 def _as_fitted(estimate: Estimate, other: SettledPeriod | None, drift: Drift | None) -> NDArray[np.float64] | None:
-    """Relative prediction error of the held-out period with the friction of the fitted one, if friction changed."""
+    """Relative prediction error of the held-out period with the friction of the fitted period; None if it did not
+    change.
+    """
     if other is None or drift is None or not drift.is_seen:
         return None
     return relative_error(other.position, predict_period(estimate, other))

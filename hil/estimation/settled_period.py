@@ -67,7 +67,7 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
         before=_state_at(samples, int(np.flatnonzero(chosen)[begin - count]), experiment.rate),
     )
     on_time = angle - velocity_of(period) * _by_period(late[None], count)
-    return replace(period, position=_mean_of_periods(on_time), position_std=_scatter(on_time))
+    return replace(period, position=_mean_of_periods(on_time), position_std=scatter(on_time))
 
 
 def _mean_of_periods(position: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -112,15 +112,21 @@ def _stabilised(config: Config, rows: NDArray[np.void], torque: NDArray[np.float
     return Stabilised(feedback_of(config), np.ascontiguousarray(excitation), former, commanded)
 
 
-def _scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Standard deviation of each joint's mean over periods, (periods, joints, samples) to (joints,) [rad]; None for
-    one.
+def scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Standard deviation of each joint's mean over periods, (periods, joints, samples) to (joints,) [rad]; None for a
+    single period.
     """
     count = len(position)
     if count < 2:
         return None
-    scatter: NDArray[np.float64] = np.sqrt(np.nanmean(np.nanvar(position, axis=0, ddof=1), axis=1) / count)
-    return scatter
+    seen = np.isfinite(position).sum(axis=0)
+    mean = np.nansum(position, axis=0) / np.maximum(seen, 1)
+    squares = np.nansum((position - mean) ** 2, axis=0)
+    # Samples that are there in one period only, or in none, tell nothing about the scatter.
+    several = seen > 1
+    variance = np.where(several, squares / np.maximum(seen - 1, 1), 0.0).sum(axis=1)
+    std: NDArray[np.float64] = np.sqrt(variance / np.maximum(several.sum(axis=1), 1) / count)
+    return std
 
 
 def _first_settled(position: NDArray[np.float64], within: float) -> int | None:

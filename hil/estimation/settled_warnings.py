@@ -71,8 +71,8 @@ def clipping_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
 
 def _clipped(name: str, goal: NDArray[np.float64], measured: NDArray[np.float64], lower: str) -> list[str]:
     """Detect a motor that receives less current than commanded, from a sagging supply or its own current limit."""
-    # A sample's current answers the goal of the sample before it, and a lagging current loop is not clipping either:
-    # the smaller of two successive goals is what the motor has had time to follow.
+    # A sample's current is the response to the goal of the sample before it, and a lagging current loop is not clipping
+    # either: the smaller of two successive goals is what the motor has had time to follow.
     least = np.minimum(np.abs(goal[1:]), np.abs(goal[:-1])) * (goal[1:] * goal[:-1] > 0.0)
     measured = measured[1:]
     large = (least > LARGE * np.abs(goal).max()) & np.isfinite(measured)

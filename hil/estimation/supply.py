@@ -20,12 +20,12 @@ from hil.drivers.servo_model import Mode
 Array = NDArray[np.float64]
 
 FEWEST = 40
-"""Fewest readings of the voltage."""
+"""Minimum number of readings of the voltage."""
 STEP_V = 0.1  # of the register
 SIGNIFICANT = 6.0
 """Number of standard errors by which the drop at full load must differ from zero."""
 LEAST = {Mode.PWM: 0.005, Mode.CURRENT: 0.05}
-"""Largest drop, relative to the voltage without load, that is not worth mentioning, by drive mode."""
+"""Drop, relative to the voltage without load, up to which nothing is reported, by drive mode."""
 _FULL_LOAD = 0.99  # quantile of the drop
 
 

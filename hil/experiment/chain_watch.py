@@ -1,7 +1,7 @@
 """Check during the experiment that a spatial arm's motion is consistent with some arm of the dry run's ensemble.
 
-Prior knowledge is the ensemble's mean and widened covariance. The ensemble is drawn around the description, and updated
-after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
+Prior knowledge is the ensemble's mean and inflated covariance. The ensemble is drawn around the description, and
+updated after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,8 @@ WIDENED = 1.5
 
 LYING_RAD = 0.08
 _FRICTIONS = 8.0
-"""Smallest torque scale, in multiples of the mean dry friction, so that less than twice the friction causes no alarm.
+"""Lower bound on the torque scale, in multiples of the mean dry friction: up to twice that friction must not raise an
+alarm.
 """
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
@@ -87,7 +88,7 @@ class ChainWatch:
 
 
 def observed_parameters(arms: ChainArms) -> tuple[Array, Array]:
-    """Mean and widened covariance of an ensemble's `linear_parameters`, in units of the commanded torque."""
+    """Mean and inflated covariance of an ensemble's `linear_parameters`, in units of the commanded torque."""
     drawn = linear_parameters(arms)
     mean = drawn.mean(axis=0)
     covariance = WIDENED**2 * np.cov(drawn.T) + np.diag((_RELATIVE_STD * mean) ** 2 + 1e-12)

@@ -5,10 +5,11 @@ velocity must equal the change in position. The difference,
 
     apart = position - integral of velocity,
 
-is tracked with exponential memories: a short one, which reveals a sudden fault at once, and a long one, which reveals a
-creeping one. Rounding and encoder noise do not accumulate in it. What ordinary servos contribute is known:
+is tracked with two fading memories (leaky integrators): a short one, which reveals a sudden fault at once, and a long
+one, which reveals a gradual one. Rounding and encoder noise do not accumulate in it. The contributions of a healthy
+servo are known:
 
-- a velocity that lags by tau, because the servo filters it: tau times the velocity, less its mean over the memory. Any
+- a velocity that lags by tau, because the servo filters it: tau times the velocity, minus its mean over the memory. Any
   lag up to `LAG_S` is accepted;
 - a velocity with a scale error: that fraction of the distance covered within the memory, at most `SCALE`;
 - the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where
@@ -17,11 +18,11 @@ creeping one. Rounding and encoder noise do not accumulate in it. What ordinary 
 A reading that jumps back and forth, as with a stuck bit, cancels in those memories. Therefore each single interval is
 also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
 
-Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, twice those
-observed by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
+Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to twice the
+values estimated by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
 
-It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). What it remembers
-of a joint is a record of the type `MEMORY`.
+It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state that it
+keeps for a joint is a record of the type `MEMORY`.
 """
 
 from typing import Any
@@ -35,25 +36,29 @@ SHORT_S, LONG_S = 0.3, 1.2
 """Time constants of the memories [s]."""
 
 LONG_EVERY_S = 0.0099
-"""Shortest interval added to the long memory [s]: that of 100 Hz, regardless of rounding."""
+"""Shortest interval after which the long fading memory is updated [s]: that of 100 Hz, despite rounding errors."""
 
 UNSURE_RAD, LONG_UNSURE_RAD = 0.02, 0.045
-"""Tolerances [rad] for rounding, encoder noise, and a velocity that is rounded towards zero during each memory."""
+"""Tolerances of the two memories [rad]: for rounding, encoder noise, and a velocity that is rounded towards zero."""
 
 LAG_S = 0.03
 LEARNT_S = 1.5
 MORE_LAG_S = 0.008
 _FAST_RAD_S = 2.0
-"""Smallest range of velocities within the memory from which the lag can be estimated [rad/s]."""
+"""Smallest range of velocities within a fading memory from which the lag can be estimated [rad/s]."""
 
 _SEPARATE = 0.05
-"""Determinant, relative to uncorrelated signals, below which lag and scale error cannot be told apart."""
+"""Determinant of the normal equations, relative to that of uncorrelated signals, below which lag and scale error cannot
+be told apart.
+"""
 
 _LAG_SHARE = 0.25
 """Allowance for a lag that is not a pure delay, as a fraction of the lag times the range of velocities."""
 
 STEP_RAD, STEP_TIMES = 0.0077, 7.0
-"""Smallest jump of a position [rad], five ticks, and its smallest ratio to the RMS of the usual differences."""
+"""Smallest difference that counts as a jump of the position [rad], five ticks, and its smallest ratio to the RMS of the
+usual differences.
+"""
 
 STEPS, STEPS_S = 4, 0.5
 """Number of jumps that counts as a fault, and the longest time between them [s]."""
@@ -68,17 +73,17 @@ samples per period, the fastest that is used, needs 0.27.
 _FADING = np.dtype(
     [(name, "f8") for name in ("apart", "far", "mean", "span", "curved", "unknown", "highest", "lowest")]
 )
-"""An exponential memory.
+"""A fading memory.
 
-apart: position less integral of velocity [rad]. far: distance covered [rad]. mean, span: mean and range of the velocity
-[rad/s]. curved, unknown: uncertainties [rad].
+apart: position minus integral of velocity [rad]. far: distance covered [rad]. mean, span: mean and range of the
+velocity [rad/s]. curved, unknown: uncertainties [rad].
 """
 
 _STEPS = np.dtype([("square", "f8"), ("age", "f8"), ("since", "f8"), ("count", "f8")])
 """Jumps of a position.
 
-square: mean square of the usual differences [rad^2]. age: time since the beginning [s]. count: number of jumps shortly
-after each other. since: time since the latest one [s].
+square: mean square of the usual differences [rad^2]. age: time since the beginning [s]. count: number of jumps in quick
+succession. since: time since the latest one [s].
 """
 
 MEMORY = np.dtype(
@@ -92,13 +97,13 @@ MEMORY = np.dtype(
         ("long", _FADING),
     ]
 )
-"""One joint's memory.
+"""State of the check of one joint.
 
 position, velocity: latest ones [rad, rad/s]; the position is NaN before the first one and after a long gap. seconds,
-moved, difference, unknown, most_curved: sums, and the largest, of what has not been added to the long memory yet.
-learnt_for: duration of the motion learnt from [s]. lag_squared, scale_squared, crossed, lag_product, scale_product:
-sums of squares and products of the signals per lag and per scale error, and of them with `apart`. lag, scale: largest
-accepted ones [s, 1].
+moved, difference, unknown, most_curved: sums (of the last one, the maximum) since the long memory was last updated.
+learnt_for: duration of the motion that lag and scale error were estimated from [s]. lag_squared, scale_squared,
+crossed, lag_product, scale_product: elements of the normal equations for the two. lag, scale: largest accepted values
+[s, 1].
 """
 
 
@@ -111,7 +116,7 @@ def begin(memory: Any) -> None:
 def look(memory: Any, position: float, velocity: float, seconds: float, unsure: float) -> bool:
     """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
 
-    unsure: excess duration of its exchange [s], by which the time of the measurement is uncertain.
+    unsure: excess duration of its exchange [s], by which the measurement time is uncertain.
     """
     former, before = memory.position, memory.velocity
     memory.position, memory.velocity = position, velocity
@@ -151,7 +156,7 @@ def lost(memory: Any) -> None:
 
 
 def _looks_long(memory: Any, velocity: float) -> bool:
-    """Add the intervals since the last time to the long memory; return whether it shows a disagreement."""
+    """Add the intervals since the last call to the long memory; return whether it shows a disagreement."""
     long = memory.long
     moved, difference, unknown = memory.moved, memory.difference, memory.unknown
     _add(long, LONG_S, moved, difference, velocity, memory.seconds, memory.most_curved, unknown)
@@ -184,7 +189,7 @@ def _learn(memory: Any, velocity: float, seconds: float) -> None:
 
 
 def _has_jumped(steps: Any, step: float, seconds: float) -> bool:
-    """Process the difference over one interval, beyond what its motion explains [rad]; return whether it is wrong."""
+    """Process the difference over one interval, less what the motion explains [rad]; return whether it is wrong."""
     if seconds <= 0.0:
         return False
     steps.since += seconds
@@ -217,7 +222,7 @@ def _add(
 ) -> None:
     """Add one interval of `seconds`, at the end of which the joint has `velocity`.
 
-    moved, difference: change of position, and the same less the integral of velocity [rad]. curved, unknown: their
+    moved, difference: change of position, and the same minus the integral of velocity [rad]. curved, unknown: their
     uncertainty [rad], the second of which accumulates.
     """
     kept = 1.0 - seconds / time_constant if seconds < time_constant else 0.0
@@ -235,7 +240,7 @@ def _add(
 def _is_wrong(fading: Any, unsure: float, velocity: float, lag: float, scale: float) -> bool:
     """Whether position and velocity disagree.
 
-    unsure: tolerance of this memory [rad]. lag, scale: largest accepted lag [s] and scale error.
+    unsure: tolerance of this fading memory [rad]. lag, scale: largest accepted lag [s] and scale error.
     """
     of_lag = lag * (velocity - fading.mean)
     allowed = unsure + scale * abs(fading.far) + fading.curved + fading.unknown + _LAG_SHARE * lag * fading.span

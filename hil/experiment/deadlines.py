@@ -5,7 +5,7 @@ from hil.errors import Cause, SafetyStop
 from hil.plan.silence import late_limit
 
 LATE_SHARE = 0.2
-"""Fraction of deadlines that may be missed permanently."""
+"""Fraction of deadlines that may be missed in the long run."""
 
 _OFTEN_LATE = 5.0
 _OF_ONE_STALL = 2  # number of deadlines counted per stall
@@ -27,7 +27,7 @@ class Deadlines:
         self._in_a_row = 0
         self._often = 0.0
         self.any_missed = False
-        """Whether missed deadlines have not been made up for by those met since."""
+        """Whether some missed deadlines are not yet offset by deadlines met since."""
 
     def missed(self, seconds: float = 0.0) -> None:
         """Record a missed deadline, `seconds` after the last command."""
@@ -47,7 +47,7 @@ class Deadlines:
         )
 
     def met(self) -> None:
-        """Record a sample taken on time. A single stall does not count, a large share of missed deadlines does."""
+        """Record a sample taken on time. A single stall is tolerated; a large share of missed deadlines is not."""
         self._in_a_row = 0
         if self._often <= 0.0:
             self.any_missed = False
@@ -62,7 +62,7 @@ class Deadlines:
             )
 
     def check_gap(self, seconds: float) -> None:
-        """Check the time between two exchanges: the servos' watchdogs must not have acted."""
+        """Check the time between two exchanges: the servos' watchdogs must not have tripped."""
         if seconds >= self._watchdog:
             raise SafetyStop(
                 f"This program stalled: {_told(seconds)} passed between two commands. {_WHY_LATE}"

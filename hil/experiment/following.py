@@ -14,8 +14,8 @@ per sample. The step is bounded so that no single reply decides, and the sum is 
 weighted by the time that it represents. The commanded current is any value between the last two goals,
 because a reply may be measured before or after the motor follows the latest goal.
 
-It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). What it remembers
-of a joint is a record of the type `MEMORY`.
+It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state that it
+keeps for a joint is a record of the type `MEMORY`.
 """
 
 from typing import Any
@@ -31,13 +31,14 @@ SIGMA_SHARE = 0.1
 """Standard deviation of ordinary sensor and current-loop errors, relative to the planned peak."""
 
 SIGMA_TICKS = 4.0
-"""The same in register ticks; used if it is larger than that of SIGMA_SHARE."""
+"""That standard deviation in register ticks, if this is larger than that of SIGMA_SHARE."""
 
 LOST_AFTER_S = 0.03
 """Time for which a current must look like zero, at full weight, before it is taken for zero [s]."""
 
 _FULL_WEIGHT = 2.0
-"""Largest log likelihood ratio of one sample: a commanded current of two sigma, and a measured one of zero."""
+"""Upper bound on the log likelihood ratio of one sample: that of a commanded current of two sigma if zero is measured.
+"""
 
 _FEWEST = 2
 """Minimum number of samples, however low the rate."""
@@ -48,11 +49,12 @@ MEMORY = np.dtype(
         *((name, "f8") for name in ("former_goal", "evidence", "count", "differs_for", "differs")),
     ]
 )
-"""One joint's constants and memory.
+"""Constants and state of the check of one joint.
 
 per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V], and share, relative to the goal; follow_time: how
-long a larger one may last [s]. evidence, count: sum of the likelihood ratios times seconds, and its number of samples.
-differs_for, differs: duration [s] and samples of a deviation.
+long a larger one may last [s]. evidence, count: sum of the log likelihood ratios times seconds, and its number of
+samples.
+differs_for, differs: duration [s] and number of samples of a deviation.
 """
 
 

@@ -23,7 +23,7 @@ from hil.experiment.apart import Apart
 from hil.experiment.command_limits import CommandLimits
 from hil.experiment.deadlines import Deadlines
 from hil.experiment.joint_checks import JOINT, MOST_OUTSIDE_RAD, JointChecks
-from hil.experiment.silence import LATE_WAKE_UP_S, Silence
+from hil.experiment.silence import Silence
 from hil.experiment.status_check import StatusCheck
 from hil.plan.find_torque import how_to_find_torque
 
@@ -47,8 +47,8 @@ class Guard:
     interval: time between two exchanges [s]; by default, that between two samples. patience: how long an exchange waits
     for missing replies [s].
 
-    left_by_a_run: whether the arm stands where a run just before this one left it. One that was stopped at a limit may
-    have come to rest a little beyond it: such a joint may move back in, but no farther out.
+    left_by_a_run: whether the arm is where an immediately preceding run left it. One that was stopped at a limit may
+    have come to rest slightly beyond it: such a joint may move back in, but no farther out.
     """
 
     def __init__(
@@ -73,7 +73,6 @@ class Guard:
         interval = 1.0 / rate if interval is None else interval
         self._silence = Silence(config, interval, patience)
         self._patience = patience or float("inf")
-        self._watchdog = safety.watchdog
         self._deadlines = Deadlines(config)
         self._joints = _joint_records(config, planned, left_by_a_run)
         self._checks = JointChecks(self._joints, interval)
@@ -92,7 +91,7 @@ class Guard:
         self._commands.holding(goals)
 
     def woke_up(self, now: float, late: float) -> None:
-        """Record that this program woke up at `now` [s], `late` [s] after it wanted to: the computer may be busy."""
+        """Record that this program woke up at `now` [s], `late` [s] after it wanted to (negative: earlier)."""
         self._silence.woke_up(now, late)
 
     def late(self, seconds: float = 0.0) -> None:
@@ -107,11 +106,9 @@ class Guard:
         now = state.time_before_write
         took = state.time_after_read - now
         gap = watchdog_gap if watchdog_gap > took else took
-        if gap >= self._watchdog:
-            self._deadlines.check_gap(gap)
+        self._deadlines.check_gap(gap)
         self._silence.ask(now)
-        if took - self._patience >= LATE_WAKE_UP_S:
-            self._silence.woke_up(now, took - self._patience)
+        self._silence.woke_up(now, took - self._patience)
         if took < self._shortest:
             self._shortest = took
         unsure = took - self._shortest
@@ -243,7 +240,7 @@ class Guard:
         self._stop(
             index,
             Cause.NOT_FOLLOWING,
-            f"carries {state.current[index]:.3f} where {state.goal_current[index]:.3f} is commanded, for "
+            f"carries {state.current[index]:.3f} instead of the commanded {state.goal_current[index]:.3f}, for "
             f"{1e3 * self._joints[index]['found']:.0f} ms. Its torque is off, it was rebooted, its watchdog acted, or "
             "it cannot deliver this much at its speed and supply voltage (safety.follow_share).",
         )
@@ -311,7 +308,7 @@ class Guard:
 
 
 def _joint_records(config: Config, planned: Sequence[float], left_by_a_run: bool) -> np.ndarray:
-    """What `joint_checks` needs to know of each joint."""
+    """What `joint_checks` needs to know about each joint."""
     joints = np.zeros(len(config.joints), JOINT)
     safety = config.safety
     for record, joint, peak in zip(joints, config.joints, planned, strict=True):

@@ -2,7 +2,7 @@
 
 They are, in this order: a jump of the position, the limits of position and velocity, whether the motor carries the
 commanded current (`following`), whether position and velocity agree (`consistency`), and whether the motor turns as
-commanded (`work`). All that is known of a joint is one record of the type `JOINT`.
+commanded (`work`). Everything known about a joint is in one record of the type `JOINT`.
 """
 
 from collections.abc import Callable
@@ -49,14 +49,14 @@ JOINT = np.dtype(
     ],
     align=True,
 )
-"""One joint: limits, latest state, what the latest check found, and the memories of the checks.
+"""One joint: limits, latest state, what the latest check found, and the state that each check keeps.
 
 low, high: position limits [rad]. fastest: velocity limit, and farthest, the fastest change of a reported position
 [rad/s]. may_start_outside, is_followed, is_worked: whether it may be found outside its limits at first, and whether
 `following` and `work` are checked. position, seen_at: latest position [rad], NaN before the first one, and its time
-[s]. found_outside: position at which it was found outside at first [rad], NaN if it was not. moved, seconds, most:
-change of the position [rad], the time that it represents [s], and the largest possible one [rad]. found: duration of a
-deviation from the goal [s], or work taken out of the arm [J].
+[s]. found_outside: position outside the limits at which it was first seen [rad], NaN if it was inside. moved, seconds,
+most: change of the position [rad], the time that it represents [s], and the largest possible one [rad]. found: duration
+of a deviation from the goal [s], or work taken out of the arm [J].
 """
 
 
@@ -81,14 +81,14 @@ class JointChecks:
     def look(self, state: State, unsure: float) -> int:
         """Check all joints, none of which missed this reply or the one before; return FINE or CHECKS * joint + check.
 
-        unsure: excess duration of the exchange [s]. Joints behind the first one with a fault are not checked.
+        unsure: excess duration of the exchange [s]. Joints after the first faulty one are not checked.
         """
         self._pack(self._bytes, 0, *state.position, *state.velocity, *state.goal_current, *state.current)
         before, after = state.time_before_write, state.time_after_read
         return _look(self.joints, self._sample, 0, self._count, before, after, self.interval, unsure, 0)
 
     def look_at(self, joint: int, state: State, unsure: float, missed: int) -> int:
-        """Check one joint, `missed` of whose replies in a row were missing before; return as `look` does."""
+        """Check one joint whose last `missed` replies were missing; return as `look` does."""
         self._pack(self._bytes, 0, *state.position, *state.velocity, *state.goal_current, *state.current)
         before, after = state.time_before_write, state.time_after_read
         return _look(self.joints, self._sample, joint, joint + 1, before, after, self.interval, unsure, missed)

@@ -96,7 +96,8 @@ def _guard_of(
 ) -> Guard:
     """A guard whose limits are widened just enough for the arm's position and velocity when it was stopped.
 
-    planned: largest goals of the experiment [A or V], so that currents have to follow as closely as they had to there.
+    planned: largest goals of the experiment [A or V], so that currents must follow their goals as closely as before the
+    stop.
     """
     fastest = max(_FASTER * float(np.abs(velocity).max()), 2.0 * config.safety.lower_speed) + 0.5
     joints = [

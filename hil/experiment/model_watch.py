@@ -1,12 +1,13 @@
 """Check during the experiment that the motion is consistent with some arm of the dry run's ensemble.
 
 The prior knowledge is that of the dry run: an ensemble of arms from `[arm.prior]` or from an earlier result. Its mean
-and widened covariance initialise `hil.estimator.models.momentum_observer`. Without link lengths, which a dry run needs
+and inflated covariance initialise `hil.estimator.models.momentum_observer`. Without link lengths, which a dry run needs
 too, only the planned torque is known: the first motion then trains the model, and only later motion is judged.
 """
 
 import math
 import operator
+from collections import deque
 from collections.abc import Callable, Sequence
 from struct import Struct
 from typing import Any
@@ -30,16 +31,21 @@ WIDENED = 1.5
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
 _FRICTIONS = 8.0
-"""Smallest torque scale, in multiples of the mean dry friction, so that less than twice the friction causes no alarm.
+"""Lower bound on the torque scale, in multiples of the mean dry friction: up to twice that friction must not raise an
+alarm.
 """
 _TILT_SHARE = 0.2  # standard deviation of gravity perpendicular to the assumed direction, relative to gravity
 _FRICTION_SPREAD = 3.0
-"""Multiple of the spread of servo friction that is allowed for friction elsewhere in an arm without a description."""
-_UNDESCRIBED = {"gravity": 10.0, "viscous": 6.0, "offset": 0.3}
-"""Standard deviations for an arm without a description, as multiples of the planned torque in SI units; others 1.
+"""Factor on the spread of servo friction for an arm without a description, to allow for friction outside its servos."""
+_UNDESCRIBED = {"gravity": 10.0, "viscous": 1.0, "offset": 0.3, "tilt": 1.0}
+_INERTIA = 0.3
+"""Standard deviations for an arm without a description, as multiples of the planned torque in SI units.
 
-A small first torque moves an arm by a tenth of a radian: its gravity is ten times as large.
+If a small first torque moves an arm by a tenth of a radian, the arm's gravity torque is ten times as large. But the arm
+does move, which it would not if viscous friction or inertia were several times the planned torque.
 """
+_FLAT = 0.3
+"""Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the same units."""
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
 """Time for which a joint must appear stationary under a torque that is held over several exchanges [s]."""
@@ -49,57 +55,39 @@ _LAG_S = 0.012
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 JOLT_S, JOLT_BACK_S = 0.01, 0.15
-"""Time in which the velocity of a joint that slips changes, and after which it is back at the latest [s]."""
+"""Time within which a slipping joint's velocity changes, and within which it returns [s]."""
 
 JOLT_RAD_S, JOLT_TIMES = 1.2, 5.0
-"""Smallest change of velocity in `JOLT_S` that is a jolt [rad/s], and its smallest ratio to the RMS of the usual ones.
+"""Smallest change of velocity in `JOLT_S` that counts as a jolt [rad/s], and its smallest ratio to the RMS of ordinary
+ones.
 """
 
 _USUAL_S = 1.0
 _GAP = 3.0
-"""Number of intervals between two samples after which changes of velocity are not judged."""
+"""Gap between two samples, in sample intervals, beyond which changes of velocity are not judged."""
 _WINDOW_S = 0.3
-"""Time over which a message reports the torques commanded to a stationary joint [s]: a multisine often crosses zero."""
+"""Time over which a message about a stationary joint gives the range of its torque [s]: a single value may be near
+zero.
+"""
 
 
-class _Ranges:
-    """Smallest and largest value of each joint within the last `_WINDOW_S`, or the last half of it."""
+_JOLT = np.dtype(
+    [(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun")]
+    + [("count", "i8"), ("oldest", "i8")]
+)
+"""Statistics of a joint's changes of velocity.
 
-    def __init__(self, joints: int) -> None:
-        self._began = -math.inf
-        self._low, self._high = [0.0] * joints, [0.0] * joints
-        self._former = self._low, self._high
-
-    def add(self, values: list[float], now: float) -> None:
-        if now - self._began >= 0.5 * _WINDOW_S:
-            self._former, self._began = (self._low, self._high), now
-            self._low, self._high = values.copy(), values.copy()
-            return
-        low, high = self._low, self._high
-        for joint, value in enumerate(values):
-            if value < low[joint]:
-                low[joint] = value
-            elif value > high[joint]:
-                high[joint] = value
-
-    def of(self, joint: int) -> tuple[float, float]:
-        low, high = self._former
-        return min(low[joint], self._low[joint]), max(high[joint], self._high[joint])
-
-
-_JOLT = np.dtype([(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun")])
-"""What is known of a joint's changes of velocity.
-
-square: mean square of the usual ones [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may yet
-belong to a jolt, and its duration [s]. change: first change of what may be a jolt [rad/s]. begun: its time [s].
+square: mean square of ordinary ones [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may still
+turn out to belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s]. begun: its time
+[s]. count, oldest: number of earlier velocities stored, and the row of the oldest.
 """
 
 
 class Jolts:
-    """Detects a joint that jerks and is at its old velocity again a moment later, as one whose horn slips.
+    """Detects a joint whose velocity jumps and returns a moment later, as when its horn slips.
 
-    A motor cannot do this, whatever the arm: it would have to accelerate and brake much harder than ever before. So it
-    is known without any knowledge of the arm. Velocities are compared over `JOLT_S`, with their usual changes.
+    No motor can do this on any arm: it would have to accelerate and brake much harder than ever before. The check
+    therefore needs no knowledge of the arm. Changes of velocity over `JOLT_S` are compared with ordinary ones.
 
     count: number of joints. interval: time between two exchanges [s].
     """
@@ -110,7 +98,6 @@ class Jolts:
         self._joints = np.zeros(count, _JOLT)
         self._joints["begun"] = -np.inf
         self._former = np.zeros((back, count))
-        self._known = np.zeros(2, dtype=np.int64)
         self._velocity = np.zeros(count)
         self._pack = Struct(f"{count}d").pack_into
         self._bytes = memoryview(self._velocity.data).cast("B")
@@ -120,27 +107,26 @@ class Jolts:
     def look(self, velocity: Sequence[float], seconds: float, now: float) -> tuple[int, float] | None:
         """Process velocities [rad/s], `seconds` after the previous ones [s]; return the joint and change of a jolt."""
         self._pack(self._bytes, 0, *velocity)
-        joint = _jolting(self._joints, self._former, self._known, self._velocity, seconds, now, self._least)
+        joint = _jolting(self._joints, self._former, self._velocity, seconds, now, self._least)
         return None if joint < 0 else (joint, float(self._joints["change"][joint]))
 
     def forget(self) -> None:
-        """Begin anew: nothing is known about the motion since the previous sample."""
-        self._known[:] = 0
+        """Start over: nothing is known about the motion since the previous sample."""
+        self._joints["count"] = 0
 
 
-def _jolting_loop(joints: Any, former: Any, known: Any, velocity: Any, seconds: float, now: float, least: float) -> int:
-    # known: number of former velocities, and the row of the oldest.
-    back, row = former.shape[0], known[1]
-    known[1] = (row + 1) % back
-    if known[0] < back:
-        former[row] = velocity
-        known[0] += 1
-        return -1
+def _jolting_loop(joints: Any, former: Any, velocity: Any, seconds: float, now: float, least: float) -> int:
+    back = former.shape[0]
     found = -1
     for index in range(len(joints)):
         joint = joints[index]
+        row = joint.oldest
         change = velocity[index] - former[row, index]
         former[row, index] = velocity[index]
+        joint.oldest = (row + 1) % back
+        if joint.count < back:
+            joint.count += 1
+            continue
         most = max(least, JOLT_TIMES * math.sqrt(joint.square))
         is_jolt = not -most <= change <= most
         is_open = now - joint.begun <= JOLT_BACK_S
@@ -149,7 +135,7 @@ def _jolting_loop(joints: Any, former: Any, known: Any, velocity: Any, seconds: 
             continue
         if is_jolt and not is_open:
             joint.begun, joint.change, is_open = now, change, True
-        # What may be the beginning of a jolt counts as usual only once it has turned out to be none.
+        # A possible beginning of a jolt only counts as ordinary motion once it has turned out not to be one.
         joint.squared += seconds * min(change * change, most * most)
         joint.since += seconds
         if not is_open:
@@ -189,7 +175,7 @@ class ModelWatch:
         held = interval < 0.99 / config.experiment.rate
         self._follows = 1.0 - math.exp(-interval / _LAG_S) if held else 1.0
         self._felt = [0.0] * len(largest)
-        self._commanded = _Ranges(len(largest))
+        self._commanded: deque[tuple[float, list[float]]] = deque(maxlen=math.ceil(_WINDOW_S / interval))
         self._stands_for = 0.0
         self._long = max(interval, _VAGUE_S)
         self._jolts = Jolts(len(largest), interval)
@@ -213,7 +199,7 @@ class ModelWatch:
             follows = self._follows
             torque = self._felt = [felt + follows * (to - felt) for felt, to in zip(self._felt, torque, strict=True)]
         self._look_for_jolts(state, seconds)
-        self._commanded.add(torque, now)
+        self._commanded.append((now, torque))
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
         if joint < 0:
             self._stands_for = 0.0
@@ -232,8 +218,8 @@ class ModelWatch:
             joint, change = found
             raise SafetyStop(
                 f"{self._names[joint]} jerked: its velocity changed by {change:+.1f} rad/s and back within "
-                f"{1e3 * JOLT_BACK_S:.0f} ms, which no motor does. Its horn slips on the shaft, something hit it, "
-                "or its encoder is wrong.",
+                f"{1e3 * JOLT_BACK_S:.0f} ms, which these torques cannot cause. Its horn slips on the shaft, something "
+                "hit it, its encoder is wrong, or another program sent it a goal.",
                 Cause.UNEXPECTED,
             )
 
@@ -241,7 +227,8 @@ class ModelWatch:
         lacking = self._observer.lacking[joint]
         name, velocity = self._names[joint], state.velocity[joint]
         if abs(velocity) < _STILL_RAD_S:
-            low, high = self._commanded.of(joint)
+            recent = [torque[joint] for at, torque in self._commanded if self._seen_at - at <= _WINDOW_S]
+            low, high = min(recent), max(recent)
             said = (
                 f"{name} stands still, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "
                 "arm consistent with the prior and the data so far would move. Something blocks it, or its encoder is "
@@ -288,6 +275,7 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
     guesses = [servo_prior(joint.joint.servo).coulomb for joint in config.joints]
     mean = {f"coulomb_{number}": guess.median for number, guess in enumerate(guesses, 1)}
     spread = np.zeros(len(NAMES))
+    is_flat = config.arm.gravity == 0.0
     for index, name in enumerate(NAMES):
         if len(largest) == 1 and name in _OF_TWO:
             continue
@@ -296,5 +284,6 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
         if term == "coulomb":
             spread[index] = _FRICTION_SPREAD * guesses[joint].spread * guesses[joint].median
         else:
-            spread[index] = _UNDESCRIBED.get(term, 1.0) * largest[joint]
+            share = _FLAT if is_flat and term in ("gravity", "tilt") else _UNDESCRIBED.get(term, _INERTIA)
+            spread[index] = share * largest[joint]
     return mean, np.diag(spread**2)

@@ -91,14 +91,24 @@ def run_experiment(
                 _play(config, plan, bus, recorder, stop, shown, note, arms)
             torque = str(bus.torque_off_report)
             note(torque)
+            _close(recorder, torque)
             with suppress(RunFolderError):  # the same information is in the recording
                 write_json(run.path / "lateness.json", lateness_histogram(recorder.samples))
         _check_still_wanted(stop, torque)
     return torque
 
 
+def _close(recorder: Recorder, torque: str) -> None:
+    """Close the recording; the error of a failure also states whether torque is off."""
+    try:
+        recorder.close()
+    except RunFolderError as error:
+        error.add_note(torque)
+        raise
+
+
 def _check_still_wanted(stop: StopRequest, torque: str) -> None:
-    """Raise a stop request that arrived while torque was being cut: the recording stays, but nothing follows."""
+    """Raise a stop request that arrived while torque was being cut: the recording is kept, but nothing more is run."""
     try:
         stop.check()
     except StopRequested as request:

@@ -41,7 +41,7 @@ def _lower(config: Config, bus: ServoBus, joint: Joint, limit: float, note: Call
             )
         if present > needed and config.safety.write_current_limit:
             servo.write("Current Limit", needed)
-            note(f"{servo.title}: Current Limit {present} -> {needed} until the end")
+            note(f"{servo.title}: Current Limit {present} -> {needed} until the end of the run")
 
 
 def _check_pwm_limit(bus: ServoBus, joint: Joint, limit: float) -> None:

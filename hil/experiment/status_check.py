@@ -121,7 +121,7 @@ class StatusCheck:
         return None
 
     def _is_anothers(self, joint: int, offset: float, now: float) -> bool:
-        """Whether a servo minus computer clock is that of another joint, and its servo's clock is a different one."""
+        """Whether this difference of clocks (servo minus computer) is that of another joint's servo."""
         return any(
             readings >= _LEARNT_READINGS
             and abs(_wrapped(offset - behind)) <= _CLOCK_TOLERANCE_S + _CLOCK_DRIFT * (now - seen_at)
@@ -131,5 +131,5 @@ class StatusCheck:
 
 
 def _wrapped(seconds: float) -> float:
-    """The same difference of two clocks, between minus and plus half of their period."""
+    """A difference of two clocks, wrapped to plus or minus half of the period after which a servo's clock wraps."""
     return (seconds + 0.5 * _WRAP_S) % _WRAP_S - 0.5 * _WRAP_S

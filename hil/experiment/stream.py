@@ -30,7 +30,6 @@ from hil.experiment.guard import Guard
 from hil.experiment.lowering import Lowering, may_lower
 from hil.experiment.model_watch import ModelWatch
 from hil.experiment.repetition import Repetition
-from hil.experiment.silence import LATE_WAKE_UP_S
 from hil.experiment.stop_request import StopRequest
 from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
@@ -41,7 +40,7 @@ from hil.setup.servo_session import has_moved
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
 _FORGETS = 0.98
-"""Factor per exchange by which the memory of the longest one fades."""
+"""Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
 
 
 class Progress(NamedTuple):
@@ -210,8 +209,8 @@ class Stream:
             return "Check for backlash, a dragging cable or a slipping joint; or raise max_settling_periods."
         seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
         return (
-            f"The change falls slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), as "
-            f"while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
+            f"The change decreases slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), "
+            f"as while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:
@@ -278,9 +277,7 @@ class Stream:
                 self._stop.check()
         self._look_for_another_master(self._interval)
         self._deadline, now, late = self._ticks.wait()
-        overslept = now - max(self._deadline, self._awake_at)
-        if overslept >= LATE_WAKE_UP_S:
-            self._guard.woke_up(now, overslept)
+        self._guard.woke_up(now, now - max(self._deadline, self._awake_at))
         self._awake_at = now
         if late:
             # A missed tick is skipped, never made up for in a burst: the servos keep the previous goal.
@@ -324,7 +321,7 @@ class Stream:
                 yield state
 
     def _look_for_another_master(self, later: float) -> None:
-        """If it is time, read back what the servos hold just before the exchange due `later` than the sample [s]."""
+        """If a read-back is due, do it just before the exchange that is due `later` [s] after the sample."""
         deadline = self._deadline
         if deadline is not None and self._exchange.read_back_at <= deadline + later:
             self._bus.check_not_overruled(deadline + later)
@@ -371,7 +368,7 @@ class Stream:
         self._told(error, f"The arm {done}.")
 
     def _way_down(self, lowering: Lowering, state: State) -> State:
-        """The last state; raises SafetyStop, StopRequested, DriverError."""
+        """Follow the path home; return the last state. Raises SafetyStop, StopRequested, DriverError."""
         asked = max(1, self._stop.count)
         for index in range(lowering.begin(state, self._goal)):
             for checked in self._between_samples() if index else ():

@@ -3,8 +3,8 @@
 It is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot return more work than was
 put in, so a motor that continually takes work out of it turns the wrong way.
 
-It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). What it remembers
-of a joint is a record of the type `MEMORY`.
+It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state that it
+keeps for a joint is a record of the type `MEMORY`.
 """
 
 from typing import Any
@@ -15,7 +15,8 @@ import numpy as np
 __all__ = ["MEMORY", "TOLERANCE_RAD", "begin", "look"]
 
 TOLERANCE_RAD = 0.04
-"""Tolerance before a joint's sign is called wrong [rad]: work returned, divided by the joint's largest planned torque.
+"""Work taken out of the arm, divided by the joint's largest planned torque, above which the joint's sign is called
+wrong [rad].
 
 A healthy motor returns some because of delays: a heavy arm at 20 Hz up to 0.02 rad.
 """
@@ -24,7 +25,7 @@ _OF_OTHERS = 0.5
 """Share of the work put in by the other joints' motors that may come out at this joint."""
 
 MEMORY = np.dtype([("scale", "f8"), ("least", "f8"), ("done", "f8"), ("held", "f8")])
-"""One joint's constants and memory.
+"""Constants and state of the check of one joint.
 
 scale: torque per goal [N m/A or N m/V]. least: work below which the sign is in doubt [J]. done: work done so far [J].
 held: latest goal [A or V].

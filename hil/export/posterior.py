@@ -37,7 +37,7 @@ _POSES = 20
 """Poses in which the mass matrix of a drawn spatial arm must be positive definite."""
 
 _IN_TORQUE = ("N m", "kg m^2")
-"""Parameters whose units start like this scale with the torque constant."""
+"""Beginnings of the units of parameters that scale with the torque constant."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,8 @@ def draw_arms(source: Source, samples: int, seed: int = 1, *, torque_constants: 
 def export_samples(
     run: Path, formats: Sequence[str], out: Path, samples: int, seed: int = 1, link_length: float | None = None
 ) -> Drawn:
-    """Draw arms and write them to the folder `out`: arm_0000.xml or .urdf and so on, and arms.parquet.
+    """Draw arms from the posterior and write them to the folder `out`: arm_0000.xml or .urdf and so on, and
+    arms.parquet.
 
     Raises ExportError, ResultError, RunFolderError.
     """

@@ -36,7 +36,7 @@ _TIMES = 160
 """Number of instants of a motion that are compared, per joint."""
 _LINEAR_RANGE = 0.02  # rad, below which displacements are compared linearly, and above it by their logarithms
 _ERROR = 0.08
-"""Relative error of a compared displacement that models of this kind leave."""
+"""Relative model error of a compared displacement."""
 _LEAST_ERROR_STEPS = 1.5
 MOVED_STEPS = 26
 """Smallest range of motion of a joint that counts as having moved [encoder steps]."""

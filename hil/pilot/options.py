@@ -20,7 +20,9 @@ class PilotOptions:
     certain_share: float = 0.85
     """Fraction of a limit that a typical arm should reach; below it, uncertainty wastes too much of the range."""
     certain_share_known: float = 0.72
-    """The same if the belief comes from an earlier result: another run would hardly narrow it."""
+    """Fraction of a limit that a typical arm should reach if the belief comes from an earlier result, whose uncertainty
+    another run would hardly reduce.
+    """
 
     pilot_period_share: float = 0.5
     """Period of a pilot, relative to experiment.period."""
@@ -34,22 +36,24 @@ class PilotOptions:
     breakaway_room: float = 0.25
     """Fraction of the distance to its position limits after which a joint that has just broken away is stopped."""
     min_breakaway_steps: int = 60
-    """Minimum of that distance [encoder steps]."""
+    """Minimum distance after which a joint that has just broken away is stopped [encoder steps]."""
 
     at_limit: float = 0.99
     """Fraction of a torque limit above which the limit counts as reached."""
     torque_after_limit: float = 0.85
     """Cap on further torque, relative to the torque at which a limit was exceeded."""
     torque_after_unsettled: float = 0.85
-    """The same after a run that never settled: large motion with little friction may never settle."""
+    """Cap on further torque after a run that never settled, as a large motion with little friction may, relative to its
+    torque.
+    """
     torque_over_friction: float = 1.8
     """Ratio of a joint's torque to its Coulomb friction up to which a run that never settled does not lower it."""
     worthwhile_raise: float = 1.15
     """Minimum ratio of torques that justifies another run if little of the range is unused."""
     worthwhile_raise_far: float = 1.03
-    """The same if more of the range is unused."""
+    """Minimum ratio of torques that justifies another run if more of the range is unused."""
     fair_share: float = 0.7
-    """Fraction of a limit reached by a typical arm that separates the two."""
+    """Fraction of a limit, reached by a typical arm, above which little of the range counts as unused."""
 
     wide_range: float = 0.74
     """Fraction of the position range, of the joint that uses least, below which other waves are tried."""
@@ -57,13 +61,14 @@ class PilotOptions:
     """Maximum number of other waves: either sign of each joint, and all of these reversed in time."""
 
     falling_raise: float = 1.35
-    """Maximum ratio of the torques of two runs of an arm that falls over when it is stopped."""
+    """Maximum ratio of the torques of successive runs of an arm that falls over when it is stopped."""
     falling_breakaway_raise: float = 1.2
-    """Ratio of successive peak torques of a joint of such an arm that has not moved yet."""
+    """Ratio of successive peak torques of a joint that has not moved yet, on an arm that falls over when it is stopped.
+    """
     falling_share: float = 0.85
-    """Fraction of the limits for such an arm."""
+    """Fraction of the limits that runs may use on an arm that falls over when it is stopped."""
     min_falling_torque: float = 0.05
-    """Torque that such an arm may receive in any case, as a fraction of what the current limit allows."""
+    """Torque that an arm that falls over may receive in any case, as a fraction of what the current limit allows."""
     start_inside: float = 0.95
     """Fraction of the limits within which an arm that a stopped run left beyond them is assumed to start."""
 

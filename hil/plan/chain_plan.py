@@ -34,8 +34,8 @@ class PathSegment(Segment):
     """A path; its multisine is the torque that is commanded for it.
 
     way, back: goals of the transitions from and to the rest pose (samples, joints) [A]. paths: the desired motions:
-    transition, period, transition back. thought: the assumed model that gave the torque. peaks: largest goal for the
-    path without the stabiliser (joints,) [A].
+    transition, period, transition back. thought: the assumed model from which the torque was computed. peaks: largest
+    goal for the path without the stabiliser (joints,) [A].
     """
 
     way: Array

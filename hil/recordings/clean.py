@@ -72,7 +72,8 @@ def _restarts(rows: Rows) -> list[Rows]:
     edges = [0, *ends.tolist(), rows.time.size]
     parts = [rows.kept(slice(first, last)) for first, last in pairwise(edges)]
     if len(parts) > 1:
-        said = f"Time goes back {len(parts) - 1} times: taken as {len(parts)} recordings."
+        often = "once" if len(parts) == 2 else f"{len(parts) - 1} times"
+        said = f"Time goes back {often}: treated as {len(parts)} recordings."
         parts[0] = parts[0].kept(slice(None), said)
     return parts
 
@@ -139,6 +140,6 @@ def _apart(rows: Rows) -> list[Rows]:
     edges = [0, *ends.tolist(), rows.time.size]
     parts = [rows.kept(slice(first, last)) for first, last in pairwise(edges)]
     if len(parts) > 1:
-        said = f"{len(ends)} gaps of more than {LONGEST_GAP:g} s: taken as {len(parts)} recordings."
+        said = f"{len(ends)} gaps of more than {LONGEST_GAP:g} s: treated as {len(parts)} recordings."
         parts[0] = parts[0].kept(slice(None), said)
     return parts

@@ -32,4 +32,4 @@ def read_tables(path: Path) -> list[Table]:
         return read_parquet(path)
     if kind == ".mcap":
         return read_mcap(path)
-    raise CsvError(f"{path}: {kind} files are not read. Convert it to CSV, Parquet or MCAP.")
+    raise CsvError(f"{path}: {kind} files are not supported. Convert it to CSV, Parquet or MCAP.")

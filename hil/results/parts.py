@@ -90,8 +90,9 @@ class SettledFit(Fit):
 
 @dataclass(frozen=True, kw_only=True)
 class ShootingFit(Fit):
-    """Fit of any motion, cut into segments. residual_rms_rad: the residual in rad RMS, per joint; residual_rms_ticks is
-    empty where the encoders' resolution is not known."""
+    """Fit of an arbitrary motion, cut into segments. residual_rms_rad: the residual in rad RMS, per joint;
+    residual_rms_ticks is empty where the encoders' resolution is not known.
+    """
 
     residual_rms_rad: PerJoint
     residual_rms_ticks: PerJoint
@@ -194,14 +195,20 @@ class TriedModel:
 class ModelChoice:
     """The model chosen with friction = "auto", and its gain and cost.
 
-    error_divided_by: prediction error of the first model divided by that of the chosen one. standard_errors_times:
-    factor by which the standard errors grew; None if that was not compared.
+    error_divided_by: prediction error of the model with the fewest parameters divided by that of the chosen one.
+    standard_errors_times: factor by which the standard errors grew; None if that was not compared.
     """
 
     chosen: str
     error_divided_by: float
     standard_errors_times: float | None = None
     tried: tuple[TriedModel, ...]
+
+    @property
+    def plainest(self) -> str:
+        """The model with the fewest parameters of those that could be judged."""
+        judged = [trial for trial in self.tried if trial.score is not None]
+        return min(judged, key=lambda trial: trial.parameters).model if judged else self.chosen
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from enum import IntEnum
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,9 +48,9 @@ def sample_type(joints: int) -> np.dtype[np.void]:
     """The type of one row.
 
     It contains times [s], the position in the plan, and per joint goal and measured current [A], velocity [rad/s],
-    position [rad], the servo's error byte and whether its reply is missing (the measured values are then NaN). In turn,
-    a few times a second, it also contains the servo's clock [s], supply voltage [V] and temperature [degrees C], which
-    are NaN otherwise.
+    position [rad], the servo's error byte and whether its reply is missing (the measured values are then NaN).
+    Alternately, a few times a second, it also contains the servo's clock [s], supply voltage [V] and temperature
+    [degrees C], which are NaN otherwise.
     """
     each = (joints,)
     return np.dtype(
@@ -101,8 +102,13 @@ class Recorder:
     def __enter__(self) -> "Recorder":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(self, _kind: object, error: BaseException | None, _traceback: object) -> None:
+        try:
+            self.close()
+        except RunFolderError as lost:
+            if error is None:
+                raise
+            error.add_note(str(lost))  # the reason for the end comes first
 
     @property
     def samples(self) -> NDArray[np.void]:
@@ -134,13 +140,33 @@ class Recorder:
         self.count += 1
 
     def close(self) -> None:
-        """Truncate the file to the recorded rows; may be called again."""
+        """Truncate the file to the recorded rows; may be called again.
+
+        Raises RunFolderError if the file was removed or renamed in the meantime; its rows are then saved in a new file.
+        """
         if self._bytes.nbytes == 0:
             return
         self._touched.close(_TOUCH_S)
         self._bytes.release()
         self._bytes = memoryview(b"")
-        self._samples = _cut(self._path, self._samples, self.count)
+        try:
+            self._samples = _cut(self._path, self._samples, self.count)
+        except FileNotFoundError:
+            self._samples = self.samples.copy()
+            self._save_again()
+
+    def _save_again(self) -> NoReturn:
+        folder = self._path.parent
+        said = f"{folder} was removed or renamed while the run was being recorded"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            np.save(self._path, self._samples)
+        except OSError as error:
+            raise RunFolderError(f"{said}, and its samples cannot be saved to a new file: {error.strerror}.") from error
+        raise RunFolderError(
+            f"{said}. Its {self.count} samples have been saved to a new file, {self._path}, but estimating from them "
+            "also needs the config.toml and run.json of the folder that is missing."
+        )
 
     def _touch(self, first: int) -> None:
         """Map the pages of a chunk of rows for writing: a page's first write can take the kernel 0.4 ms."""

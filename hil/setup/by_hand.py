@@ -30,7 +30,7 @@ class Pose:
     """Where the arm is."""
 
     angles: tuple[float, ...]
-    """In the description's convention [rad]."""
+    """Joint angles in the description's convention [rad]."""
     end: tuple[float, float, float]
     """The end link's centre of mass in the base's frame [m]."""
 
@@ -41,7 +41,7 @@ class Moved:
 
     joint: str
     asked: str
-    """What the user was asked to do with it."""
+    """What the user was asked to do with this joint."""
     angles: tuple[float, ...]
     """Angles by which all joints moved [rad]."""
     well: bool

@@ -314,8 +314,8 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
     fix = (
-        f"arm.rest_pose is {rest:.3f} rad, arm.rest_tolerance allows {config.rest_tolerance:g}. If the arm hangs "
-        f"at rest now, set zero_ticks = {zero}."
+        f"arm.rest_pose is {rest:.3f} rad, arm.rest_tolerance allows {config.rest_tolerance:g}. Move it there by hand. "
+        f"Only if the arm is in its rest pose now, set zero_ticks = {zero}."
     )
     return _graded(abs(angle - rest) <= config.rest_tolerance, "pose", f"{angle:+.3f} rad", fix)
 

@@ -14,7 +14,7 @@ from hil.drivers.exchange import Exchange
 from hil.drivers.packet import HEADER, Framer, Instruction, crc, encode, encode_status
 from hil.drivers.port import Port
 from hil.drivers.servo_model import Mode
-from hil.drivers.state import spans
+from hil.drivers.state import read_back_spans, spans
 from hil.drivers.sync_read import FastSyncRead, Span, SyncRead
 
 XM430 = load_control_table("XM430-W350")
@@ -284,10 +284,10 @@ def test_a_cycle_without_answers_is_bounded(count: int, at_most_s: float) -> Non
 def test_servos_and_adapter_are_given_the_time_that_they_may_take() -> None:
     wire = Wire()
     wire.latency = 16e-3
-    slow = Exchange(wire, (1, 2), XM430["Goal Current"], spans(Mode.CURRENT, [XM430] * 2), 0.5e-3)
+    slow = Exchange(wire, (1, 2), XM430["Goal Current"], spans(Mode.CURRENT, [XM430] * 2), 2e-3)
     slow.cycle([0, 0])
     on_the_wire = (20 + 16 + 42) * 10 / 1e6  # both requests, both answers
-    needed = on_the_wire + 2 * 0.5e-3 + 16e-3
+    needed = on_the_wire + 2 * 2e-3 + 16e-3
     assert needed < wire.time < needed + 1e-3
 
 
@@ -336,6 +336,41 @@ def test_another_masters_instructions_between_two_cycles_are_counted() -> None:
         assert cycles.strangers == count
 
 
+def read_back_of(wire: Wire) -> Exchange:
+    cycles = exchange(wire)
+    modes = [Mode.CURRENT, Mode.CURRENT]
+    cycles.add_read_back(*read_back_spans(modes, [XM430, XM430]), modes)
+    return cycles
+
+
+def test_another_masters_instructions_before_a_read_back_are_counted() -> None:
+    wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])
+    cycles = read_back_of(wire)
+    cycles.cycle([0, 0])
+    wire.waiting = encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")
+    cycles.overruled(wire.now() + 0.1)
+    assert cycles.strangers == 1
+
+
+def test_goals_are_compared_with_what_was_sent_though_the_caller_changes_its_list() -> None:
+    wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)] * 30)
+    cycles = read_back_of(wire)
+    goals = [7, 8]
+    for _ in range(4):
+        cycles.cycle(goals)
+    goals[:] = [70, 80]
+    goal, mode = read_back_spans([Mode.CURRENT] * 2, [XM430] * 2)
+    assert isinstance(goal, Span) and isinstance(mode, Span)
+    assert cycles._read_back is not None
+    goals_are_asked_for = cycles._read_back.reads[0]
+    for _ in range(8):
+        size, held = (goal.size, (7, 8)) if cycles._read_back.read is goals_are_asked_for else (mode.size, (0, 0))
+        answers = [bytes(size - 2) + struct.pack("<h", each) for each in held]
+        wire.answers = [b"".join(encode_status(servo, 0, each) for servo, each in enumerate(answers, 1))]
+        assert cycles.overruled(wire.now() + 0.1) is None and not wire.answers
+        assert not cycles._late_possible and not cycles.is_in_doubt
+
+
 def test_damaged_bytes_are_told_from_silence_and_late_replies_from_both() -> None:
     fine = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
     for received, is_damaged in ((answer(1, 1, 2, 3), False), (b"", False), (fine[:-3] + b"abc", True)):
@@ -374,6 +409,23 @@ def test_an_echo_is_removed_and_its_end_is_noticed(one_write: bool) -> None:
         times.append(wire.time - began)
     assert times[4] < 1e-4, "it waits for no more than echo and reply"
     assert times[5] > 1e-3 > 10 * times[6], "only one cycle waits for an echo that has ended"
+
+
+def test_a_read_back_behind_an_echo_is_read_whole() -> None:
+    wire = Wire()
+    wire.echoes = True
+    cycles = read_back_of(wire)
+    wire.answers = [echoed(wire, answer(1, 1, 2, 3) + answer(2, 4, 5, 6), [7, 8])]
+    cycles.cycle([7, 8])
+    back = cycles._read_back
+    assert back is not None and back.read is back.reads[1]
+    _, mode = read_back_spans([Mode.CURRENT] * 2, [XM430] * 2)
+    assert isinstance(mode, Span)
+    wire.answers = [back.read.request + b"".join(encode_status(servo, 0, bytes(mode.size)) for servo in (1, 2))]
+    began = wire.time
+    assert cycles.overruled(began + 0.1) is None
+    assert not wire.waiting and not cycles._late_possible
+    assert wire.time < began + 0.1, "it did not wait for more"
 
 
 @pytest.mark.parametrize(("share", "latest"), [(0.4, True), (0.6, False)])

@@ -10,6 +10,7 @@ import serial
 from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, Protocol2PacketHandler
 
 from hil import fakes
+from hil.drivers.clock import WallClock
 from hil.drivers.packet import encode, encode_status
 from hil.drivers.port import open_port
 from hil.drivers.sdk_port import SdkPort
@@ -61,6 +62,18 @@ def test_read_waits_for_the_timeout_only(port: FakeSerial) -> None:
     port.clock.wait_until(port.clock.now() + 1.0)
     assert port.in_waiting == len(PONG)
     assert port.read(100) == PONG
+
+
+def test_real_time_by_url() -> None:
+    """pyserial creates the port object before it sets the URL that asks for real time."""
+    fakes.register()
+    with serial.serial_for_url(f"{URL}?time=real", baudrate=1_000_000, timeout=0.02) as opened:
+        assert isinstance(opened, FakeSerial) and isinstance(opened.clock, WallClock)
+        began = opened.clock.now()
+        assert opened.read(1) == b""
+        assert opened.clock.now() - began >= 0.02
+    with serial.serial_for_url(URL) as opened:
+        assert isinstance(opened.clock, VirtualClock)
 
 
 def test_read_without_timeout_never_hangs(port: FakeSerial) -> None:

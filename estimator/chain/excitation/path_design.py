@@ -100,7 +100,7 @@ class PathDesigner:
         random = np.random.default_rng(seed)
         found = self._finished(centre, self._random_lines(random))
         if found is None:
-            raise ExcitationError("no path about this centre stays within the limits of torque and clearance")
+            raise ExcitationError("no path about this centre stays within the torque and clearance limits")
         return found
 
     def design(self, seed: int, generations: int = GENERATIONS) -> Design:
@@ -126,7 +126,7 @@ class PathDesigner:
         centre, lines = self._split(best)
         found = self._finished(centre, lines)
         if found is None:
-            raise ExcitationError("no path stays within the limits of torque and clearance")
+            raise ExcitationError("no path stays within the torque and clearance limits")
         return found
 
     def scaled(self, design: Design, share: float) -> Path:
@@ -155,7 +155,7 @@ class PathDesigner:
                 best = value, centre, lines
         if best is None:
             raise ExcitationError(
-                f"none of {CENTRES} centres has a path that stays within the limits of torque and clearance"
+                f"none of {CENTRES} centres has a path that stays within the torque and clearance limits"
             )
         return best[1], best[2]
 
@@ -169,7 +169,7 @@ class PathDesigner:
         found = [self._finished(centre, self._random_lines(random)) for _ in range(tries)]
         allowed = [design for design in found if design is not None]
         if not allowed:
-            raise ExcitationError("no path about this centre stays within the limits of torque and clearance")
+            raise ExcitationError("no path about this centre stays within the torque and clearance limits")
         return max(allowed, key=lambda design: float(design.path.position.std(axis=1).min()))
 
     def _random_lines(self, random: np.random.Generator) -> Array:

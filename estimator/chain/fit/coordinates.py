@@ -77,7 +77,7 @@ class ChainCoordinates:
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
-        """Return the point reached by `step` from `x`; other coordinates may follow both.
+        """Return the point reached by `step` from `x`; both may be followed by other coordinates.
 
         If a recording hardly determines the torque of some joints relative to that of the first, their torque scales
         and all parameters of their links change by a common factor. The scales are exponential. Unless the
@@ -124,9 +124,8 @@ class ChainCoordinates:
 
     @cached_property
     def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices of the parameters with their own prior: friction shapes, drives, small angles.
-
-        With their typical coordinates and the standard deviations of these.
+        """Indices of the parameters with their own prior (friction shapes, drives, small angles), their prior means and
+        standard deviations.
         """
         found = [
             (i, np.log(SHAPES[kind][0]), SHAPES[kind][1]) if kind in SHAPES else (i, 0.0, ANGLES[kind] / SMALL[kind])

@@ -19,7 +19,7 @@ def resolved_widths(problem: ChainProblem, x: Array, shortest_step: float, width
         problem: the recordings.
         x: coordinates at which the arm can be simulated.
         shortest_step: shortest integration step, near standstill [s].
-        widths_per_substep: widths through which reversed friction may move a joint within `shortest_step`.
+        widths_per_substep: number of widths through which a reversal of friction may take a joint in `shortest_step`.
     """
     model, parameters = problem.model, problem.parameters(x)
     every = model.base.as_all(np.array([parameters[name] for name in model.base.names]))

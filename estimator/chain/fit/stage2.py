@@ -57,7 +57,7 @@ class ChainOptions:
     finer: int = 16
     """Number of smaller steps that replace one near standstill, where friction changes fast."""
     finest: int = 64
-    """The same number in the last iterations."""
+    """Number of smaller steps that replace one near standstill in the last iterations."""
     widths_per_substep: float = CoordinateOptions.widths_per_substep
     width_floor: float = 3e-4
     """Minimum width of every Coulomb step [rad/s]: hardly distinguishable from friction that truly sticks."""
@@ -93,8 +93,8 @@ MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 NEARER, LAST = MinimiserOptions(max_damping=0.1), MinimiserOptions(max_damping=1.0)
 """Options of the last iterations with coarse steps, which fine ones follow, and with fine steps.
 
-Where a joint is on the verge of sticking, the sum of squares has small steps. A decrease that is only achieved with
-heavy damping is such a step and is not pursued.
+Where a joint is on the verge of sticking, the sum of squares is slightly discontinuous. A decrease that is only
+achieved with heavy damping is such a discontinuity and is not pursued.
 """
 
 
@@ -176,8 +176,8 @@ def fit_periods(
     )
     last = replace(sticking, weights=weights, steps=problem.steps, finer=options.finest, reach=options.reach)
     damped = last.minimise(nearer.x, options.ftol, options=LAST)
-    # Damping holds back poorly determined coordinates, so it is removed now. Without it from the beginning, many
-    # coordinates would reach their step limits and hold up the others.
+    # Damping holds back poorly determined coordinates, so it is removed now. Had it been absent from the beginning,
+    # many coordinates would reach their step limits and hold up the others.
     minimum = damped
     if not damped.stalled:
         minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
@@ -195,10 +195,10 @@ def fit_periods(
 
 
 def _remaining(minimum: Minimum, coordinates: ChainCoordinates) -> tuple[Array, float]:
-    """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations foresee.
+    """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations predict.
 
-    Where the sum of squares has small steps, all damped steps may fail although the gradient is not zero. A width at
-    its floor stays there.
+    Where the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
+    A width at its floor stays there.
     """
     at, least = minimum.at, np.full(minimum.x.size, -np.inf)
     least[: len(coordinates.names)] = coordinates.room_below(minimum.x)
@@ -248,7 +248,7 @@ def _softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Ar
 
 
 def _tempered(problem: ChainProblem, x: Array) -> ChainProblem:
-    """Return the problem with a prior that counts as much more as the residual at `x` exceeds the assumed noise.
+    """Return the problem with the prior's weight raised by as much as the residual at `x` exceeds the assumed noise.
 
     Repeated readings count as one, as they do in the sum of squares.
     """

@@ -24,11 +24,16 @@ ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, i
 SAMPLES = 150
 KINDS = (slice(1, 4), slice(4, 10), slice(10, 11), slice(0, 1))  # moments, inertias, armature, mass
 CLEARLY_INDEPENDENT = 0.1
-"""Part of a column that the kept ones do not explain, above which it does not wait; relative to the largest column of
-the same link and kind."""
+"""Norm of the part of a column that the columns kept so far do not explain, above which the column is kept at once.
+
+It is relative to the largest column of the same link and kind.
+"""
 INDEPENDENT = 1e-4
-"""The same, above which it is kept at all. Angles such as 1.5708 in a description make every parameter a little
-independent, but change no torque by more than this fraction."""
+"""Norm of that part, on the same scale, above which the column is kept in the end.
+
+Angles such as 1.5708 in a description make every parameter slightly independent, but change no torque by more than this
+fraction.
+"""
 LEAST_FACTOR = 1e-7  # of a group
 NOTHING = 1e-9
 
@@ -109,7 +114,7 @@ def _norms_by_kind(norm: Array) -> Array:
 
 
 def _independent(Y: Array, order: list[int]) -> Columns:
-    """Return the independent ones of columns that are relative to their kind."""
+    """Return which columns of `Y`, scaled by the largest of their kind, are independent of each other."""
     left = Y[:, order].copy()
     kept: list[int] = []
 

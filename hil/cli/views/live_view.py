@@ -93,8 +93,8 @@ class LiveView:
         silent = f", {lost} servo{'s' if lost > 1 else ''} silent" if lost else ""
         late = f"{1e6 * self._latest:.0f} µs"
         if self._is_narrow:
-            return f"round trip {trip:.2f} ms, {late} late{silent}"
-        return f"round trip {trip:.2f} ms, latest write {late} after the earliest{silent}"
+            return f"round trip {trip:.2f} ms, jitter {late}{silent}"
+        return f"round trip {trip:.2f} ms, write jitter at most {late}{silent}"
 
     def _health(self, index: int) -> str:
         heat, supply = self._heat[index], self._supply[index]

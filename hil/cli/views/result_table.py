@@ -9,7 +9,7 @@ from rich.table import Table
 
 from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
-from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
+from hil.estimation.torque_constants import RATIO, by_voltage_said, torque_constants_said
 from hil.estimator.models.terms import TERMS, joint_of, kind_of, term_of
 from hil.next_step import command, next_step
 from hil.printing import print_fitting, say
@@ -54,8 +54,12 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
         print("Regression on the measured torque: no motion was simulated, so there is no position residual.")
     if result.model_choice is not None:
         choice = result.model_choice
-        times = f"error {choice.error_divided_by:.3g} times smaller than with the plainest model"
-        print(f"Chosen on held-out segments: {choice.chosen}, {times}.")
+        compared = (
+            "the simplest model"
+            if choice.chosen == choice.plainest
+            else f"whose error, compared with that of the simplest model, is {_times(1.0 / choice.error_divided_by)}"
+        )
+        print(f"Chosen on held-out segments: {choice.chosen}, {compared}.")
     if result.physical is not None:
         print("\n".join(physical_lines(result.physical)))
     for note in result.notes:
@@ -108,9 +112,9 @@ def _undetermined(result: SettledResult) -> list[str]:
 
 
 def _may_be_absent(name: str, entry: Quantity) -> bool:
-    """Whether a term's distance from no effect is below its standard error."""
+    """Whether a term is within one standard error of having no effect."""
     kind = kind_of(name)
-    if kind == "stribeck_velocity":  # no value of the velocity means no effect
+    if kind == "stribeck_velocity":  # a term without effect has no Stribeck velocity
         return entry.std > abs(entry.value)
     return kind in TERMS and not abs(entry.value - term_of(name).absent) > entry.std
 
@@ -122,7 +126,8 @@ def _constant_std(result: SettledResult, name: str) -> float:
     joint = joint_of(name) or 1
     if not term_of(name).of_torque or joint > len(result.arm.joints):
         return 0.0
-    facts = result.arm.joints[joint - 1]
+    # Where the ratio of the torque constants was identified, every value scales with that of the first joint.
+    facts = result.arm.joints[0 if f"{RATIO}_{joint}" in result.extra else joint - 1]
     return facts.torque_per_goal_std / facts.torque_per_goal if facts.torque_per_goal else 0.0
 
 
@@ -162,8 +167,10 @@ def _choice(result: SettledResult) -> list[str]:
         return [f"Model chosen: {choice.chosen}. The motion gives no reason to add a term."]
     among = ", ".join(tried) if len(tried) <= _MOST_NAMED else f"{len(tried)} candidates"
     cost = choice.standard_errors_times
+    if choice.chosen == choice.plainest:
+        return [f"Model chosen from {among}: {choice.chosen}, which has the fewest parameters of them."]
     return [
-        f"Model chosen from {among}: {choice.chosen}. Compared with {tried[0]}, its prediction error is "
+        f"Model chosen from {among}: {choice.chosen}. Compared with {choice.plainest}, its prediction error is "
         f"{_times(1.0 / choice.error_divided_by)} and its standard errors are {_times(cost)}."
     ]
 

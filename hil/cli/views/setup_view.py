@@ -65,7 +65,7 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
 
 
 def _after_scan(servos: Sequence[Found], port: str) -> str:
-    """The next command: separate servos that share a baud rate's factory setting, else describe or check the arm."""
+    """The next command: bring all servos to one baud rate if necessary, else describe or check the arm."""
     if Path(port).is_file() or not ("/" in port or ":" in port or port.upper().startswith("COM")):
         return next_step("check", port)
     if len({servo.baud for servo in servos}) > 1:

@@ -71,7 +71,7 @@ class Difference:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """A sentence for each of the two whose model is not to be trusted as it is."""
+        """One sentence for each of the two models that should not be trusted as it is."""
         return tuple(
             f"{name}: trust this model: {trust}. Its values may be biased by more than their standard errors, so a "
             "change may come from the model instead of the arm; the report says why."

@@ -27,7 +27,7 @@ from hil.results.parts import Covariance
 Array = NDArray[np.float64]
 
 KINDS = ("viscous", "coulomb", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry")
-"""Terms of friction in motion, and the width of its step, which is known together with the rise."""
+"""Terms of friction in motion, and the width of its step, which the data determine only together with the rise."""
 REPEATABILITY = 0.005
 """Standard deviation of a friction parameter from run to run of an unchanged arm, relative to its value."""
 

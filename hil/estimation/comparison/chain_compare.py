@@ -35,7 +35,8 @@ Array = NDArray[np.float64]
 
 
 def compare_chain(run: RunFolder, mujoco: bool) -> tuple[Mapping[str, float] | None, dict[str, Peer], "Judge"]:
-    """Apply every method to the settled period of `run`; return the truth, if known, the results, and their judge.
+    """Apply every method to the settled period of `run`; return the truth, if known, the results, and the judge of
+    their predictions.
 
     Raises HilError, EstimationError.
     """
@@ -63,7 +64,7 @@ class Judge:
 
     def error(self, parameters: Mapping[str, float], period: SettledPeriod | None = None) -> float | None:
         """Error of the prediction relative to the motion, of the worst joint; None if nothing was held out or if the
-        simulated arm diverges. period: another one than the held-out one.
+        simulated arm diverges. period: the one to predict, by default the held-out one.
         """
         shown = self._held_out if period is None else period
         if shown is None:
@@ -101,7 +102,7 @@ def _methods(config: Config, period: SettledPeriod, judge: Judge) -> Iterator[Pe
     began = time.perf_counter()
     linear = fit_lines([period], model, prior)
     seconds = time.perf_counter() - began
-    words = "first stage alone: least squares on the lines of the period"
+    words = "first stage alone: least squares on the period's Fourier lines"
     yield Peer(
         "fourier_lines", _simulated(model, linear.value), _by_name(model.linear_names, linear.std), seconds, words, 1
     )

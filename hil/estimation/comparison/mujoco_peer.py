@@ -1,4 +1,4 @@
-"""mujoco.sysid on a settled period: the peer behind the extra `peers`.
+"""mujoco.sysid on a settled period, for comparison; installed with the extra `peers`.
 
 The arm is a MuJoCo model with one or two hinges. The unknowns are first moment and inertia of each link, armature of
 joint 2, and damping, friction loss and a constant torque of each joint, each scaled by its expected value. The method

@@ -33,7 +33,9 @@ UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "ca
 
 @dataclass(frozen=True)
 class ChainEstimated:
-    """result: without what the caller adds. predicted: of each recording (joints, samples) [rad], NaN where none is."""
+    """result: complete except for what the caller adds. predicted: positions per recording (joints, samples) [rad];
+    NaN: no prediction.
+    """
 
     result: ShootingResult
     predicted: tuple[Array, ...]
@@ -98,7 +100,7 @@ def estimate_chain_recordings(
 
 
 def _described(config: RecordingConfig, joints: int) -> ArmDescription:
-    assert config.arm.urdf is not None  # the caller's condition
+    assert config.arm.urdf is not None  # ensured by the caller
     names = config.joint_names
     if names is None:
         raise ConfigError(
@@ -114,7 +116,7 @@ def _described(config: RecordingConfig, joints: int) -> ArmDescription:
 
 
 def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> Array | None:
-    """Return the relative torque error on the last part, of parameters from the rest; None if a part is too short."""
+    """Return the relative torque error on the last part, with parameters from the rest; None if a part is too short."""
     try:
         first = [_part(each, 0.0, FITTED_SHARE) for each in recordings]
         last = [_part(each, FITTED_SHARE, 1.0) for each in recordings]
@@ -139,7 +141,7 @@ def _method(found: RecordedChain) -> str:
     if found.simulated:
         return (
             f"filtered inverse dynamics ({found.cutoff:g} Hz), then maximum likelihood of one-step-ahead position "
-            f"predictions with an observer; {found.model.description}; any motion, commanded torque"
+            f"predictions with an observer; {found.model.description}; arbitrary motion, commanded torque"
         )
     return (
         f"filtered inverse dynamics ({found.cutoff:g} Hz) by weighted least squares: the torque was measured, not "

@@ -37,7 +37,9 @@ NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 
 @dataclass(frozen=True)
 class Estimated:
-    """result: without what the caller adds. predicted: of each recording (joints, samples) [rad], NaN where none is."""
+    """result: complete except for what the caller adds. predicted: positions per recording (joints, samples) [rad];
+    NaN: no prediction.
+    """
 
     result: ShootingResult
     predicted: tuple[NDArray[np.float64], ...]

@@ -49,8 +49,8 @@ def _torques(recordings: Sequence[Recording]) -> list[str]:
 
 
 def _pendulum(estimate: ShootingEstimate, gravity: float) -> list[str]:
-    """Check inertia gravity / weight, a length in any unit of torque; it is implausible if time or angle have a wrong
-    unit.
+    """Check inertia * gravity / weight: a length whatever the unit of torque, and implausible if time or angle have a
+    wrong unit.
     """
     if gravity <= 0.0:
         return []

@@ -1,4 +1,4 @@
-"""From other tools' files to a folder with a result, like that of a run."""
+"""Estimates from other tools' files, whose results are in folders like those of runs."""
 
 import json
 import re
@@ -68,7 +68,7 @@ def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder:
 def _estimate_chain(
     paths: Sequence[Path], config_path: Path | None, config: RecordingConfig, folder: Path | None
 ) -> ShootingResult:
-    """The same for a spatial arm; its URDF is kept next to the result."""
+    """The result for a spatial arm; its URDF is kept next to the result."""
     read = _read(paths, config.columns)
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
     found = estimate_chain_recordings(read.recordings, config, shown)

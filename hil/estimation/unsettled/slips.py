@@ -7,10 +7,10 @@ from hil.estimator.baselines.signs import suspect_absolute, suspect_signs
 from hil.estimator.data.recording import Recording
 
 CLEAR = 0.25
-"""Largest torque residual with the slip undone, relative to that of the recording as given."""
+"""Largest torque residual with the mistake corrected, relative to that of the recording as given."""
 
 WELL = 0.3
-"""Largest torque residual with the slip undone, relative to the torque."""
+"""Largest torque residual with the mistake corrected, relative to the torque."""
 
 
 def refuse_slips(recordings: Sequence[Recording], source: str) -> None:

@@ -19,7 +19,7 @@ WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
 
 @dataclass(frozen=True)
 class Doubts:
-    """Sentences. faults: the estimate is unusable; doubts: it may be wrong; warnings: worth knowing."""
+    """Findings, as sentences. faults: the estimate is unusable; doubts: it may be wrong; warnings: worth knowing."""
 
     faults: tuple[str, ...]
     doubts: tuple[str, ...]
@@ -86,7 +86,7 @@ def _flat(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
         if each.between == "linear" and FLAT < at_most < 0.9:
             return [
                 f"{name}: its torque stays at {size.max():.3g} N m in {100 * at_most:.0f} % of the samples: if the "
-                "current was clipped, use the measured current, or drive the joint less hard."
+                "current was clipped, use the measured current, or use less torque."
             ]
     return []
 

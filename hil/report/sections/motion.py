@@ -50,11 +50,11 @@ def next_commands(data: RunData) -> Section:
     rows = (
         ("the arm for MuJoCo, or as URDF", f"hil export {run} --format mjcf --format urdf{length}"),
         (
-            "a hundred arms drawn from the error bars",
+            "a hundred arms drawn from the posterior",
             f"hil export {run} --format mjcf --samples 100 --out arms{length}",
         ),
         ("estimate again, after a change of [model] in its config.toml", f"hil estimate {run}"),
-        ("what changed since another run", f"hil diff OTHER_RUN {run}"),
+        ("what changed compared with another run", f"hil diff OTHER_RUN {run}"),
         ("other methods on the same recording", f"hil compare {run}"),
     )
     return Section("next", "What next", tables=(Table(("", ""), rows, 2),))

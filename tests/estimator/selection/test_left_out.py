@@ -120,6 +120,11 @@ def test_friction_that_fell_is_told(
     assert drift.change == pytest.approx([-0.08, -0.08], abs=0.004)
     said = judge(estimate, validate(ideal_period, estimate), Evidence(drift=drift)).sentences
     assert any("Friction of joint 1 fell by 8" in sentence or "fell by 7.9" in sentence for sentence in said)
+    assert any("grease warms up" in sentence and "experiment.warm_up" in sentence for sentence in said)
+    rose = replace(drift, change=-drift.change)
+    said = judge(estimate, validate(ideal_period, estimate), Evidence(drift=rose)).sentences
+    (sentence,) = [each for each in said if "Friction of joint 1 rose" in each]
+    assert "which warming up does not explain" in sentence and "experiment.warm_up" not in sentence
     same = friction_change(recorded(ideal_arm, wave(2, PEAKS)), estimate, 30.0)
     assert not same.is_seen
 

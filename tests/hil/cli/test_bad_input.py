@@ -120,7 +120,7 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate unknown.csv", 2, "a, b, c"),
     ("estimate not.parquet", 2, "not.parquet"),
     ("estimate not.mcap", 2, "not.mcap"),
-    ("estimate old.db3", 2, ".db3 files are not read"),
+    ("estimate old.db3", 2, ".db3 files are not supported"),
     ("estimate notes.txt", 2, "is empty"),
     ("estimate good.csv --config nowhere.toml", 2, "nowhere.toml"),
     ("estimate good.csv --config binary.toml", 2, "binary.toml"),

@@ -4,10 +4,16 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from hil.cli.views.result_table import print_result
+from hil.model_file import read_settled_result
+from hil.results.parts import Quantity
+from hil.runs.run_folder import RunFolder
 from tests.support.command_line import hil
 
 
@@ -79,3 +85,21 @@ def test_no_figure_is_cut_in_a_narrow_terminal(
     assert capsys.readouterr().out.split() == wide.split()
     assert hil("runs", identified.parent) == 0
     assert str(identified) in capsys.readouterr().out
+
+
+def test_with_an_identified_ratio_only_the_first_torque_constant_counts(
+    identified: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The errors of joint 2 are compared with what is still unknown: the constant to which all values refer."""
+    result, config = read_settled_result(identified), RunFolder.open(identified).load_config()
+
+    def in_std(ratio: bool, std_2: float) -> list[str]:
+        first, second = result.arm.joints
+        joints = (replace(first, torque_per_goal_std=0.1), replace(second, torque_per_goal_std=std_2))
+        extra = {**result.extra, "torque_scale_2": Quantity(1.0, 0.001, "1")} if ratio else result.extra
+        changed = replace(result, arm=replace(result.arm, joints=joints), extra=extra)
+        print_result(changed, config, identified, Console(width=200))
+        return [line for line in capsys.readouterr().out.splitlines() if line.startswith("inertia_2 ")]
+
+    assert in_std(True, 0.2) == in_std(True, 0.5)
+    assert in_std(False, 0.2) != in_std(False, 0.5)

@@ -6,7 +6,9 @@ import pytest
 from hil.config.schema import load_config
 from hil.estimation.changes.diff import Difference
 from hil.estimation.pilot_limit import torque_limit
+from hil.estimation.settled_period import scatter
 from hil.estimator.selection.verdict import improvement_of
+from hil.results.parts import ModelChoice, TriedModel
 from hil.runs.recording import sample_type
 from hil.runs.timing import lost_samples
 from tests.support.paths import CONFIGS
@@ -47,3 +49,24 @@ def test_a_difference_repeats_doubtful_verdicts() -> None:
     (doubt,) = Difference("a", "b", (), (), (), trust=("yes", "with care")).doubts
     assert doubt.startswith("b: trust this model: with care")
     assert Difference("a", "b", (), (), ()).doubts == ()
+
+
+def test_a_choice_is_compared_with_the_plainest_model_that_could_be_judged() -> None:
+    tried = tuple(
+        TriedModel(model=name, parameters=count, held_out_rms=None, score=score, seconds=1.0)
+        for name, count, score in (("full", 14, 0.1), ("plain", 10, 0.3), ("failed", 8, None))
+    )
+    choice = ModelChoice(chosen="full", error_divided_by=3.0, tried=tried)
+    assert choice.plainest == "plain"
+    assert ModelChoice(chosen="full", error_divided_by=1.0, tried=tried[2:]).plainest == "full"
+
+
+def test_scatter_of_samples_that_most_periods_lack(recwarn: pytest.WarningsRecorder) -> None:
+    """Samples missing at the same place in every period, or in all but one, tell nothing and warn of nothing."""
+    position = np.random.default_rng(1).normal(0.0, 0.01, (5, 2, 4000))
+    whole = scatter(position)
+    position[:, 0, :3] = np.nan
+    position[1:, 1, 5] = np.nan
+    assert whole is not None and whole == pytest.approx(0.01 / np.sqrt(5), rel=0.05)
+    assert scatter(position) == pytest.approx(whole, rel=1e-2)
+    assert not recwarn.list

@@ -204,7 +204,9 @@ def test_where_grease_warms_up_a_warm_up_is_proposed(arm: Arm, tmp_path: Path) -
     warming = "cold_coulomb = 0.5\ncold_viscous = 0.5\nwarm_up_time = 6.0\n"
     drives = [(f"viscous = {each}", f"{warming}viscous = {each}") for each in ("0.045", "0.040")]
     never = ("seed = 1\n", "seed = 1\nsettle_within = 1e-4\nmax_settling_periods = 5\n")
-    with pytest.raises(NotSettled, match=r"falls slowly from period to period.*set experiment.warm_up = \d+") as caught:
+    with pytest.raises(
+        NotSettled, match=r"decreases slowly from period to period.*set experiment.warm_up = \d+"
+    ) as caught:
         run(arm(never, *drives), tmp_path / "run")
     seconds = float(str(caught.value).rsplit("= ", 1)[1].rstrip("."))
     assert 20.0 <= seconds <= 90.0  # 1e-4 of the motion is left after five or six times 6 s

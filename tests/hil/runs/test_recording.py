@@ -3,6 +3,7 @@
 import errno
 import mmap
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -80,6 +81,26 @@ def test_a_full_disk_at_the_start_is_said_and_one_at_the_end_needs_nothing(
     monkeypatch.setattr(np, "save", full)
     recorder.close()
     assert len(np.load(tmp_path / "fine.npy")) == 0
+
+
+@pytest.mark.parametrize("reason", ["", "limit exceeded"])
+def test_samples_outlive_their_folder(tmp_path: Path, reason: str) -> None:
+    """A run folder that is removed while it is written to: the samples are saved again, and the message says so."""
+    path = tmp_path / "run" / "samples.npy"
+    path.parent.mkdir()
+    with pytest.raises(ValueError if reason else RunFolderError) as caught, Recorder(path, 2, 100) as recorder:
+        recorder.keep(7.0, Phase.REST, 0, -1, state(1))
+        shutil.rmtree(path.parent)
+        recorder.keep(8.0, Phase.REST, 0, -1, state(2))
+        if reason:
+            raise ValueError(reason)
+    said = "\n".join((str(caught.value), *getattr(caught.value, "__notes__", ())))
+    assert (
+        said.startswith(reason)
+        and "was removed or renamed" in said
+        and f"2 samples have been saved to a new file, {path}" in said
+    )
+    assert load_samples(path, 2)["deadline"].tolist() == [7.0, 8.0]
 
 
 def test_of_a_killed_run_the_rows_that_were_taken_are_there(tmp_path: Path) -> None:
