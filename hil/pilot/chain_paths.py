@@ -88,7 +88,13 @@ class Paths:
         limits = PathLimits(low + room, high - room, speed, allowed)
         try:
             designer = PathDesigner(
-                known.base, known.prior, experiment.rate, experiment.period, experiment.band[1], limits
+                known.base,
+                known.prior,
+                thought.coulomb,
+                experiment.rate,
+                experiment.period,
+                experiment.band[1],
+                limits,
             )
             best = designer.design(experiment.seed)
             other = designer.widest(best.centre, experiment.seed + 1)

@@ -22,19 +22,31 @@ POSITIVE = {
     "torque_scale": 1e-3,
     "added_mass_scale": 1e-2,
     "lag": 1e-5,
+    "lag_ratio": 0.1,
+    "back_emf": 0.5,
 }
 """Kinds of positive parameters and the minimum initial value of each [its unit]."""
-SMALL = {"offset": 0.01, "zero": 0.02, "delay": 1e-3, "base_tilt_x": 0.02, "base_tilt_y": 0.02}
+SMALL = {
+    "offset": 0.01,
+    "zero": 0.02,
+    "delay": 1e-3,
+    "base_tilt_x": 0.02,
+    "base_tilt_y": 0.02,
+}
 """Scales of the other parameters that are not base parameters [their unit]."""
 SHAPES = {
     "coulomb_width": (0.01, 2.5),
     "stribeck_rise": (0.3, 1.0),
     "stribeck_velocity": (0.15, 0.7),
     "load": (0.03, 1.5),
+    "lag": (1e-3, 1.0),
+    "lag_ratio": (1.0, 0.6),
+    "back_emf": (0.92, 0.08),
 }
-"""Priors on the shape of friction near standstill: typical value [its unit] and standard deviation of its logarithm.
+"""Priors on the shape of friction and on drives: typical value [its unit] and standard deviation of its logarithm.
 
-Without them, these parameters would be undetermined for a joint that never moves slowly.
+Without them, these parameters would be undetermined for a joint that never moves slowly, or has little inertia. Early
+in a fit they do not move at all: a lag that has once been taken for zero, while other errors dominate, hardly grows.
 """
 ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
 """Priors on small angles that gravity may not reveal: standard deviations around zero [rad]."""
@@ -112,7 +124,7 @@ class ChainCoordinates:
 
     @cached_property
     def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices of the parameters with their own prior (friction shapes, small angles), their prior means and
+        """Indices of the parameters with their own prior (friction shapes, drives, small angles), their prior means and
         standard deviations.
         """
         found = [

@@ -28,6 +28,8 @@ class ChainModel:
     zeros: estimate zero errors of the encoders of all joints but the first, as far as gravity reveals them.
     torque_scale: estimate torque scales of all joints but the first, whose torque constant is trusted.
     base_tilt: estimate the tilt of the base; `base` must be made for it (`BaseParameters.of(..., tilts=True)`).
+    lags: estimate each joint's lag, if `drive` has one, as a ratio to that of the first: servo models differ.
+    by_voltage: joints, from 1, that are driven by voltage, whose back-EMF lags too.
     added_mass: some periods were recorded with a known mass added, which reveals the first joint's torque constant too.
     Raises ModelError.
     """
@@ -39,6 +41,8 @@ class ChainModel:
     torque_scale: bool = False
     base_tilt: bool = False
     added_mass: bool = False
+    lags: bool = False
+    by_voltage: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.friction not in FRICTION:
@@ -70,7 +74,11 @@ class ChainModel:
             terms += [(name, "rad") for name in TILT]
         if self.added_mass:
             terms.append((ADDED_MASS, "1"))
-        return terms + [(name, "s") for name in DRIVE[self.drive]]
+        terms += [(f"back_emf_{joint}", "1") for joint in self.by_voltage]
+        terms += [(name, "s") for name in DRIVE[self.drive]]
+        if self.lags and "lag" in DRIVE[self.drive]:
+            terms += [(f"lag_ratio_{joint}", "1") for joint in self._numbers[1:]]
+        return terms
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -87,7 +95,7 @@ class ChainModel:
     def description(self) -> str:
         """Text naming the friction, options and drive."""
         words = {"zeros": self.zeros, "torque scales": self.torque_scale, "base tilt": self.base_tilt}
-        words |= {"added mass": self.added_mass}
+        words |= {"added mass": self.added_mass, "lags": self.lags, "back-EMF": bool(self.by_voltage)}
         return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))
 
     @property

@@ -70,7 +70,12 @@ class Simulation:
         self._columns = (
             where[places(n, base.columns)],
             np.array([[at.get(f"{term}_{joint + 1}", width) for joint in range(n)] for term in JOINT_TERMS]),
-            np.array([at.get("delay", width), at.get("lag", width)]),
+            np.array(
+                [
+                    [at.get("delay", width)] * n,
+                    [at.get(f"lag_ratio_{j + 1}", at.get("lag", width)) for j in range(n)],
+                ]
+            ),
             np.array([at[name] for name in TILT if name in at], dtype=np.int64),
             tilt_slopes(gravity, *tilt) if TILT[0] in at else np.zeros((2, 3)),
         )
@@ -94,7 +99,7 @@ class Simulation:
         """Simulate the next `piece` of the samples.
 
         Returns the angles (samples, joints) [rad], None if the motion diverges, and their derivatives (samples, joints,
-        causes).
+        causes). In place of that by a `lag_ratio` is the one by this joint's own lag, which that by `lag` excludes.
         """
         torque, measured = run_.torque[piece], run_.measured[piece]
         position = np.empty(measured.shape)

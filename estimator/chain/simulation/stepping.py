@@ -67,8 +67,8 @@ def _direct(
 ) -> None:
     """Compute the direct derivatives of joint j's step equation by the drive's parameters, and by v into `by`.
 
-    left: see `_left`. slopes: derivatives of the torque by delay and by lag. times: their columns. ghk: gamma h times
-    the stage's acceleration.
+    left: see `_left`. slopes: derivatives of the torque by delay and by lag. times: columns of the delay and the
+    lag of each joint. ghk: gamma h times the stage's acceleration.
     """
     scale, width, fading = p[SCALE, j], p[WIDTH, j], p[FADING, j]
     motor = scale * t
@@ -93,8 +93,8 @@ def _direct(
     row[at[LOAD, j]] = abs(motor) * shape
     by_motor = load * sign * shape - 1.0
     row[at[SCALE, j]] = by_motor * t
-    row[times[0]] = by_motor * scale * slopes[0, j]
-    row[times[1]] = by_motor * scale * slopes[1, j]
+    row[times[0, j]] = by_motor * scale * slopes[0, j]
+    row[times[1, j]] = by_motor * scale * slopes[1, j]
 
 
 # These take whole arrays and indices: a view of a row costs as much as its arithmetic.
