@@ -182,8 +182,8 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     if not found.reached:
         trust = "with care" if trust == "yes" else trust
         sentences.append(
-            "The fit stopped before its minimum, where a joint sticks and breaks away; the standard errors include the "
-            "distance that remains. Record faster motion, so that fewer joints stick."
+            "The fit stopped short of its minimum, where a joint sticks and breaks away; the standard errors include "
+            "the distance that remains. Record faster motion, so that fewer joints stick."
         )
     return Verdict(trust, weakest, tuple(sentences))
 
