@@ -26,6 +26,7 @@ from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
+from hil.setup.changed_settings import EXPLAINED, Settings, changed_settings, settings_now
 from hil.setup.realtime import on_time
 from hil.setup.servo_session import REBOOT_S, has_moved, servo_session
 
@@ -131,6 +132,7 @@ def _play(
 ) -> None:
     """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event."""
     stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
+    settings = settings_now(bus)
     try:
         # In this order, because on_time takes longer than the watchdog's timeout.
         with on_time(bus.port.clock) as granted, bus.torque(config.safety.watchdog):
@@ -140,6 +142,7 @@ def _play(
             stream.run()
     except BaseException as error:
         _explain_alert(bus, stream.state, error)
+        _explain_by_settings(bus, settings, error)
         if isinstance(error, DriverError | HilError):
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):
@@ -190,6 +193,15 @@ def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> 
         stop.args = (str(fault),)
     except DriverError:
         return
+
+
+def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException) -> None:
+    """Name settings that another program changed; read only once torque is off, because reading takes time."""
+    stop = error if isinstance(error, SafetyStop) else error.__context__
+    if isinstance(stop, SafetyStop) and stop.cause in EXPLAINED:
+        changed = changed_settings(before, settings_now(bus))
+        if changed:
+            stop.args = (f"{changed} What was seen: {stop}",)
 
 
 @contextmanager

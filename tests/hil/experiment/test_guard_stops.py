@@ -125,6 +125,26 @@ def test_what_goes_wrong_in_a_period_stops_the_arm_for_that_cause(
     assert (Phase.BRAKING in samples["phase"]) == stop.cause.allows_braking
 
 
+def rewritten(ports: list[Any], register: str, value: int) -> None:
+    """Another program switches a servo's torque off, writes to its EEPROM, and switches torque on again."""
+    servo = ports[0].bus.servos[2]
+    servo.write(64, b"\x00")
+    entry = servo.model.registers[register]
+    servo.write(entry.address, value.to_bytes(entry.size, "little", signed=True))
+    servo.write(64, b"\x01")
+
+
+@pytest.mark.parametrize(("register", "value"), [("Drive Mode", 1), ("Homing Offset", 300)])
+def test_settings_that_another_program_changed_are_the_cause_that_is_named(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
+) -> None:
+    happens = once(lambda: rewritten(ports, register, value))
+    stop, _ = run_until_stopped(arm(), tmp_path / "run", happens, plan)
+    assert str(stop).startswith("Another program has changed the settings of a servo during the run (joint 'elbow'")
+    assert f"{register} is {value} and was 0" in str(stop) and "What was seen: " in str(stop)
+    assert_stopped(ports[0])
+
+
 @pytest.mark.parametrize(
     ("happens", "said"),
     [
