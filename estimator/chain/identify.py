@@ -9,6 +9,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.fit.coordinates import ANGLES, kind_of
+from hil.estimator.chain.fit.neglected import neglected
 from hil.estimator.chain.fit.stage1 import ChainLinear, fit_lines
 from hil.estimator.chain.fit.stage2 import DEFAULTS, ChainFit, ChainOptions, fit_periods
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -76,11 +77,14 @@ def identify_chain(
     # The weight of the prior in the result; model errors or an unfinished fit widen the standard errors, not this.
     std = np.sqrt(np.diag(fit.white_covariance))
     wide = std[:count] > BELIEVED * prior.std
+    covariance = fit.total_covariance.copy()
+    named = dict(zip(model.names, fit.value.tolist(), strict=True))
+    covariance[:count, :count] += neglected(model, named, used[0].filled())
     return ChainEstimate(
         names=model.names,
         units=model.units,
         value=fit.value,
-        covariance=fit.total_covariance,
+        covariance=covariance,
         residual=np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
         position_step=used[0].position_step,
         model=model,

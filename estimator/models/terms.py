@@ -65,7 +65,7 @@ OPTIONS: dict[Option, str] = {
     "saturation": "torque saturation: torque falls short of large commands",
     "cable": "a cable or spring that pulls the joint towards one angle",
     "encoder": "encoder errors that repeat once and twice per turn",
-    "lags": "different lags of the two joints' current loops",
+    "lags": "different lags of the joints' current loops",
 }
 """Optional parts of a model and their descriptions; also keys of `[model]`."""
 

@@ -52,7 +52,7 @@ def _torque(
     edges = np.arange(steps + 1) / (steps * rate) + command_to_sample - delay
     shifts = np.floor(edges * rate)
     phases = edges - shifts / rate
-    lags = np.broadcast_to(np.asarray(lag, dtype=np.float64), (2,))[:joints] if np.ndim(lag) else np.full(joints, lag)
+    lags = np.asarray(lag, dtype=np.float64)[:joints] if np.ndim(lag) else np.full(joints, lag)
     fading = np.where(lags[:, None] > 0.0, np.exp(-phases / np.where(lags > 0.0, lags, 1.0)[:, None]), 0.0)
     torque, late, change = (np.empty((joints, samples, steps)) for _ in range(3))
     lagging = np.empty((2, samples))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hil.config.chain import described_arm
 from hil.config.schema import Config
 from hil.errors import RecordingCutShort
+from hil.estimation.model_from_config import voltage_driven
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
@@ -92,11 +93,16 @@ def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
     """The model requested by the configuration.
 
     Links moved by several joints couple these joints' torques, so inexact torque constants contradict each other: their
-    ratios are parameters wherever the configuration gives an uncertainty.
+    ratios are parameters wherever the configuration gives an uncertainty. Servos of different models, or some driven by
+    voltage, differ in their lags, so each joint always has its own.
     """
     wanted = config.model
     scales = known.base.chain.joints > 1 and (wanted.torque_scale or known.prior.scale_precision is not None)
-    return ChainModel(known.base, wanted.fixed_friction, wanted.drive, wanted.zeros, scales, wanted.base_tilt)
+    return ChainModel(
+        *(known.base, wanted.fixed_friction, wanted.drive, wanted.zeros, scales, wanted.base_tilt),
+        lags=known.base.chain.joints > 1,
+        by_voltage=voltage_driven(config),
+    )
 
 
 def true_chain_parameters(config: Config, known: KnownChain) -> dict[str, float] | None:

@@ -22,9 +22,17 @@ POSITIVE = {
     "torque_scale": 1e-3,
     "added_mass_scale": 1e-2,
     "lag": 1e-5,
+    "back_emf": 1e-2,
 }
 """Kinds of positive parameters and the minimum initial value of each [its unit]."""
-SMALL = {"offset": 0.01, "zero": 0.02, "delay": 1e-3, "base_tilt_x": 0.02, "base_tilt_y": 0.02}
+SMALL = {
+    "offset": 0.01,
+    "zero": 0.02,
+    "delay": 1e-3,
+    "lag_difference": 1e-3,
+    "base_tilt_x": 0.02,
+    "base_tilt_y": 0.02,
+}
 """Scales of the other parameters that are not base parameters [their unit]."""
 SHAPES = {
     "coulomb_width": (0.01, 2.5),
@@ -36,10 +44,18 @@ SHAPES = {
 
 Without them, these parameters would be undetermined for a joint that never moves slowly.
 """
+DRIVES = {"lag": (1e-3, 1.0), "back_emf": (0.92, 0.08)}
+"""Priors on the drive, as in SHAPES.
+
+The motion determines most lags to a few microseconds. What it hardly determines is the lag of a joint that moves
+little, and how much of its viscous friction is back-EMF.
+"""
+LATER = 1e-3  # s: standard deviation of the difference between two joints' lags (0.6 of 1 ms each)
 ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
 """Priors on small angles that gravity may not reveal: standard deviations around zero [rad]."""
 RESHAPING = 1.0  # maximum change of their logarithms in one step
 NARROWING, WIDENING = 1.6, 1.1  # maximum decrease and increase of a width's logarithm in one step
+DRIVING = 0.5  # maximum change of a lag difference (in ms) and of the logarithm of a share of back-EMF in one step
 LONGEST = 2.0  # maximum change of any coordinate in one step
 
 
@@ -105,6 +121,7 @@ class ChainCoordinates:
         """
         count = len(self.names)
         bound = np.where([kind in SHAPES for kind in self._kinds], reach * RESHAPING, LONGEST)
+        bound[[kind in ("lag_difference", "back_emf") for kind in self._kinds]] = DRIVING
         least[:count], most[:count] = -bound, bound
         widths = self._widths
         least[widths] = np.maximum(self.room_below(x)[widths], -reach * NARROWING)
@@ -112,13 +129,16 @@ class ChainCoordinates:
 
     @cached_property
     def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices of the parameters with their own prior (friction shapes, small angles), their prior means and
-        standard deviations.
+        """Indices of the parameters with their own prior (friction shapes, drive, small angles), and the means and
+        standard deviations of their coordinates.
         """
+        logarithms, around_zero = SHAPES | DRIVES, ANGLES | {"lag_difference": LATER}
         found = [
-            (i, np.log(SHAPES[kind][0]), SHAPES[kind][1]) if kind in SHAPES else (i, 0.0, ANGLES[kind] / SMALL[kind])
+            (i, np.log(logarithms[kind][0]), logarithms[kind][1])
+            if kind in logarithms
+            else (i, 0.0, around_zero[kind] / SMALL[kind])
             for i, kind in enumerate(self._kinds)
-            if kind in SHAPES or kind in ANGLES
+            if kind in logarithms or kind in around_zero
         ]
         index, typical, spread = np.array(found).reshape(-1, 3).T
         return index.astype(np.int64), typical, spread

@@ -15,13 +15,13 @@ from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.coordinates import LONGEST, ChainCoordinates
 from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
 from hil.estimator.chain.model.prior import Prior
+from hil.estimator.chain.simulation.drive_times import DriveTimes
 from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation, pieces
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.covariance import Scatter
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise
 from hil.estimator.fit.normal_equations import normal_equations
 from hil.estimator.options import MinimiserOptions
-from hil.estimator.simulation.drive import torque_and_slopes
 
 MINIMISER = MinimiserOptions()
 MOST_KEPT = 1 << 26  # bytes of derivatives
@@ -88,10 +88,8 @@ class ChainProblem:
 
     def run_of(self, period: SettledPeriod, parameters: dict[str, float]) -> ChainRun:
         """Return the simulation's input for a period, with the delay and lag of these parameters."""
-        delay, lag = parameters.get("delay", 0.0), parameters.get("lag", 0.0)
-        torque, slopes = torque_and_slopes(
-            period.torque, period.rate, period.command_to_sample, self.steps, delay=delay, lag=lag
-        )
+        times = DriveTimes.of(parameters, period.joints)
+        torque, slopes = times.torque(period.torque, period.rate, period.command_to_sample, self.steps)
         return ChainRun(
             self._thinned(np.moveaxis(torque, 0, 2)),
             self._thinned(np.transpose(slopes, (2, 3, 0, 1))),

@@ -1,11 +1,10 @@
 """Open-loop prediction of a motion from given parameters, without measurements but with the arm's own feedback."""
 
-import math
-
 import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.simulation.drive_times import DriveTimes
 from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import PeriodicityError
@@ -28,8 +27,9 @@ def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeri
     steps = steps_per_sample(period.rate)
     step = 1.0 / (period.rate * steps)
     # Commands take effect `command_to_sample` before the sample of their index, plus `delay`; lumped into a lag.
-    lag = max(parameters.get("lag", 0.0) + parameters.get("delay", 0.0) - period.command_to_sample, 1e-5)
-    fallen = 1.0 - math.exp(-step / lag)
+    times = DriveTimes.of(parameters, joints)
+    lag = np.maximum(times.lag + times.delay - period.command_to_sample, 1e-5)
+    fallen = 1.0 - np.exp(-step / lag)
     share = fallen * lag / step
     start = np.stack((period.filled()[:, 0], np.zeros(joints)))
     simulation = Simulation(model.base, parameters, start, np.zeros((2, joints)))

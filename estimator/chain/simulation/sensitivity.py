@@ -10,7 +10,8 @@ from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import places, split
 from hil.estimator.chain.model.kernels import room
 from hil.estimator.chain.model.tilt import TILT, tilt_slopes, tilted
-from hil.estimator.chain.simulation.stepping import JOINT_TERMS, run
+from hil.estimator.chain.simulation.drive_times import DriveTimes
+from hil.estimator.chain.simulation.stepping import JOINT_TERMS, LATE, SHARE, VISCOUS, run
 
 ABSENT = {"coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}
 """Values that disable a term that the model lacks; zero for all other terms."""
@@ -24,7 +25,7 @@ class ChainRun:
     torque: Array
     """Mean motor torque over each step after each sample, unscaled (samples, steps, joints) [N m]."""
     slopes: Array
-    """Derivatives of `torque` by delay and by lag (samples, steps, 2, joints) [N m/s]."""
+    """Derivatives of `torque` by delay, and by lag or lag difference (samples, steps, 2, joints) [N m/s]."""
     measured: Array
     """Measured angles (samples, joints) [rad]; NaN where a sample is missing."""
     step: float
@@ -59,10 +60,13 @@ class Simulation:
         at = {name: index for index, name in enumerate(names)}
         rotation, translation, axis, gravity = base.chain.arrays
         tilt = [parameters.get(name, 0.0) for name in TILT]
+        p = np.array([[parameters.get(f"{t}_{j + 1}", ABSENT.get(t, 0.0)) for j in range(n)] for t in JOINT_TERMS])
+        p[LATE] = DriveTimes.of(parameters, n).total
+        link, armature = split(base.chain, base.as_all(np.array([parameters[name] for name in base.names])))
         self._arm = (
             (rotation, translation, axis, tilted(gravity, *tilt)),
-            split(base.chain, base.as_all(np.array([parameters[name] for name in base.names]))),
-            np.array([[parameters.get(f"{t}_{j + 1}", ABSENT.get(t, 0.0)) for j in range(n)] for t in JOINT_TERMS]),
+            (link, armature - p[SHARE] * p[VISCOUS] * p[LATE]),
+            p,
             np.array(start, dtype=np.float64, order="C"),
         )
         # Unwanted derivatives are written to a spare column after all others.
