@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks import chain as bench
-from hil.estimator.chain.identify import ChainEstimate, identify_chain
+from hil.estimator.chain.identify import SYSTEMATIC, ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.simulation.drive_times import DriveTimes
 from hil.estimator.data.settled_period import SettledPeriod
@@ -110,3 +110,18 @@ def test_slopes_are_those_of_the_torque(parameters: dict[str, float]) -> None:
     up, down = ({**parameters, "lag_difference_2": parameters["lag_difference_2"] + s} for s in (step, -step))
     differences = (torque(up)[0][1] - torque(down)[0][1]) / (2 * step)
     np.testing.assert_allclose(torque(parameters)[1][1, 1], differences, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("missing", [{"ripple": 0.002}, {"load": 0.003}])
+def test_a_small_missing_term_shows_although_the_residual_looks_like_rounding(
+    setup: bench.Setup, period: SettledPeriod, missing: dict[str, float]
+) -> None:
+    drives = tuple(drive.model_copy(update=missing) for drive in setup.arm.drives)
+    other = replace(setup, arm=setup.arm.model_copy(update={"drives": drives}))
+    disturbed = bench.record(BENCH, other, bench.path_of(BENCH, setup, 101))
+    model = ChainModel(setup.base, lags=True)
+    assert identify_chain(period, model, setup.prior).explained
+    found = identify_chain(disturbed, model, setup.prior)
+    assert found.residual_steps.max() < 1.2 / 12**0.5
+    assert found.systematic > SYSTEMATIC
+    assert not found.explained
