@@ -246,7 +246,7 @@ def measure(joints: int, seed: int) -> dict[str, Any]:
     bench, setup = BENCHES[joints], set_up(BENCHES[joints], seed)
     played, other = path_of(bench, setup, 100 + seed), path_of(bench, setup, 200 + seed)
     period, held_out = record(bench, setup, played), record(bench, setup, other)
-    model = ChainModel(setup.base, lags=True)
+    model = ChainModel(setup.base)
     started, worked = time.perf_counter(), time.process_time()
     estimate = identify_chain(period, model, setup.prior)
     seconds, processor = time.perf_counter() - started, time.process_time() - worked

@@ -37,7 +37,7 @@ MOST_PATIENCE_S = 0.02
 
 _NEVER = 1 << 62
 _DOUBTS = 3
-_PART_OF_A_REPLY = 8  # bytes; the header of a fast answer whose first servos were heard
+_PART_OF_A_REPLY = 8  # bytes; at least the header of a fast reply, whose first servos have then answered
 
 _crc = crc16.umts
 _pack_crc = struct.Struct("<H").pack
@@ -153,8 +153,8 @@ class Exchange:
             self._until_status = min(self._until_status, 1)
 
     def add_read_back(self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[int]) -> None:
-        """Prepare `overruled`. goal, mode: spans that end with the goal, or Operating Mode. modes: the modes that were
-        set.
+        """Prepare `overruled`. goal, mode: spans that end with the goal and with Operating Mode. modes: the operating
+        modes that were set.
         """
         self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
         self._expected = self._expected.union(*(read.expected for read in self._read_back.reads))
@@ -181,7 +181,7 @@ class Exchange:
         asked = read.reply_size + (len(read.request) if self._echoes else 0)
         takes = max(self._lasted - port.wire_time(self._bytes(self._reads[0]) - self._bytes(read)), back.longest)
         if now + takes > due or self._late_possible:
-            back.took(0.0)  # one long read-back, while this computer was busy, must not put an end to them
+            back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
             self.read_back_at = now + TRY_AGAIN_S
             return None
         port.clock.wait_until(due - takes - HOST_S)
@@ -262,7 +262,7 @@ class Exchange:
         return read.unpack(received) or self._search(read, received, deadline)
 
     def _other_span(self, between: bool) -> int:
-        """Choose the span for a cycle that does not read the usual one: a different one after a loss, a slow one, the
+        """Choose the span for a cycle that does not read the usual one: another after a loss, a slow one, or the
         status.
         """
         if self._late_possible:
@@ -313,7 +313,7 @@ class Exchange:
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
 
     def _overhear(self, received: bytes) -> None:
-        """Examine bytes that were pending before the request: another master's, or a late or second reply."""
+        """Examine bytes that were pending before the request: from another master, or a late or repeated reply."""
         packets = _packets_within(received)
         self._look_for_strangers(packets)
         if any(packet.is_status for packet in packets):

@@ -54,7 +54,8 @@ class Port:
     """
 
     overheard: bytes = b""
-    """Bytes pending before a request, which `ask` keeps apart from its reply: late replies, or those to other masters.
+    """Bytes pending before a request, which `ask` keeps apart from its reply: late replies, or replies to another
+    master.
     """
 
     def __init__(self, url: str, baud: int, opened: Any) -> None:

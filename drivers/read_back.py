@@ -19,10 +19,13 @@ _GOALS_PER_MODE = 2
 Number and times are random, because a regular pattern might never see a program that overwrites every other goal.
 """
 
+_GOALS_PER_MODE_IN_DOUBT = 4
+"""The same after a sighting, while every cycle is followed by a read-back."""
+
 REMEMBERED = 4
 """Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
 
-_GOAL_SIGHTINGS, _MODE_SIGHTINGS, _SIGHTED_S = 3, 2, 0.5
+_GOAL_SIGHTINGS, _MODE_SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Read-backs of a foreign goal, or mode, that prove another writer, and the time within which they must occur [s].
 
 Three for goals, so that the status detects lost writes first.
@@ -32,7 +35,7 @@ TRY_AGAIN_S = 0.005
 """Delay before a read-back that did not fit in before a cycle is tried again [s]."""
 
 _FADES = 0.98
-_IN_DOUBT_S = 0.1
+_IN_DOUBT_S = 0.3
 """Time after a foreign value was read, during which every cycle is followed by a read-back [s]."""
 
 
@@ -73,7 +76,7 @@ class ReadBack:
 
     @property
     def read(self) -> GroupRead:
-        """The next group read."""
+        """The group read to send next: that of the goals or that of the operating modes."""
         return self.reads[self._is_of_modes]
 
     def took(self, seconds: float) -> None:
@@ -95,15 +98,17 @@ class ReadBack:
                 return Overruled(place, self._goals[place], value, sent[-1][place])
             self.doubts_until = now + _IN_DOUBT_S
             is_nearly_sure |= len(times) == most - 1
+        is_in_doubt = now < self.doubts_until
         # A change of mode resets the goal, so a foreign goal may be its first sign.
         if not is_nearly_sure:
-            self._until_mode = 1 + int(_GOALS_PER_MODE * self._draw.random()) if of_modes else self._until_mode - 1
+            most = _GOALS_PER_MODE_IN_DOUBT if is_in_doubt else 1 + int(_GOALS_PER_MODE * self._draw.random())
+            self._until_mode = most if of_modes else self._until_mode - 1
             self._is_of_modes = self._until_mode == 0
-        self.due = now if now < self.doubts_until else now + _READ_BACK_S * (0.5 + self._draw.random())
+        self.due = now if is_in_doubt else now + _READ_BACK_S * (0.5 + self._draw.random())
         return None
 
     def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
-        """Place and value of each servo that holds what was not written."""
+        """Place and value of each servo that holds a value that this program did not write."""
         if self._is_of_modes:
             return [
                 (place, answer[-1])

@@ -91,7 +91,7 @@ class Servo:
     def write(self, register: str, value: int, attempts: int | None = None) -> None:
         """Write a register and read it back; raises as `read`, and ServoRefused if another value is read back.
 
-        attempts: number for the write and for the read; by default that of all set-up work.
+        attempts: how often the write, and then the read, may be tried; by default as often as in all set-up work.
         """
         attempts = _ATTEMPTS if attempts is None else attempts
         # The status packet may be lost or switched off (Status Return Level 1); what counts is the register's value.

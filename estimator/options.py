@@ -111,16 +111,18 @@ class LikelihoodOptions:
     """Tolerance of the fit of the initial state alone."""
 
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=1e-4)
-    """Stiction cannot be distinguished from a width of 1e-4 rad/s, and from 3e-4 only by half a standard error."""
+    """The lower bound of 1e-4 rad/s on widths cannot be distinguished from stiction; 3e-4 could be, by half a standard
+    error.
+    """
     minimiser: MinimiserOptions = MinimiserOptions()
     integration: IntegrationOptions = IntegrationOptions()
     coarse_integration: IntegrationOptions = IntegrationOptions(max_step=2.6e-3, max_substeps=16)
-    """Accurate to a few hundredths of an encoder step, in a third of the time."""
+    """Coarse steps: accurate to a few hundredths of an encoder step, in a third of the time of fine ones."""
     covariance: CovarianceOptions = CovarianceOptions()
     least_inflation: float = 2.0
     """Factor by which the data's variance must exceed that of independent errors for priors to be given more weight."""
     least_tempering: float = 1e-4
-    """Minimum relative increase of the sum of squares for which the fit is repeated with such priors."""
+    """Minimum relative increase of the sum of squares for which the fit is repeated with priors of greater weight."""
 
     initial_widths: tuple[float, ...] = (0.005, 0.05)
     """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried.
@@ -142,7 +144,7 @@ class LikelihoodOptions:
     tracking_loss: float = 1.5
     """Ratio of free to tracking cost above which the run's beginning is fitted before the whole."""
     horizons: tuple[float, ...] = (0.125, 0.25, 0.5)
-    """Lengths of that beginning as fractions of the run, in the order in which they are fitted."""
+    """Lengths of the beginnings that are fitted before the whole run, as fractions of it, in this order."""
     min_horizon_samples: int = 10
     """Minimum number of samples per unknown, over all joints; a shorter beginning is skipped."""
 
@@ -186,7 +188,9 @@ class ShootingOptions:
     start_segments: int = 80
     """Maximum number of segments, evenly spread, in the fits that only need to come close to a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-3)
-    """A width below 3e-3 rad/s is slow to simulate and has no visible effect in a second of motion."""
+    """The lower bound on widths is 3e-3 rad/s: narrower ones are slow to simulate, without a visible effect in a
+    second.
+    """
     minimiser: SegmentedMinimiserOptions = SegmentedMinimiserOptions()
     initial_width: float = 0.05
     """Initial width of the smoothed Coulomb step [rad/s]."""
@@ -245,11 +249,11 @@ class SelectionOptions:
     steady_residual: float = 5.0
     """RMS residual in units of the noise below which a change of friction is sought: worse models may mimic one."""
     presliding_residual: float = 1.2
-    """RMS residual in units of the noise above which presliding is tried, which is slow to fit."""
+    """RMS residual in units of the noise above which a fit with presliding is tried; such fits are slow."""
     initial_widths: tuple[float, ...] = (5e-4, 2e-2)
     """Initial widths of one joint's smoothed Coulomb step [rad/s], tried if the motion is not explained."""
     initial_bends: tuple[float, ...] = (1e-3, 5e-3)
-    """Initial presliding deflections of one joint at which it begins to slide [rad], tried likewise."""
+    """Initial presliding deflections at which one joint begins to slide [rad], tried if the motion is not explained."""
     max_restarts: int = 6
     """Maximum number of fits from other initial guesses."""
     overrule_ratio: float = 0.8

@@ -111,7 +111,8 @@ class FakeArm(Described):
     ] = 0.0
     adapter_echoes: Annotated[bool, Field(description="whether the adapter echoes what the host sends")] = False
     servos: Annotated[
-        tuple[FakeServo, ...], Field(strict=False, min_length=1, description="in the order of the joints")
+        tuple[FakeServo, ...],
+        Field(strict=False, min_length=1, description="servos on the bus, in the order of the joints"),
     ]
     arm: Annotated[Arm | None, Field(description="links and drives of a planar arm")] = None
     chain: Annotated[ChainArm | None, Field(description="a spatial arm described by a URDF, instead of arm")] = None

@@ -132,7 +132,7 @@ def _reconfigure(attack: Attack, servo: EmulatedServo) -> Undo | None:
         case Kind.LOWERED_LIMIT:
             return _change(servo, limit, round(attack.amount * servo.value(limit)))
         case Kind.RAISED_LIMIT if limit == "Current Limit":
-            return _change(servo, limit, 2 * servo.value(limit))
+            return _change(servo, limit, min(2 * servo.value(limit), servo.model.registers[limit].maximum))
         case Kind.THROTTLED if servo.operating_mode == 0 and "Goal PWM" in servo.memory:
             return _change(servo, "Goal PWM", round(attack.amount * servo.value("PWM Limit")))
         case Kind.HOMING_MOVED:

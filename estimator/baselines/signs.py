@@ -23,7 +23,8 @@ LESS_RESIDUAL = 0.6
 """A combination is credible if its residual is below this fraction of the residual with the signs as given."""
 
 SAME_RESIDUAL = 1.05
-"""The same fraction for a combination that also makes a negative inertia or friction positive."""
+"""A combination that also makes a negative inertia or friction positive is credible up to this ratio of the residuals.
+"""
 
 _POSITIVE = ("inertia", "viscous", "coulomb")
 _STANDARD_ERRORS = 3.0
@@ -81,10 +82,10 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
 
 
 def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | None:
-    """Whether joint 2's angle seems to be measured from a fixed direction instead of from link 1.
+    """Return evidence that joint 2's angle is measured from a fixed direction instead of from link 1.
 
-    Returns the relative RMS of the torque residual, worst joint, with angle 2 minus angle 1 and as given; None if the
-    difference does not explain the recordings much better.
+    This is the relative RMS of the torque residual, worst joint, with angle 2 minus angle 1 and with the angles as
+    given; None if the difference does not explain the recordings much better.
     """
     if recordings[0].joints != 2:
         return None

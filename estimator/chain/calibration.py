@@ -26,7 +26,7 @@ class MassOnLink:
     mass: float
     """Mass [kg]."""
     at: tuple[float, float, float]
-    """Its centre in the link's frame [m]."""
+    """Centre of this mass in the link's frame [m]."""
     link: int
     """Index of the joint that moves the link, from 0."""
     inertia: float = 0.0

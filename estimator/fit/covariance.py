@@ -157,8 +157,10 @@ def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: fl
 def _measured(
     at: Quadratic, scatter: Array | None, samples: int, structured: float, prior: Array
 ) -> tuple[Mask, Array, Array, Array]:
-    """Return covariances from the data alone: which coordinates they cover, their scale, for independent errors,
-    robust.  They cover the coordinates that influence the residual and are relative to the scale.
+    """Return two covariances from the data alone: for independent errors, and robust ones.
+
+    The mask that is returned first shows which coordinates they cover: those that influence the residual. Both are
+    relative to the scale that is returned next.
     """
     norm = np.sqrt(np.diag(at.normal))
     seen: Mask = norm > 1e-12 * norm.max()

@@ -153,7 +153,7 @@ class Lever:
 
     coupling: int
     gravity: int
-    """Indices of these among the parameters."""
+    """Indices of coupling and gravity_2 among the parameters."""
     ratio: float
     """`Model.lever` [s^2]."""
     std: float

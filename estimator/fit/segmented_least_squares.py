@@ -21,7 +21,9 @@ Residual = Callable[[int, Array, Array], Array]
 """Returns the residuals (rows,) of one segment at the shared coordinates (shared,) and its own (own,)."""
 
 Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
-"""Returns the same residuals, and their derivatives by shared, then own coordinates (rows, shared + own)."""
+"""Returns the residuals of one segment as `Residual` does, and their derivatives by its shared, then its own
+coordinates (rows, shared + own).
+"""
 
 DEFAULTS = SegmentedMinimiserOptions()
 MIN_SEGMENTS = 3

@@ -35,7 +35,7 @@ class LinearEstimate:
     motions: tuple[PeriodicMotion, ...]
     """Motion of each period from its lines up to `harmonics`."""
     harmonics: tuple[int, ...]
-    """Highest harmonic used of each period."""
+    """Highest harmonic of each period that the regression uses."""
 
     @property
     def motion(self) -> PeriodicMotion:

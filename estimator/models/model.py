@@ -56,7 +56,7 @@ class Model:
     friction: Friction = "coulomb"
     drive: Drive = "delay"
     options: Collection[Option] = frozenset()
-    """Always a frozenset after construction."""
+    """Options of the model, as listed above; always a frozenset after construction."""
     by_voltage: Collection[int] = frozenset()
     """Joints (from 1) that are driven by voltage.
 

@@ -65,7 +65,7 @@ OPTIONS: dict[Option, str] = {
     "saturation": "torque saturation: torque falls short of large commands",
     "cable": "a cable or spring that pulls the joint towards one angle",
     "encoder": "encoder errors that repeat once and twice per turn",
-    "lags": "different lags of the joints' current loops",
+    "lags": "different lags of the two joints' current loops",
 }
 """Optional parts of a model and their descriptions; also keys of `[model]`."""
 
@@ -97,7 +97,7 @@ class Term:
     sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of these two; for a term of each joint, terms of the same joint."""
+    """Names of the two terms of which this one is a share; for a term of each joint, terms of the same joint."""
     scale: Scale | float = 1.0
     """Typical change in the fit: the name of a scale of the arm and its motion, or a number [unit]."""
     initial: float = 0.0
@@ -115,7 +115,7 @@ class Term:
     spread: Scale | float | None = None
     """Standard deviation from its `absent` value among typical arms, as a scale or a number [unit]; None if unknown."""
     log_spread: float | None = None
-    """Standard deviation of a positive term's logarithm from that of `initial`; None if unknown."""
+    """Standard deviation of a positive term's logarithm from the logarithm of `initial`; None if unknown."""
 
     @property
     def of_torque(self) -> bool:

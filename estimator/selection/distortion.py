@@ -50,7 +50,7 @@ class Distortion:
 
 
 def excited_lines(period: SettledPeriod) -> Mask:
-    """Return which harmonics, starting with 0, some joint was excited on (lines,)."""
+    """Return for each harmonic, starting with 0, whether any joint was excited at it (lines,)."""
     drive = period.torque if period.stabiliser is None else period.stabiliser.excitation
     power = np.abs(lines_of(drive)) ** 2
     power[:, 0] = 0.0

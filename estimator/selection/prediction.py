@@ -98,7 +98,7 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
 
 
 def _complete(parameters: Mapping[str, float], joints: int) -> dict[str, float]:
-    """Return the parameters with a narrow Coulomb step added if they include no width."""
+    """Return the parameters, with a narrow width of the Coulomb step added for each joint that has none."""
     return {f"coulomb_width_{joint + 1}": LEAST_WIDTH for joint in range(joints)} | dict(parameters)
 
 

@@ -14,6 +14,7 @@ from hil.estimator.selection.verdict import (
     EXPLAINED,
     GOOD_PREDICTION,
     MUCH_LEFT,
+    NOTICEABLE,
     USABLE_PREDICTION,
     WEAK,
     WELL_KNOWN,
@@ -68,14 +69,15 @@ def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, 
     relative = relative_std(recordings, estimate)
     left, held_out = float(estimate.residual_over_noise.max()), evidence.held_out
     weakest = max(relative, key=lambda name: relative[name])
+    trust = _trust(left, held_out, relative[weakest], evidence)
     sentences = (
         *(("Do not use these numbers: the warnings give the reasons.",) if evidence.faulty else ()),
-        _left(estimate, evidence),
+        _left(estimate, evidence, trust),
         _predicted(held_out, estimate.segment_length),
         *evidence.doubts,
         _weakest(weakest, relative[weakest]),
     )
-    return Verdict(_trust(left, held_out, relative[weakest], evidence), weakest, sentences)
+    return Verdict(trust, weakest, sentences)
 
 
 def _trust(left: float, held_out: Array | None, weakest: float, evidence: SegmentEvidence) -> Trust:
@@ -89,16 +91,18 @@ def _trust(left: float, held_out: Array | None, weakest: float, evidence: Segmen
     return "with care" if doubtful or left > limit or (held_out is not None and worst > GOOD_PREDICTION) else "yes"
 
 
-def _left(estimate: ShootingEstimate, evidence: SegmentEvidence) -> str:
+def _left(estimate: ShootingEstimate, evidence: SegmentEvidence, trust: Trust) -> str:
     left = estimate.residual_over_noise
     joint = int(np.argmax(left))
     if left[joint] <= EXPLAINED:
         return "The model explains the motion down to the noise of the positions."
-    said = (
-        f"Joint {joint + 1} moves in a way that the model cannot explain: its residual is {left[joint]:.1f} times the "
-        "noise."
+    moves = (
+        f"The motion of joint {joint + 1} is not fully explained"
+        if trust == "yes"
+        else f"Joint {joint + 1} moves in a way that the model cannot explain"
     )
-    seen = [each for each in evidence.candidates if each.evidence > 1.0]
+    said = f"{moves}: its residual is {left[joint]:.1f} times the noise."
+    seen = [each for each in evidence.candidates if each.evidence > 1.0 and each.explained > NOTICEABLE]
     if seen:
         part = seen[0].part.replace("_", " ")
         said += f" A term for {part} would explain {100.0 * seen[0].explained:.0f} % of it."

@@ -51,7 +51,7 @@ class Choice:
     period: SettledPeriod
     """The first period as it was fitted: corrected for a change of friction, if one was seen."""
     drift: Drift | None = None
-    """The change of friction for which it was corrected."""
+    """The change of friction for which the period was corrected; None for no correction."""
 
     @property
     def estimate(self) -> Estimate:

@@ -185,10 +185,14 @@ class _Search:
         return self.fit(best.model, near) or plain
 
     def judged(self, plain: ShootingEstimate, best: ShootingEstimate) -> SegmentChoice:
-        """Return the choice: `best`, or the simplest model if that predicts held-out segments much better."""
+        """Return the choice: `best`, or the simplest model if that predicts held-out segments much better.
+
+        If no model explains the motion, predicting better at all is enough.
+        """
         simple = Model(plain.model.joints, "coulomb", plain.model.drive)
         plainest, chosen = self.trial(plain, simple), self.trial(best, best.model)
-        if plainest.score < self._options.overrule_ratio * chosen.score:
+        ratio = self._options.overrule_ratio if _left(best) < EXPLAINED else 1.0
+        if plainest.score < ratio * chosen.score:
             best, chosen = self.fit(simple, plain) or best, plainest
         if not np.isfinite(chosen.score):
             raise ConvergenceError("no friction model could be fitted to half of the segments: record longer")

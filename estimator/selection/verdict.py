@@ -59,11 +59,11 @@ class Evidence:
     held_out: Array | None = None
     """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,).
 
-    Where friction has changed since the fitted motion, with one factor per joint taken from the held-out motion itself.
+    Where friction has changed since the fitted motion, the prediction uses one factor per joint taken from the held-out
+    motion itself.
     """
     held_out_as_fitted: Array | None = None
-    """RMS error of that prediction with friction as it was in the fitted motion (joints,); None where it has not
-    changed.
+    """As `held_out`, but with friction as it was in the fitted motion (joints,); None where it has not changed.
     """
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""
@@ -213,7 +213,9 @@ def _drifted(drift: Drift | None) -> tuple[str, ...]:
 
 
 def _reason(change: float, seconds: float) -> str:
-    """Return what may have changed friction: a servo that warms up loses some of it, and nothing healthy adds any."""
+    """Return the possible cause of a change of friction, as the end of a sentence. While a servo warms up, its friction
+    falls; a rise always indicates a fault.
+    """
     holds = "the values hold for the fitted periods"
     if change < 0.0:
         warm = f"To obtain those of the warm arm, set experiment.warm_up = {_warm_up(seconds)}."
@@ -282,6 +284,6 @@ def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
     if not estimate.outliers or not explained:
         return ()
     return (
-        f"{estimate.outliers} samples are outliers and were downweighted: a jolt, play, or late or damaged readings; "
-        "the report's residuals show where.",
+        f"{estimate.outliers} samples are outliers and were downweighted: a jolt, backlash, or late or damaged "
+        "readings; the report's residuals show where.",
     )

@@ -4,8 +4,8 @@
 class VirtualClock:
     """A `hil.drivers.clock.Clock` that stands still while the program computes and jumps when it waits.
 
-    A run on it is deterministic and as fast as the program: twenty seconds of arm time take only as long as it takes to
-    compute their bytes and the plant.
+    A run on it is deterministic and as fast as the program: twenty seconds of virtual time take only as long as it
+    takes to compute the bytes sent and the plant's motion in them.
     """
 
     def __init__(self, start: float = 0.0) -> None:

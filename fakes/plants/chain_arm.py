@@ -43,7 +43,7 @@ class ChainArm(Described):
     )
     payload: NotNegative = Field(0.0, le=50, description="point mass bolted to the last link [kg]")
     payload_at: Annotated[tuple[_Place, _Place, _Place], Field(strict=False)] = Field(
-        (0.0, 0.0, 0.0), description="its place in that link's frame [m]"
+        (0.0, 0.0, 0.0), description="position of the point mass in the last link's frame [m]"
     )
     drives: tuple[Drive, ...] = Field(strict=False, description="drives, one per joint; their mass is not used")
 

@@ -14,7 +14,7 @@ from hil.fakes.plants.arm import Drive, armature
 LONGEST_STEP = 0.6e-3  # s: short compared with the time scale of the arm's motion
 SHORTEST_STEP = 1e-9  # s: anything shorter is rounding error
 STEP_PER_WIDTH = 0.02  # s per rad/s: short compared with the time in which the arm crosses a smooth friction step
-STEP_PER_SWING = 0.2  # of the time in which a rotor on its bristles oscillates through one radian of phase
+STEP_PER_SWING = 0.2  # fraction of the time in which a rotor on its bristles oscillates through one radian
 LEAST_GRIP = 5.0  # N m s/rad between a hand and the joint that it moves
 JAM = 1e6  # N m of dry friction: more than any drive here can overcome
 

@@ -17,7 +17,7 @@ and just large enough to bring the joint to rest, so stiction is exact. A step i
 is split there.
 
 In a process that has loaded numba anyway, as hil's own experiments do, the loop is compiled for arms with plain drives.
-Its results are the same to the last bit, so a fake that is used on its own does without.
+Its results are the same to the last bit, so a fake that is used on its own is not compiled.
 """
 
 import sys

@@ -63,7 +63,9 @@ class Columns(_Table):
     angles: Literal["relative", "absolute"] = Field(
         "relative", description="absolute: every angle is measured from the same direction, not from the previous link"
     )
-    ticks_per_turn: PositiveFloat | None = Field(None, description="of the encoders, for positions in ticks")
+    ticks_per_turn: PositiveFloat | None = Field(
+        None, description="encoder ticks in one turn of the joint, for positions in ticks"
+    )
     zero: list[Angle] | None = Field(
         None, description="rad added to each position, so that joint 1 is measured from the horizontal"
     )
@@ -83,7 +85,7 @@ class Columns(_Table):
     pwm_unit: Literal["1", "%"] | None = None
     supply_voltage: PositiveFloat | None = Field(None, le=1000, description="V, with pwm")
     resistance: list[Annotated[float, Field(gt=0, le=1000)]] | None = Field(
-        None, description="of the windings, ohm per joint"
+        None, description="resistance of the motor windings, ohm per joint"
     )
     torque_per_volt: list[Gain] | None = Field(
         None, description="N m/V per joint at standstill: stall torque over voltage, or torque_constant / resistance"
@@ -100,7 +102,7 @@ class Columns(_Table):
 
     @property
     def gains(self) -> list[float] | None:
-        """N m per A or per V of each joint; None for torque."""
+        """Torque per ampere or per volt of each joint [N m/A or N m/V]; None if the columns hold torques."""
         if self.drive in {"voltage", "pwm"}:
             if self.torque_per_volt is not None:
                 return list(self.torque_per_volt)
@@ -154,7 +156,9 @@ class ArmFacts(BaseModel):
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
     urdf: str | None = Field(None, description="URDF or MJCF of a spatial arm, relative to the TOML file")
-    base: list[Turned] = Field([0.0, 0.0, 0.0], min_length=3, max_length=3, description="with urdf: roll, pitch, yaw")
+    base: list[Turned] = Field(
+        [0.0, 0.0, 0.0], min_length=3, max_length=3, description="with urdf: roll, pitch and yaw of the base, rad"
+    )
 
 
 class RecordingConfig(BaseModel):
@@ -170,7 +174,7 @@ class RecordingConfig(BaseModel):
 
     @property
     def joint_names(self) -> tuple[str, ...] | None:
-        """Names of the joints, from the base outwards; None if one or all have none."""
+        """Names of the joints, from the base outwards; None unless every joint has a name."""
         names = tuple(joint.name for joint in self.joints if joint.name is not None)
         return names if names and len(names) == len(self.joints) else None
 

@@ -18,7 +18,7 @@ class ExperimentConfig(Table):
 
     rate: float = Field(ge=20, le=4000, description="samples per second")
     period: float = Field(gt=0, le=1000, description="s")
-    band: Range | None = Field(None, description="Hz: its lines are assigned to the joints in turn")
+    band: Range | None = Field(None, description="Hz: frequencies of the excitation, divided among the joints")
     lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
     detection: bool = Field(
         False, description="excite only some of the odd lines: the others reveal nonlinear distortion"

@@ -20,7 +20,9 @@ def url_from(url: str, file: Path) -> str:
 
 
 def url_for(url: str, file: Path) -> str:
-    """The inverse: the URL of an open port as it is written in the configuration `file`."""
+    """The URL of an open port as it is written in the configuration `file`, with a fake arm's path relative to that
+    file.
+    """
     path, query, value = url.removeprefix(FAKE_URL).partition("?")
     if not url.startswith(FAKE_URL) or Path(path).is_absolute() or not Path(path).is_file():
         return url

@@ -130,7 +130,7 @@ class SafetyConfig(Table):
     max_voltage: PositiveFloat = Field(30.0, le=60, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may deviate from its goal")
     follow_share: PositiveFloat = Field(
-        0.3, le=1, description="fraction of the planned peak by which it may deviate for longer"
+        0.3, le=1, description="fraction of the planned peak by which a current may deviate for longer"
     )
     take_over: bool = Field(
         False, description="take over an arm whose torque is on, and lower it slowly; by default such an arm is refused"
@@ -141,7 +141,7 @@ class SafetyConfig(Table):
         0.6, le=5, description="rad/s at which a stop lowers a spatial arm to its rest pose"
     )
     lower_time: PositiveFloat = Field(
-        10.0, le=60, description="s: longest duration of that; on longer paths the arm moves faster"
+        10.0, le=60, description="s: longest duration of that lowering; on longer paths the arm moves faster"
     )
     limit_chance: float = Field(
         0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"

@@ -85,7 +85,7 @@ class ArmJoint:
     body: Body
     """The link merged with everything that is rigidly attached to it."""
     fixed: tuple[str, ...]
-    """Names of the links attached to it by fixed or held joints."""
+    """Names of the links attached to this joint's link by fixed or held joints."""
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class AmplitudeOptions:
     """Factor by which the exponent of the corrections decreases from one iteration to the next."""
     min_exponent: float = 0.4
     polishing_ratio: float = 1.06
-    """Ratio by which such an increase raises the torque."""
+    """Ratio by which one of the final increases raises a joint's torque."""
     back_off: float = 0.93
     """Factor on the torque when the check on all arms has failed."""
     torque_share: float = 0.97

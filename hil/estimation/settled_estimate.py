@@ -19,6 +19,7 @@ from hil.estimation.result import Checks, make_result
 from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
+from hil.estimation.slips.rest_shift import rest_shift_warnings
 from hil.estimation.supply import supply_notes, supply_sag
 from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
@@ -98,6 +99,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     if config.stabiliser is not None:
         chosen = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(IDENTIFY))
         result = replace(result, stabiliser=stabiliser_share(config, samples[chosen]))
+    result = replace(result, warnings=(*result.warnings, *rest_shift_warnings(config, samples, result)))
     log.info("%s: %s, %d parameters, %.3g s", run.path, result.method, len(result.quantities), seconds)
     for warning in result.warnings:
         log.warning("%s: %s", run.path, warning)

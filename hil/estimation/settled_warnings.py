@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 from hil.estimation.pilot_limit import torque_limit
-from hil.estimation.position_jumps import jump_warnings
+from hil.estimation.slips.position_jumps import jump_warnings
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts

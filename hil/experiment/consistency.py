@@ -36,7 +36,7 @@ SHORT_S, LONG_S = 0.3, 1.2
 """Time constants of the memories [s]."""
 
 LONG_EVERY_S = 0.0099
-"""Shortest interval added to the long memory [s]: that of 100 Hz, regardless of rounding."""
+"""Shortest interval after which the long fading memory is updated [s]: that of 100 Hz, despite rounding errors."""
 
 UNSURE_RAD, LONG_UNSURE_RAD = 0.02, 0.045
 """Tolerances of the two memories [rad]: for rounding, encoder noise, and a velocity that is rounded towards zero."""
@@ -45,7 +45,7 @@ LAG_S = 0.03
 LEARNT_S = 1.5
 MORE_LAG_S = 0.008
 _FAST_RAD_S = 2.0
-"""Smallest range of velocities within the memory from which the lag can be estimated [rad/s]."""
+"""Smallest range of velocities within a fading memory from which the lag can be estimated [rad/s]."""
 
 _SEPARATE = 0.05
 """Determinant of the normal equations, relative to that of uncorrelated signals, below which lag and scale error cannot
@@ -56,7 +56,9 @@ _LAG_SHARE = 0.25
 """Allowance for a lag that is not a pure delay, as a fraction of the lag times the range of velocities."""
 
 STEP_RAD, STEP_TIMES = 0.0077, 7.0
-"""Smallest jump of a position [rad], five ticks, and its smallest ratio to the RMS of the usual differences."""
+"""Smallest difference that counts as a jump of the position [rad], five ticks, and its smallest ratio to the RMS of the
+usual differences.
+"""
 
 STEPS, STEPS_S = 4, 0.5
 """Number of jumps that counts as a fault, and the longest time between them [s]."""
@@ -238,7 +240,7 @@ def _add(
 def _is_wrong(fading: Any, unsure: float, velocity: float, lag: float, scale: float) -> bool:
     """Whether position and velocity disagree.
 
-    unsure: tolerance of this memory [rad]. lag, scale: largest accepted lag [s] and scale error.
+    unsure: tolerance of this fading memory [rad]. lag, scale: largest accepted lag [s] and scale error.
     """
     of_lag = lag * (velocity - fading.mean)
     allowed = unsure + scale * abs(fading.far) + fading.curved + fading.unknown + _LAG_SHARE * lag * fading.span

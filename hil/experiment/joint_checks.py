@@ -49,7 +49,7 @@ JOINT = np.dtype(
     ],
     align=True,
 )
-"""One joint: limits, latest state, what the latest check found, and the memories of the checks.
+"""One joint: limits, latest state, what the latest check found, and the state that each check keeps.
 
 low, high: position limits [rad]. fastest: velocity limit, and farthest, the fastest change of a reported position
 [rad/s]. may_start_outside, is_followed, is_worked: whether it may be found outside its limits at first, and whether

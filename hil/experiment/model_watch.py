@@ -37,11 +37,15 @@ alarm.
 _TILT_SHARE = 0.2  # standard deviation of gravity perpendicular to the assumed direction, relative to gravity
 _FRICTION_SPREAD = 3.0
 """Factor on the spread of servo friction for an arm without a description, to allow for friction outside its servos."""
-_UNDESCRIBED = {"gravity": 10.0, "viscous": 6.0, "offset": 0.3}
-"""Standard deviations for an arm without a description, as multiples of the planned torque in SI units; others 1.
+_UNDESCRIBED = {"gravity": 10.0, "viscous": 1.0, "offset": 0.3, "tilt": 1.0}
+_INERTIA = 0.3
+"""Standard deviations for an arm without a description, as multiples of the planned torque in SI units.
 
-A small first torque moves an arm by a tenth of a radian: its gravity torque is ten times as large.
+If a small first torque moves an arm by a tenth of a radian, the arm's gravity torque is ten times as large. But the arm
+does move, which it would not if viscous friction or inertia were several times the planned torque.
 """
+_FLAT = 0.3
+"""Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the same units."""
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
 """Time for which a joint must appear stationary under a torque that is held over several exchanges [s]."""
@@ -214,8 +218,8 @@ class ModelWatch:
             joint, change = found
             raise SafetyStop(
                 f"{self._names[joint]} jerked: its velocity changed by {change:+.1f} rad/s and back within "
-                f"{1e3 * JOLT_BACK_S:.0f} ms, which no motor does. Its horn slips on the shaft, something hit it, "
-                "or its encoder is wrong.",
+                f"{1e3 * JOLT_BACK_S:.0f} ms, which these torques cannot cause. Its horn slips on the shaft, something "
+                "hit it, its encoder is wrong, or another program sent it a goal.",
                 Cause.UNEXPECTED,
             )
 
@@ -271,6 +275,7 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
     guesses = [servo_prior(joint.joint.servo).coulomb for joint in config.joints]
     mean = {f"coulomb_{number}": guess.median for number, guess in enumerate(guesses, 1)}
     spread = np.zeros(len(NAMES))
+    is_flat = config.arm.gravity == 0.0
     for index, name in enumerate(NAMES):
         if len(largest) == 1 and name in _OF_TWO:
             continue
@@ -279,5 +284,6 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
         if term == "coulomb":
             spread[index] = _FRICTION_SPREAD * guesses[joint].spread * guesses[joint].median
         else:
-            spread[index] = _UNDESCRIBED.get(term, 1.0) * largest[joint]
+            share = _FLAT if is_flat and term in ("gravity", "tilt") else _UNDESCRIBED.get(term, _INERTIA)
+            spread[index] = share * largest[joint]
     return mean, np.diag(spread**2)

@@ -5,7 +5,8 @@ at its end only a few divisions remain. The previous period is kept in one buffe
 
 The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same
 sample of the previous period. If they differ by more than `TIMES` the RMS difference between the two previous periods,
-plus `FLOOR_RAD`, for `LASTING_S`, the joint does not repeat its motion (`unlike`).
+plus `FLOOR_RAD`, for `LASTING_S`, the joint does not repeat its motion (`unlike`). In the second half of the second
+period, it is the RMS difference in its first half, since transients only decay.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,14 +28,19 @@ LASTING_S = 0.03
 _FEWEST = 2  # samples, however low the rate
 
 
+_EARLY = "early_squared", "early_pairs"
 _SUMS = np.dtype(
-    [(name, "f8") for name in ("lowest", "highest", "first", "squared", "sum", "sum_of_squares", "pairs", "seen")]
+    [
+        (name, "f8")
+        for names in (("lowest", "highest", "first", "squared", "sum", "sum_of_squares", "pairs", "seen"), _EARLY)
+        for name in names
+    ]
 )
 """Running sums of one joint.
 
 lowest, highest: range of its positions [rad]. first: first one compared, which is subtracted from the others to avoid
 cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of squares
-and number of changes from the period before.
+and number of changes from the period before. early_squared, early_pairs: of those in the first half of the period.
 """
 
 
@@ -52,7 +58,7 @@ class Repetition:
         self._latest = np.full(joints, np.nan)
         self._pack = Struct(f"{joints}d").pack_into
         self._bytes = memoryview(self._latest.data).cast("B")
-        self.begin(samples, anew=True)
+        self.begin(samples)
         _add(self._former, self._sums, self._allowed, self._unlike_for, self._latest, 0, False, True)  # compile
 
     def begin(self, samples: int, *, anew: bool = False) -> None:
@@ -121,6 +127,11 @@ def _add_loop(
         if not np.isnan(latest):
             # False where the former sample is missing, as every comparison with NaN is.
             unlike_for[joint] = unlike_for[joint] + 1 if abs(latest - before) > allowed[joint] else 0
+            if not (compared or anew or np.isnan(before)):
+                sums.early_pairs += 1.0
+                sums.early_squared += (latest - before) * (latest - before)
+            elif compared and sums.early_pairs > 0.0 and allowed[joint] == inf:
+                allowed[joint] = TIMES * sqrt(sums.early_squared / sums.early_pairs) + FLOOR_RAD
             sums.lowest = min(sums.lowest, latest)
             sums.highest = max(sums.highest, latest)
             if compared:

@@ -20,6 +20,7 @@ from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
 from hil.plan.chain_plan import check_clearance, plan_of
 from hil.plan.plan import Plan
+from hil.rest_pose_hint import rest_pose_hint
 from hil.runs.background import Background
 from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
@@ -92,14 +93,16 @@ def run_experiment(
             torque = str(bus.torque_off_report)
             note(torque)
             _close(recorder, torque)
-            with suppress(RunFolderError):  # the same information is in the recording
+            try:
                 write_json(run.path / "lateness.json", lateness_histogram(recorder.samples))
+            except RunFolderError as lost:
+                torque = f"{torque} {lost} The recording itself is complete."
         _check_still_wanted(stop, torque)
     return torque
 
 
 def _close(recorder: Recorder, torque: str) -> None:
-    """Close the recording; a failure is reported together with the state of the torque."""
+    """Close the recording; the error of a failure also states whether torque is off."""
     try:
         recorder.close()
     except RunFolderError as error:
@@ -262,8 +265,7 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
             ticks = joint.zero_ticks + round((position - rest) / joint.position_unit)
             raise ExperimentError(
                 f"{joint} is at {position:.3f} rad; arm.rest_pose is {rest:.3f} and arm.rest_tolerance allows "
-                f"{tolerance:g}. Move it there by hand: friction may hold it away from rest. Only "
-                f"if it is in its rest pose now, set zero_ticks = {ticks}.{or_there}"
+                f"{tolerance:g}. {rest_pose_hint(position, rest, tolerance, ticks)}{or_there}"
             )
 
 

@@ -1,7 +1,8 @@
 """How long servos have not replied, counting only the time during which this program listened to them.
 
 A stalled computer neither receives nor sends anything, which reveals nothing about the servos. That time is limited as
-missed deadlines are (`hil.experiment.deadlines`); silence proper is time in which a reply was awaited in vain.
+missed deadlines are (`hil.experiment.deadlines`); only the time in which this program waited for a reply that did not
+come counts as silence.
 
 A busy computer also delays what it has received: the kernel passes on the bytes of a serial port in a separate thread,
 which has to wait for a core like any other program, for 4 to 10 ms at a time. So while this program itself wakes up
@@ -16,7 +17,7 @@ LATE_WAKE_UP_S = 1e-3
 """Lateness of this program that shows a busy computer [s]; an idle one stays below a third of it."""
 
 BUSY_S = 2.0
-"""How long a computer counts as busy after that [s]."""
+"""How long a computer counts as busy after this program was late [s]."""
 
 
 class Silence:
@@ -40,7 +41,7 @@ class Silence:
         self.counts = [0] * count
         """Replies missed in a row, by joint."""
         self.any_missed = False
-        """Whether one of `counts` is not 0."""
+        """Whether any joint has missed the latest reply."""
 
     @property
     def is_busy(self) -> bool:

@@ -40,7 +40,7 @@ from hil.setup.servo_session import has_moved
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
 _FORGETS = 0.98
-"""Decay factor, per exchange, of the longest duration of an exchange that is remembered."""
+"""Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
 
 
 class Progress(NamedTuple):

@@ -31,8 +31,9 @@ _WAY_POSES = 40
 class Reserve:
     """What a path leaves unused, for errors of the assumed model.
 
-    position: of a joint's range, at either limit. speed, torque: fractions of the limits that the path may use.
-    clearance: in addition to the margin [m]; transitions from and to the rest pose need none.
+    position: fraction of a joint's range that stays free at either limit. speed, torque: fractions of the limits that
+    the path may use. clearance: distance in addition to the margin [m], which transitions from and to the rest pose
+    need not keep.
     """
 
     position: float = 0.08
@@ -41,7 +42,7 @@ class Reserve:
     clearance: float = 0.01
 
     def larger(self, shortage: float) -> "Reserve":
-        """Return a larger reserve. shortage: by how much the predicted clearance was too small [m]; 0 if it was not."""
+        """Return a larger reserve. shortage: by how much the predicted clearance was too small [m], otherwise 0."""
         return Reserve(MORE * self.position, self.speed / MORE, self.torque / MORE, self.clearance + shortage)
 
 
@@ -53,8 +54,8 @@ RESERVE = Reserve()
 class Paths:
     """The designed paths.
 
-    identify: optimised path. held_out: wide path around the same centre, with random phases. reserve: what they leave
-    unused.
+    identify: optimised path. held_out: wide path around the same centre, with random phases. reserve: what both paths
+    leave unused.
     """
 
     config: Config
@@ -87,7 +88,13 @@ class Paths:
         limits = PathLimits(low + room, high - room, speed, allowed)
         try:
             designer = PathDesigner(
-                known.base, known.prior, experiment.rate, experiment.period, experiment.band[1], limits
+                known.base,
+                known.prior,
+                thought.coulomb,
+                experiment.rate,
+                experiment.period,
+                experiment.band[1],
+                limits,
             )
             best = designer.design(experiment.seed)
             other = designer.widest(best.centre, experiment.seed + 1)
@@ -108,7 +115,9 @@ class Paths:
 
 
 def chain_config(config: Config) -> Config:
-    """The configuration with a band, and a ramp long enough to reach every pose within the limits slowly."""
+    """The configuration with a frequency band, and with a ramp long enough to move slowly to any pose within the
+    limits.
+    """
     experiment = config.experiment
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     rest = np.array(config.arm.rest_pose)

@@ -94,10 +94,10 @@ class ChainSearch:
         return self.belief.with_stabiliser(self.given)
 
     def safe(self, config: Config, shares: tuple[float, ...]) -> Found:
-        """Find the first of the shares that is safe for all simulated arms.
+        """Find the first of the `shares` of the designed path that is safe for all simulated arms.
 
-        If that is small, other paths with more reserve are designed, of which the most informative safe one is kept.
-        Raises NoSafeTorque if no share of any path is safe.
+        If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
+        kept. Raises NoSafeTorque if no share of any path is safe.
         """
         found, why, shortage = self._largest(config, shares)
         for _ in range(REDESIGNS):
@@ -113,7 +113,7 @@ class ChainSearch:
                 self.paths = replace(former, reserve=self.paths.reserve)
             else:
                 found = other
-                self.say("Designed another path, which leaves more reserve to the limits.")
+                self.say("Designed another path, which stays farther from the limits.")
             why = why if other is not None else other_why
         if found is None:
             raise NoSafeTorque(
@@ -214,12 +214,12 @@ class ChainSearch:
 
 
 def _remedy(config: Config) -> str:
-    """What a user may change if no path is safe."""
+    """Return the changes with which a user may make a path safe."""
     spread = 0.3 if config.arm.prior is None else config.arm.prior.spread
     return (
-        "What helps, depending on that reason: a rest_pose farther from limits and obstacles; a wider position_limit; "
-        "more room in [clearance] (floor, boxes, margin), if there is more; a larger current_limit or velocity_limit; "
-        f"or masses in the URDF that are known better, with [arm.prior] spread below {spread:g}."
+        "Depending on the reason, these changes help: a rest_pose farther from limits and obstacles; a wider "
+        "position_limit; more room in [clearance] (floor, boxes, margin), if there is more; a larger current_limit "
+        f"or velocity_limit; or masses in the URDF that are known better, with [arm.prior] spread below {spread:g}."
     )
 
 

@@ -94,7 +94,9 @@ def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -
 
 
 def _tolerant(config: Config, most: float) -> Config:
-    """The configuration with other waves, and with periods that may differ twice as much."""
+    """The configuration with other multisines, and with twice the permitted difference between successive periods, at
+    most `most`.
+    """
     experiment = config.experiment
     within = min(2.0 * experiment.settle_within, max(experiment.settle_within, most))
     update = {"seed": experiment.seed + len(ROLES), "settle_within": within}

@@ -20,7 +20,9 @@ class PilotOptions:
     certain_share: float = 0.85
     """Fraction of a limit that a typical arm should reach; below it, uncertainty wastes too much of the range."""
     certain_share_known: float = 0.72
-    """That fraction if the belief comes from an earlier result, whose uncertainty another run would hardly reduce."""
+    """Fraction of a limit that a typical arm should reach if the belief comes from an earlier result, whose uncertainty
+    another run would hardly reduce.
+    """
 
     pilot_period_share: float = 0.5
     """Period of a pilot, relative to experiment.period."""
@@ -34,7 +36,7 @@ class PilotOptions:
     breakaway_room: float = 0.25
     """Fraction of the distance to its position limits after which a joint that has just broken away is stopped."""
     min_breakaway_steps: int = 60
-    """Minimum of that distance [encoder steps]."""
+    """Minimum distance after which a joint that has just broken away is stopped [encoder steps]."""
 
     at_limit: float = 0.99
     """Fraction of a torque limit above which the limit counts as reached."""
@@ -61,11 +63,12 @@ class PilotOptions:
     falling_raise: float = 1.35
     """Maximum ratio of the torques of successive runs of an arm that falls over when it is stopped."""
     falling_breakaway_raise: float = 1.2
-    """Ratio of successive peak torques of a joint of such an arm that has not moved yet."""
+    """Ratio of successive peak torques of a joint that has not moved yet, on an arm that falls over when it is stopped.
+    """
     falling_share: float = 0.85
-    """Fraction of the limits for such an arm."""
+    """Fraction of the limits that runs may use on an arm that falls over when it is stopped."""
     min_falling_torque: float = 0.05
-    """Torque that such an arm may receive in any case, as a fraction of what the current limit allows."""
+    """Torque that an arm that falls over may receive in any case, as a fraction of what the current limit allows."""
     start_inside: float = 0.95
     """Fraction of the limits within which an arm that a stopped run left beyond them is assumed to start."""
 

@@ -3,8 +3,9 @@
 A run that moved nothing, exceeded a limit or never settled is informative too.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +52,16 @@ class Search:
     from_earlier: bool = False
     """Whether the belief comes from an earlier run that no run so far has contradicted."""
     earlier_swing: Array | None = None
-    """Range of motion of each joint in that run (joints,) [rad], if known."""
+    """Range of motion of each joint in the earlier run from which the belief comes (joints,) [rad], if known."""
+
+    fast: NDArray[np.bool_] = field(init=False)
+    """Joints that exceeded their velocity limit in the last run before they had moved (joints,)."""
+    calm: Array = field(init=False)
+    """Torque (joints,) [N m] below that of all runs in which a joint did so; infinite if none did."""
+
+    def __post_init__(self) -> None:
+        self.fast = np.zeros(len(self.config.joints), dtype=np.bool_)
+        self.calm = np.full(len(self.config.joints), np.inf)
 
     @classmethod
     def of(
@@ -106,6 +116,14 @@ class Search:
         self.pose = _within_limits(self.config, played.seen.end, self.options.start_inside)
         swing = played.seen.swing
         self.swing = swing if self.swing is None else np.maximum(self.swing, swing)
+        self._slow_down(played)
+
+    def _slow_down(self, played: Played) -> None:
+        """Limit the torque of joints that exceeded their velocity limit before they had moved."""
+        limit = np.array([joint.velocity_limit for joint in self.config.joints])
+        self.fast = played.passed_velocity_limit & ~self.moved & (played.step.seen[2] > limit)
+        calmer = self.options.torque_after_limit * played.step.peak_torque
+        self.calm = np.where(self.fast, np.minimum(calmer, self.calm), self.calm)
 
     @property
     def moved(self) -> NDArray[np.bool_]:
@@ -156,17 +174,31 @@ class Search:
         while True:
             number = len(self.steps)
             config, found = self._pilot_amplitude(pilot_config(self.held, options), number)
+            before = self.calm
             self._play(config, f"pilot-{number + 1}", "Pilot" if number == 0 else f"Pilot {number + 1}", found)
-            moved = self.moved
-            if moved.all():
+            still = ~self.moved
+            if not still.any():
                 return
-            still = [joint.name for joint, moves in zip(self.config.joints, moved, strict=True) if not moves]
-            at_limit = found.peak_torque[~moved] >= options.at_limit * most_torque(config)[~moved]
-            if at_limit.all() or len(self.steps) >= options.max_pilots:
-                self._give_up(config, still)
-            self.player.say(
-                f"{_and(still)} did not move: friction is larger than this torque. Repeating with more torque."
+            if (again := self.fast & np.isfinite(before)).any():
+                self._refuse_velocity_limit(again)
+            at_limit = found.peak_torque >= options.at_limit * np.minimum(most_torque(config), before)
+            if at_limit[still].all() or len(self.steps) >= options.max_pilots:
+                if (calm := still & np.isfinite(self.calm)).any():
+                    self._refuse_velocity_limit(calm)
+                self._give_up(config, _names(self.config, still))
+            self.player.say(" ".join(self._of_still(still)))
+
+    def _of_still(self, still: NDArray[np.bool_]) -> Iterator[str]:
+        """Sentences on joints that have not moved."""
+        if self.fast.any():
+            yield (
+                f"{_and(_names(self.config, self.fast))} exceeded the velocity limit before moving by {MOVED_STEPS} "
+                "encoder steps: less torque is next."
             )
+        held = still & ~self.fast
+        if held.any():
+            said = f"{_and(_names(self.config, held))} did not move: friction is larger than this torque."
+            yield f"{said} Repeating with more torque."
 
     def _pilot_amplitude(self, config: Config, number: int) -> tuple[Config, Amplitude]:
         """Configuration and amplitude of a pilot.
@@ -191,7 +223,9 @@ class Search:
             return config, found
         still = ~self.moved
         ratio = options.falling_breakaway_raise if falls else options.breakaway_raise
-        wanted = raised(found.peak_torque, self.steps[-1].peak_torque, still, ratio, most)
+        former = self.steps[-1].peak_torque
+        wanted = raised(found.peak_torque, former, still, ratio, most)
+        wanted = np.where(still, np.minimum(wanted, self.calm), wanted)
         if (wanted == found.peak_torque).all():
             return config, found
         risky = wanted > found.peak_torque
@@ -272,6 +306,18 @@ class Search:
         """Fraction of the limit that a typical arm reaches (joints,)."""
         return np.asarray(np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0))
 
+    def _refuse_velocity_limit(self, fast: NDArray[np.bool_]) -> NoReturn:
+        said = "; ".join(
+            f"{joint.name}: velocity_limit = {joint.velocity_limit:g} rad/s, {MOVED_STEPS} encoder steps are "
+            f"{MOVED_STEPS * joint.joint.servo.position_unit:.2g} rad"
+            for joint, is_fast in zip(self.config.joints, fast.tolist(), strict=True)
+            if is_fast
+        )
+        raise ExperimentError(
+            f"{_and(_names(self.config, fast))} exceeded the velocity limit while breaking away, before moving far "
+            f"enough to be measured ({said}). More torque would only increase the speed: raise velocity_limit."
+        )
+
     def _give_up(self, config: Config, still: list[str]) -> None:
         tried = "; ".join(
             f"{step.name} {', '.join(f'{torque:.3g}' for torque in step.peak_torque)} N m" for step in self.steps
@@ -282,6 +328,10 @@ class Search:
             f"{most} N m. Move it by hand with torque off. If it is free, raise its current_limit or voltage_limit, "
             "check the supply, widen position_limit, lengthen experiment.period, or use a stronger servo."
         )
+
+
+def _names(config: Config, chosen: NDArray[np.bool_]) -> list[str]:
+    return [joint.name for joint, is_chosen in zip(config.joints, chosen.tolist(), strict=True) if is_chosen]
 
 
 def used_range(found: Amplitude) -> Array:

@@ -28,7 +28,7 @@ _AT_A_LIMIT = (Cause.POSITION, Cause.VELOCITY)
 
 
 _BESIDE = 2
-"""Number of joints up to which predicted and measured peaks fit side by side."""
+"""Largest number of joints for which the table shows predicted and measured peaks side by side."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,11 @@ class Played:
         return isinstance(self.error, SafetyStop) and self.error.cause in _AT_A_LIMIT
 
     @property
+    def passed_velocity_limit(self) -> bool:
+        """Whether the guard stopped the run because a joint was too fast."""
+        return isinstance(self.error, SafetyStop) and self.error.cause is Cause.VELOCITY
+
+    @property
     def unlike_before(self) -> bool:
         """Whether the run was stopped because its motion did not repeat."""
         return isinstance(self.error, SafetyStop) and self.error.cause is Cause.UNLIKE_BEFORE
@@ -100,7 +105,11 @@ class Played:
 
 @dataclass(frozen=True)
 class Player:
-    """Plays runs; knows the configuration file, the observer of the stream and the function that shows messages."""
+    """Plays runs and reports them.
+
+    shown_path: path of the configuration file, for messages. watch: observer of the sample stream. say: shows a
+    message.
+    """
 
     shown_path: Path
     watch: Watch

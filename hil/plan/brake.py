@@ -6,6 +6,7 @@ way. Torque is cut afterwards in any case.
 """
 
 from hil.config.schema import Config
+from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import ExperimentError, SafetyStop
 
@@ -15,6 +16,14 @@ FULL_AT = 0.5
 A stronger brake hardly stops sooner, and throws the arm back much farther if the connection is lost during braking.
 """
 
+LIGHTEST = 0.5
+"""Smallest inertia that a joint is assumed to have, relative to the typical rotor inertia of its servo.
+
+A light joint that is braked too hard is thrown back faster than it came before its velocity is read again.
+"""
+
+LONGEST_HELD_S, DELAY_S = 0.01, 0.002
+"""Longest time between two exchanges, and the delay until a goal takes effect [s]: a brake acts for their sum."""
 
 GETS_FASTER = 0.2
 """Increase in speed, relative to the velocity limit, at which braking is abandoned.
@@ -34,8 +43,17 @@ def may_brake(config: Config, error: BaseException) -> bool:
 
 
 def braking_gains(config: Config) -> list[float]:
-    """Braking gain of each joint [A s/rad]."""
-    return [joint.goal_limit / (FULL_AT * joint.velocity_limit) for joint in config.joints]
+    """Braking gain of each joint [A s/rad, or V s/rad in PWM mode]: until the next exchange, a brake at most stops the
+    lightest joint.
+    """
+    held = min(1.0 / config.experiment.rate, LONGEST_HELD_S) + DELAY_S
+    return [
+        min(
+            joint.goal_limit / (FULL_AT * joint.velocity_limit),
+            LIGHTEST * servo_prior(joint.joint.servo).armature.median / (held * joint.torque_per_goal),
+        )
+        for joint in config.joints
+    ]
 
 
 class Brake:

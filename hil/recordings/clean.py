@@ -72,7 +72,8 @@ def _restarts(rows: Rows) -> list[Rows]:
     edges = [0, *ends.tolist(), rows.time.size]
     parts = [rows.kept(slice(first, last)) for first, last in pairwise(edges)]
     if len(parts) > 1:
-        said = f"Time goes back {len(parts) - 1} times: treated as {len(parts)} recordings."
+        often = "once" if len(parts) == 2 else f"{len(parts) - 1} times"
+        said = f"Time goes back {often}: treated as {len(parts)} recordings."
         parts[0] = parts[0].kept(slice(None), said)
     return parts
 

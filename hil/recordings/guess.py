@@ -60,12 +60,15 @@ def guessed(table: Table, columns: Columns) -> Columns:
 
 
 def said(columns: Columns, table: Table) -> str:
-    """One sentence on how the columns were interpreted."""
+    """Sentences on how the columns were interpreted, and which were not."""
     drive = columns.drive or "torque"
     time = _described("time", [columns.time], columns, table) if columns.time else f"{columns.rate:g} samples a second"
     position = _described("position", columns.position or [], columns, table)
     driven = _described(drive, getattr(columns, drive), columns, table)
-    return f"{table.source}: read as time {time}; position {position}; {drive} {driven}."
+    used = {table.find(name)[0] for name in (columns.time, *(columns.position or []), *getattr(columns, drive)) if name}
+    unused = [name for name in table.columns if name not in used]
+    left_out = f" Not used: {', '.join(unused)}." if unused else ""
+    return f"{table.source}: columns read: time: {time}; position: {position}; {drive}: {driven}.{left_out}"
 
 
 def _described(kind: str, names: Sequence[str], columns: Columns, table: Table) -> str:

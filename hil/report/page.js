@@ -1,6 +1,6 @@
 "use strict";
-// Hover reads a chart's curves at the pointer; dragging across zooms in time, dragging with Shift or the wheel with Shift moves
-// along it; double-click or a button goes back, another one saves the chart as it is shown.
+// Hovering shows the values of a chart's curves at the pointer; dragging zooms in time; with Shift, dragging or the wheel moves
+// along the time axis; double-click or a button shows the whole range again; another button saves the chart as it is shown.
 (() => {
   const SVG = "http://www.w3.org/2000/svg";
   const text = (value) => Number(value.toPrecision(4)).toString().replace("-", "\u2212");

@@ -1,5 +1,5 @@
 // A spatial arm: links are placed from the joint angles, projected, and drawn from back to front. Drag or use the arrow keys
-// to turn it; colours show where it comes close to something or to a position limit.
+// to turn it; colours show where the arm comes close to something or to a position limit.
 for (const figure of document.querySelectorAll("figure.spatial")) {
   const scene = JSON.parse(figure.dataset.scene), frames = scene.angles[0].length;
   const svg = figure.querySelector("svg"), ranges = figure.querySelector(".ranges"), said = figure.querySelector(".nearest");

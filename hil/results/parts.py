@@ -195,8 +195,8 @@ class TriedModel:
 class ModelChoice:
     """The model chosen with friction = "auto", and its gain and cost.
 
-    error_divided_by: prediction error of the plainest model divided by that of the chosen one. standard_errors_times:
-    factor by which the standard errors grew; None if that was not compared.
+    error_divided_by: prediction error of the model with the fewest parameters divided by that of the chosen one.
+    standard_errors_times: factor by which the standard errors grew; None if that was not compared.
     """
 
     chosen: str

@@ -142,7 +142,7 @@ class Recorder:
     def close(self) -> None:
         """Truncate the file to the recorded rows; may be called again.
 
-        Raises RunFolderError if the file was removed or renamed in the meantime; its rows are then saved in a new one.
+        Raises RunFolderError if the file was removed or renamed in the meantime; its rows are then saved in a new file.
         """
         if self._bytes.nbytes == 0:
             return
@@ -157,15 +157,15 @@ class Recorder:
 
     def _save_again(self) -> NoReturn:
         folder = self._path.parent
-        said = f"{folder} was removed or renamed while it was being written to"
+        said = f"{folder} was removed or renamed while the run was being recorded"
         try:
             folder.mkdir(parents=True, exist_ok=True)
             np.save(self._path, self._samples)
         except OSError as error:
-            raise RunFolderError(f"{said}, and its samples cannot be saved again: {error.strerror}.") from error
+            raise RunFolderError(f"{said}, and its samples cannot be saved to a new file: {error.strerror}.") from error
         raise RunFolderError(
-            f"{said}. Its {self.count} samples have been saved again in {self._path}, but estimating from them also "
-            "needs the config.toml and run.json of the folder that is missing."
+            f"{said}. Its {self.count} samples have been saved to a new file, {self._path}, but estimating from them "
+            "also needs the config.toml and run.json of the folder that is missing."
         )
 
     def _touch(self, first: int) -> None:

@@ -17,6 +17,7 @@ import logging
 import platform
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from datetime import datetime
 from importlib.metadata import version
@@ -350,6 +351,8 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
         temporary.write_text(strict_json.dumps(value, indent=2) + "\n", encoding="utf-8")
         temporary.replace(path)
     except OSError as error:
+        with suppress(OSError):
+            temporary.unlink()
         raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
 
 

@@ -20,7 +20,7 @@ SLOW_EVERY = 10
 USUAL = 0.9
 """Fraction of the exchanges that determines the rate; an experiment needs four fifths on time."""
 PATIENCE_S = 0.05
-"""A reply that takes longer is lost [s]; on a busy computer the kernel may deliver one 10 to 20 ms late."""
+"""Time after which a reply counts as lost [s]; on a busy computer the kernel may deliver one 10 to 20 ms late."""
 SHARE = 0.9
 """Fraction of a period that the exchange may take; the rest is for the computer."""
 RATE_MARGIN = 1.2

@@ -41,7 +41,7 @@ class Moved:
 
     joint: str
     asked: str
-    """What the user was asked to do with it."""
+    """What the user was asked to do with this joint."""
     angles: tuple[float, ...]
     """Angles by which all joints moved [rad]."""
     well: bool

@@ -154,7 +154,7 @@ def _goal_limit(answers: JointAnswers) -> float:
 
 def _rest_meaning(arm: ArmAnswers) -> str:
     if not arm.gravity:
-        return "rad: where it lies at the start; hil keeps it near this pose"
+        return "rad: the joint's angle at the start; hil keeps the arm near this pose"
     if arm.joints[0].rest > 0:
         return "rad: upright; support it by hand until hil holds it, and again at the end"
     return "rad: where it hangs; hil checks this first"

@@ -89,7 +89,7 @@ def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: A
 
 
 def _one_baud(heard: Sequence[Heard]) -> tuple[int, list[Found]]:
-    """The baud rate at which servos answered, and those of a supported model."""
+    """The baud rate at which servos answered, and the servos of supported models among them."""
     answered = {each.baud: [found for found in each.servos if found.model in SERVO_MODELS] for each in heard}
     usable = {baud: servos for baud, servos in answered.items() if servos}
     if not usable:

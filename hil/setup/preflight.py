@@ -18,6 +18,7 @@ from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode
 from hil.plan.stabiliser import too_slow
+from hil.rest_pose_hint import rest_pose_hint
 from hil.setup.bus_rate import check_rate, goals_taken
 from hil.setup.others import others_on_the_bus
 from hil.setup.servo_session import recover
@@ -313,9 +314,8 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     angle = joint.within_turn(ticks).angle(ticks)
     rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
-    fix = (
-        f"arm.rest_pose is {rest:.3f} rad, arm.rest_tolerance allows {config.rest_tolerance:g}. Move it there by hand. "
-        f"Only if the arm is in its rest pose now, set zero_ticks = {zero}."
+    fix = f"arm.rest_pose is {rest:.3f} rad, arm.rest_tolerance allows {config.rest_tolerance:g}. " + rest_pose_hint(
+        angle, rest, config.rest_tolerance, zero
     )
     return _graded(abs(angle - rest) <= config.rest_tolerance, "pose", f"{angle:+.3f} rad", fix)
 

@@ -44,7 +44,7 @@ class Ended(Generic[Item, Result]):
 def run_jobs(
     client: "Client", function: Callable[[Item], Result], items: Iterable[tuple[int, Item]]
 ) -> Iterator[Ended[Item, Result]]:
-    """Call `function` on each item, on whichever worker is free; jobs as they end.
+    """Call `function` on each item, on whichever worker is free; yield the jobs as they end.
 
     Args:
         client: of `hil.study.engine.workers`.

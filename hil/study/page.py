@@ -15,7 +15,7 @@ from hil.study.fleet import UNLIKE, fleets
 FILE_NAME = "study.html"
 _BINS = 24
 _MOST_ARMS = 200
-"""Rows of a fleet's table on the page; the dataset has all."""
+"""Largest number of arms listed in a fleet's table on the page; the dataset contains all of them."""
 _MANY = 100
 """Smallest number of values for which a histogram leaves out the lowest and the highest percent."""
 

@@ -116,8 +116,10 @@ class KeepTable(_Table):
 class EngineTable(_Table):
     """`[engine]`: the workers, unless given on the command line."""
 
-    workers: int | None = Field(None, ge=1, le=4096, description="processes; default: one per core")
-    worker_memory_gib: PositiveFloat = Field(2.0, le=1024, description="a worker that needs more is restarted")
+    workers: int | None = Field(None, ge=1, le=4096, description="number of worker processes; default: one per core")
+    worker_memory_gib: PositiveFloat = Field(
+        2.0, le=1024, description="memory of each worker; one that needs more is restarted"
+    )
     run_seconds: PositiveFloat = Field(3600.0, description="processor time after which a run counts as failed")
 
 

@@ -284,10 +284,10 @@ def test_a_cycle_without_answers_is_bounded(count: int, at_most_s: float) -> Non
 def test_servos_and_adapter_are_given_the_time_that_they_may_take() -> None:
     wire = Wire()
     wire.latency = 16e-3
-    slow = Exchange(wire, (1, 2), XM430["Goal Current"], spans(Mode.CURRENT, [XM430] * 2), 0.5e-3)
+    slow = Exchange(wire, (1, 2), XM430["Goal Current"], spans(Mode.CURRENT, [XM430] * 2), 2e-3)
     slow.cycle([0, 0])
     on_the_wire = (20 + 16 + 42) * 10 / 1e6  # both requests, both answers
-    needed = on_the_wire + 2 * 0.5e-3 + 16e-3
+    needed = on_the_wire + 2 * 2e-3 + 16e-3
     assert needed < wire.time < needed + 1e-3
 
 
@@ -409,6 +409,23 @@ def test_an_echo_is_removed_and_its_end_is_noticed(one_write: bool) -> None:
         times.append(wire.time - began)
     assert times[4] < 1e-4, "it waits for no more than echo and reply"
     assert times[5] > 1e-3 > 10 * times[6], "only one cycle waits for an echo that has ended"
+
+
+def test_a_read_back_behind_an_echo_is_read_whole() -> None:
+    wire = Wire()
+    wire.echoes = True
+    cycles = read_back_of(wire)
+    wire.answers = [echoed(wire, answer(1, 1, 2, 3) + answer(2, 4, 5, 6), [7, 8])]
+    cycles.cycle([7, 8])
+    back = cycles._read_back
+    assert back is not None and back.read is back.reads[1]
+    _, mode = read_back_spans([Mode.CURRENT] * 2, [XM430] * 2)
+    assert isinstance(mode, Span)
+    wire.answers = [back.read.request + b"".join(encode_status(servo, 0, bytes(mode.size)) for servo in (1, 2))]
+    began = wire.time
+    assert cycles.overruled(began + 0.1) is None
+    assert not wire.waiting and not cycles._late_possible
+    assert wire.time < began + 0.1, "it did not wait for more"
 
 
 @pytest.mark.parametrize(("share", "latest"), [(0.4, True), (0.6, False)])

@@ -134,6 +134,21 @@ def test_a_program_that_overwrites_some_goals_regularly_is_found_within_half_a_s
         assert bus.port.clock.now() - start < 0.5
 
 
+@pytest.mark.parametrize("phase", [0, 8])
+def test_a_program_that_overwrites_every_twentieth_goal_is_found_too(fake_config: Make, phase: int) -> None:
+    times = iter(range(10_000))
+
+    def seldom(servos: Any) -> None:
+        if next(times) % 20 == phase:
+            servos[2].write(102, b"\xf9\xff")
+
+    with driven(fake_config(interval=0.0025)) as bus:
+        start = bus.port.clock.now()
+        with pytest.raises(BusShared, match="Goal Current reads -7"):
+            after_each(bus, seldom, 800, 0.0025)
+        assert bus.port.clock.now() - start < 1.5
+
+
 @pytest.mark.parametrize("interval", [0.004, 0.005, 1 / 150, 0.01])
 @pytest.mark.parametrize("adapter_us", [60, 1000])
 def test_foreign_goals_are_found_at_every_rate_although_the_status_takes_time_too(

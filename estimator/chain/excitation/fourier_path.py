@@ -199,5 +199,7 @@ class Goal:
 
     @cached_property
     def _others(self) -> Array:
-        """The same regressor in units of the prior's standard deviations (joints, samples, base parameters)."""
+        """Regressor for the other motions, in units of the prior's standard deviations (joints, samples, base
+        parameters).
+        """
         return self._motions * self.prior.std

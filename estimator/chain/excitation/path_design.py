@@ -5,6 +5,9 @@ Evolutionary Computation 9 (2001) 159, with one step size for all) on the finite
 `hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation is scaled to the
 limits of position and speed and then shrunk until `allowed` accepts it.
 
+Friction is unknown too, and its model is no better than that of the links. Otherwise a light joint, whose torque is
+mostly friction, would seem to be identified by creeping.
+
 This designer is for the pilot, which knows only limits: it also chooses the centre and the width of the motion. For a
 box that the user has chosen, `fourier_path.design_path` is simpler; its criterion, the prediction of other motions in
 that box, needs the box to be given.
@@ -22,7 +25,8 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.errors import ExcitationError
 
 LOOKED_AT = 120  # samples at which a variation is evaluated
-NOISE = 0.02  # assumed residual of a regression, relative to a joint's RMS torque
+NOISE = 0.02  # assumed residual of a regression, relative to a joint's RMS torque, friction included
+SLOW = 0.1  # rad/s: width of the smoothed Coulomb step
 CENTRES = 48
 WIDEST_OF = 12
 OFFSPRING, PARENTS = 20, 6
@@ -63,10 +67,20 @@ class Design:
 
 
 class PathDesigner:
-    """Designs paths of one period [s] at `rate` with harmonics up to `highest` [Hz]. Raises ExcitationError."""
+    """Designs paths of one period [s] at `rate` with harmonics up to `highest` [Hz]. Raises ExcitationError.
+
+    friction: typical Coulomb friction (joints,) [N m].
+    """
 
     def __init__(
-        self, base: BaseParameters, prior: Prior, rate: float, period: float, highest: float, limits: PathLimits
+        self,
+        base: BaseParameters,
+        prior: Prior,
+        friction: Array,
+        rate: float,
+        period: float,
+        highest: float,
+        limits: PathLimits,
     ) -> None:
         self._count = int(np.floor(highest * period + 1e-9))
         if self._count < 2 or highest > rate / 8:
@@ -74,7 +88,7 @@ class PathDesigner:
                 f"a path of {period:g} s with harmonics up to {highest:g} Hz at {rate:g} samples/s: needs at least two "
                 "harmonics below an eighth of the rate"
             )
-        self._base, self._prior, self._limits = base, prior, limits
+        self._base, self._prior, self._limits, self._friction = base, prior, limits, friction
         self._samples, self._period = round(rate * period), period
         few = min(LOOKED_AT, self._samples)
         self._few = self._waves(few)
@@ -173,11 +187,16 @@ class PathDesigner:
         """Return standard errors after one whole period (base parameters,), relative to the prior's."""
         some = slice(0, None, every)
         Y = self._base.regressor(path.position[:, some], path.velocity[:, some], path.acceleration[:, some])
-        level = np.sqrt(np.mean((Y @ self._prior.value) ** 2, axis=1)) + 1e-6
-        samples = Y.shape[1]
-        rows = Y * self._prior.std / (NOISE * level[:, None, None] * np.sqrt(samples))
-        rows = rows.reshape(-1, self._base.count) * np.sqrt(self._samples)
-        information = rows.T @ rows + np.eye(self._base.count)
+        level = np.sqrt(np.mean((Y @ self._prior.value) ** 2, axis=1) + self._friction**2) + 1e-6
+        weight = np.sqrt(self._samples / Y.shape[1]) / (NOISE * level)
+        rows = Y * self._prior.std * weight[:, None, None]
+        velocity = path.velocity[:, some]
+        friction = np.stack((velocity, np.tanh(velocity / SLOW), np.ones_like(velocity)), axis=2)
+        friction *= (self._friction * weight)[:, None, None]
+        information = np.eye(self._base.count)
+        for row, unknown in zip(rows, friction, strict=True):
+            both = unknown.T @ row
+            information += row.T @ row - both.T @ np.linalg.solve(np.eye(3) + unknown.T @ unknown, both)
         errors: Array = np.sqrt(np.diag(np.linalg.inv(information)))
         return errors
 

@@ -22,14 +22,14 @@ POSITIVE = {
     "torque_scale": 1e-3,
     "added_mass_scale": 1e-2,
     "lag": 1e-5,
-    "back_emf": 1e-2,
+    "lag_ratio": 0.1,
+    "back_emf": 0.5,
 }
 """Kinds of positive parameters and the minimum initial value of each [its unit]."""
 SMALL = {
     "offset": 0.01,
     "zero": 0.02,
     "delay": 1e-3,
-    "lag_difference": 1e-3,
     "base_tilt_x": 0.02,
     "base_tilt_y": 0.02,
 }
@@ -39,23 +39,19 @@ SHAPES = {
     "stribeck_rise": (0.3, 1.0),
     "stribeck_velocity": (0.15, 0.7),
     "load": (0.03, 1.5),
+    "lag": (1e-3, 1.0),
+    "lag_ratio": (1.0, 0.6),
+    "back_emf": (0.92, 0.08),
 }
-"""Priors on the shape of friction near standstill: typical value [its unit] and standard deviation of its logarithm.
+"""Priors on the shape of friction and on drives: typical value [its unit] and standard deviation of its logarithm.
 
-Without them, these parameters would be undetermined for a joint that never moves slowly.
+Without them, these parameters would be undetermined for a joint that never moves slowly, or has little inertia. Early
+in a fit they do not move at all: a lag that has once been taken for zero, while other errors dominate, hardly grows.
 """
-DRIVES = {"lag": (1e-3, 1.0), "back_emf": (0.92, 0.08)}
-"""Priors on the drive, as in SHAPES.
-
-The motion determines most lags to a few microseconds. What it hardly determines is the lag of a joint that moves
-little, and how much of its viscous friction is back-EMF.
-"""
-LATER = 1e-3  # s: standard deviation of the difference between two joints' lags (0.6 of 1 ms each)
 ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
 """Priors on small angles that gravity may not reveal: standard deviations around zero [rad]."""
 RESHAPING = 1.0  # maximum change of their logarithms in one step
 NARROWING, WIDENING = 1.6, 1.1  # maximum decrease and increase of a width's logarithm in one step
-DRIVING = 0.5  # maximum change of a lag difference (in ms) and of the logarithm of a share of back-EMF in one step
 LONGEST = 2.0  # maximum change of any coordinate in one step
 
 
@@ -121,7 +117,6 @@ class ChainCoordinates:
         """
         count = len(self.names)
         bound = np.where([kind in SHAPES for kind in self._kinds], reach * RESHAPING, LONGEST)
-        bound[[kind in ("lag_difference", "back_emf") for kind in self._kinds]] = DRIVING
         least[:count], most[:count] = -bound, bound
         widths = self._widths
         least[widths] = np.maximum(self.room_below(x)[widths], -reach * NARROWING)
@@ -129,16 +124,13 @@ class ChainCoordinates:
 
     @cached_property
     def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices of the parameters with their own prior (friction shapes, drive, small angles), and the means and
-        standard deviations of their coordinates.
+        """Indices of the parameters with their own prior (friction shapes, drives, small angles), their prior means and
+        standard deviations.
         """
-        logarithms, around_zero = SHAPES | DRIVES, ANGLES | {"lag_difference": LATER}
         found = [
-            (i, np.log(logarithms[kind][0]), logarithms[kind][1])
-            if kind in logarithms
-            else (i, 0.0, around_zero[kind] / SMALL[kind])
+            (i, np.log(SHAPES[kind][0]), SHAPES[kind][1]) if kind in SHAPES else (i, 0.0, ANGLES[kind] / SMALL[kind])
             for i, kind in enumerate(self._kinds)
-            if kind in logarithms or kind in around_zero
+            if kind in SHAPES or kind in ANGLES
         ]
         index, typical, spread = np.array(found).reshape(-1, 3).T
         return index.astype(np.int64), typical, spread

@@ -14,14 +14,15 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.coordinates import LONGEST, ChainCoordinates
 from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
+from hil.estimator.chain.model.late_torque import as_moving, complete, lags_of
 from hil.estimator.chain.model.prior import Prior
-from hil.estimator.chain.simulation.drive_times import DriveTimes
 from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation, pieces
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.covariance import Scatter
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise
 from hil.estimator.fit.normal_equations import normal_equations
 from hil.estimator.options import MinimiserOptions
+from hil.estimator.simulation.drive import torque_and_slopes
 
 MINIMISER = MinimiserOptions()
 MOST_KEPT = 1 << 26  # bytes of derivatives
@@ -88,8 +89,11 @@ class ChainProblem:
 
     def run_of(self, period: SettledPeriod, parameters: dict[str, float]) -> ChainRun:
         """Return the simulation's input for a period, with the delay and lag of these parameters."""
-        times = DriveTimes.of(parameters, period.joints)
-        torque, slopes = times.torque(period.torque, period.rate, period.command_to_sample, self.steps)
+        torque, slopes = torque_and_slopes(
+            *(period.torque, period.rate, period.command_to_sample, self.steps),
+            delay=parameters.get("delay", 0.0),
+            lag=lags_of(parameters, self.model.joints),
+        )
         return ChainRun(
             self._thinned(np.moveaxis(torque, 0, 2)),
             self._thinned(np.transpose(slopes, (2, 3, 0, 1))),
@@ -243,6 +247,7 @@ class ChainProblem:
         kept = []
         for part in pieces(len(run.measured)):
             position, derivative = simulation.go_on(run, part)
+            complete(self.model.base, parameters, names, derivative)
             if added is not None:
                 derivative[:, :, names.index(ADDED_MASS)] = derivative[:, :, : added.size] @ added
             if position is None:
@@ -260,8 +265,8 @@ class ChainProblem:
         return self.added[index] if self.added else None
 
     def _of_period(self, index: int, parameters: dict[str, float]) -> dict[str, float]:
-        """Return the parameters of the arm as it was in a period, with what had been added to it."""
-        added = self._added(index)
+        """Return the parameters of the arm as it moved in a period, with what had been added to it."""
+        parameters, added = as_moving(self.model.base, parameters), self._added(index)
         if added is None:
             return parameters
         names, scale = self.model.base.names, parameters[ADDED_MASS]

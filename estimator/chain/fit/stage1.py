@@ -30,7 +30,7 @@ class ChainLinear:
     delay: float
     """Delay of the motors' torque [s]."""
     motions: tuple[PeriodicMotion, ...]
-    """Motion of each period from its lines."""
+    """Motion of each period, computed from its Fourier lines."""
     relative_residual: Array
     """RMS of the torque residual relative to that of the torque (joints,)."""
 

@@ -34,7 +34,7 @@ from hil.estimator.options import CoordinateOptions, CovarianceOptions, Minimise
 from hil.estimator.simulation.arm import steps_per_sample
 
 START = {"stribeck_rise": 0.2, "stribeck_velocity": 0.2, "load": 0.02, "torque_scale": 1.0, ADDED_MASS: 1.0}
-START |= {"back_emf": 0.92}
+START |= {"back_emf": 0.92, "lag_ratio": 1.0}
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class _Spectrum:
     share: Array
     """Leverage (lines,)."""
     stands_for: float
-    """Ratio of the period's number of samples to the number used."""
+    """Ratio of the period's number of samples to the number of those from which the Jacobian was computed."""
 
     def information(self) -> Array:
         """Return the information under white noise, summed over frequencies (coordinates, coordinates)."""

@@ -4,6 +4,10 @@ The columns of the regressor for random motions are processed one by one, from t
 the order first moments, inertias, rotor, mass. A column that depends linearly on the previous ones adds no information:
 its parameter is lumped into theirs (Gautier, Journal of Robotic Systems 8 (1991) 485). In this order the sums stay
 short, such as `moment_x_3 + 0.124 mass_4`, since a link's mass acts like a moment of the previous link.
+
+Columns that are nearly dependent wait until all others are kept, and then the least dependent comes first. With an axis
+that is a degree off its link's y axis, the moment along y would otherwise be kept, and the sums would have large terms
+that nearly cancel.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +22,19 @@ from hil.estimator.chain.model.tilt import GENERIC, tilted
 
 ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, inertias, armature, mass
 SAMPLES = 150
-INDEPENDENT = 1e-7  # fraction of a column's norm not explained by the previous ones above which it is independent
+KINDS = (slice(1, 4), slice(4, 10), slice(10, 11), slice(0, 1))  # moments, inertias, armature, mass
+CLEARLY_INDEPENDENT = 0.1
+"""Norm of the part of a column that the columns kept so far do not explain, above which the column is kept at once.
+
+It is relative to the largest column of the same link and kind.
+"""
+INDEPENDENT = 1e-4
+"""Norm of that part, on the same scale, above which the column is kept in the end.
+
+Angles such as 1.5708 in a description make every parameter slightly independent, but change no torque by more than this
+fraction.
+"""
+LEAST_FACTOR = 1e-7  # of a group
 NOTHING = 1e-9
 
 
@@ -45,23 +61,10 @@ class BaseParameters:
         anywhere = replace(chain, gravity=tilted(chain.gravity, *GENERIC)) if tilts else chain
         Y = _random_regressor(anywhere, seed)
         norm = np.linalg.norm(Y, axis=0)
-        kept: list[int] = []
-        basis = np.zeros((Y.shape[0], 0))
-        for link in range(chain.joints):
-            for term in ORDER:
-                column = TERMS * link + term
-                if norm[column] < NOTHING * norm.max():
-                    continue
-                left = Y[:, column] / norm[column]
-                for _ in range(2):  # the second pass removes rounding errors of the first
-                    left = left - basis @ (basis.T @ left)
-                size = float(np.linalg.norm(left))
-                if size > INDEPENDENT:
-                    kept.append(column)
-                    basis = np.column_stack((basis, left / size))
-        columns = np.array(sorted(kept))
+        order = [TERMS * link + term for link in range(chain.joints) for term in ORDER]
+        columns = _independent(Y / np.maximum(_norms_by_kind(norm), NOTHING * norm.max()), order)
         grouping = np.linalg.lstsq(Y[:, columns] / norm[columns], Y, rcond=None)[0] / norm[columns][:, None]
-        grouping[np.abs(grouping) < INDEPENDENT] = 0.0
+        grouping[np.abs(grouping) < LEAST_FACTOR] = 0.0
         return cls(chain, columns, np.round(grouping, 13))
 
     @property
@@ -100,6 +103,33 @@ class BaseParameters:
     def regressor(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """Return the regressor of the base parameters (joints, samples, base parameters); see `dynamics.regressor`."""
         return regressor(self.chain, position, velocity, acceleration, self.columns)
+
+
+def _norms_by_kind(norm: Array) -> Array:
+    """Return the largest norm of the columns of the same link and kind, for each column."""
+    largest = norm.reshape(-1, TERMS).copy()
+    for kind in KINDS:
+        largest[:, kind] = largest[:, kind].max(axis=1, keepdims=True)
+    return largest.reshape(-1)
+
+
+def _independent(Y: Array, order: list[int]) -> Columns:
+    """Return which columns of `Y`, scaled by the largest of their kind, are independent of each other."""
+    left = Y[:, order].copy()
+    kept: list[int] = []
+
+    def keep(index: int) -> None:
+        kept.append(order[index])
+        unit = left[:, index] / np.linalg.norm(left[:, index])
+        for _ in range(2):  # the second pass removes rounding errors of the first
+            left[:, :] -= np.outer(unit, unit @ left)
+
+    for index in range(len(order)):
+        if np.linalg.norm(left[:, index]) > CLEARLY_INDEPENDENT:
+            keep(index)
+    while (size := np.linalg.norm(left, axis=0)).max() > INDEPENDENT:
+        keep(int(np.argmax(size)))
+    return np.array(sorted(kept))
 
 
 def _random_regressor(chain: Chain, seed: int) -> Array:

@@ -1,6 +1,5 @@
 """Friction and drive model of a chain, and the names of all parameters."""
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,7 +18,6 @@ FRICTION: dict[str, dict[str, str]] = {
 }
 ADDED_MASS = "added_mass_scale"
 """Factor on the torque of a known added mass: ratio of the first joint's assumed to its true torque constant."""
-LAG_DIFFERENCE, BACK_EMF = "lag_difference", "back_emf"
 DRIVE = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
 
 
@@ -30,10 +28,9 @@ class ChainModel:
     zeros: estimate zero errors of the encoders of all joints but the first, as far as gravity reveals them.
     torque_scale: estimate torque scales of all joints but the first, whose torque constant is trusted.
     base_tilt: estimate the tilt of the base; `base` must be made for it (`BaseParameters.of(..., tilts=True)`).
+    lags: estimate each joint's lag, if `drive` has one, as a ratio to that of the first: servo models differ.
+    by_voltage: joints, from 1, that are driven by voltage, whose back-EMF lags too.
     added_mass: some periods were recorded with a known mass added, which reveals the first joint's torque constant too.
-    lags: estimate by how much each joint's torque is later than the first joint's.
-    by_voltage: joints (from 1) that are driven by voltage; the share `back_emf` of their viscous friction is subject to
-        the drive's lag (`hil.estimator.simulation.back_emf`). Always a frozenset after construction.
     Raises ModelError.
     """
 
@@ -45,10 +42,9 @@ class ChainModel:
     base_tilt: bool = False
     added_mass: bool = False
     lags: bool = False
-    by_voltage: Collection[int] = frozenset()
+    by_voltage: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "by_voltage", frozenset(self.by_voltage))
         if self.friction not in FRICTION:
             raise ModelError(f"friction model {self.friction!r}: a chain supports {', '.join(FRICTION)}")
         if self.drive not in DRIVE:
@@ -74,14 +70,15 @@ class ChainModel:
             terms += [(f"zero_{joint}", "rad") for joint in self._numbers[1:]]
         if self.torque_scale:
             terms += [(f"torque_scale_{joint}", "1") for joint in self._numbers[1:]]
-        if self.lags:
-            terms += [(f"{LAG_DIFFERENCE}_{joint}", "s") for joint in self._numbers[1:]]
-        terms += [(f"{BACK_EMF}_{joint}", "1") for joint in self._numbers if joint in self.by_voltage]
         if self.base_tilt:
             terms += [(name, "rad") for name in TILT]
         if self.added_mass:
             terms.append((ADDED_MASS, "1"))
-        return terms + [(name, "s") for name in DRIVE[self.drive]]
+        terms += [(f"back_emf_{joint}", "1") for joint in self.by_voltage]
+        terms += [(name, "s") for name in DRIVE[self.drive]]
+        if self.lags and "lag" in DRIVE[self.drive]:
+            terms += [(f"lag_ratio_{joint}", "1") for joint in self._numbers[1:]]
+        return terms
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,8 +95,7 @@ class ChainModel:
     def description(self) -> str:
         """Text naming the friction, options and drive."""
         words = {"zeros": self.zeros, "torque scales": self.torque_scale, "base tilt": self.base_tilt}
-        words |= {"lags": self.lags and self.joints > 1, "back-EMF": bool(self.by_voltage)}
-        words |= {"added mass": self.added_mass}
+        words |= {"added mass": self.added_mass, "lags": self.lags, "back-EMF": bool(self.by_voltage)}
         return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))
 
     @property

@@ -4,7 +4,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.chain_model import ChainModel
-from hil.estimator.chain.simulation.drive_times import DriveTimes
+from hil.estimator.chain.model.late_torque import as_moving, lags_of
 from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import PeriodicityError
@@ -27,12 +27,12 @@ def predict(model: ChainModel, parameters: dict[str, float], period: SettledPeri
     steps = steps_per_sample(period.rate)
     step = 1.0 / (period.rate * steps)
     # Commands take effect `command_to_sample` before the sample of their index, plus `delay`; lumped into a lag.
-    times = DriveTimes.of(parameters, joints)
-    lag = np.maximum(times.lag + times.delay - period.command_to_sample, 1e-5)
+    late = lags_of(parameters, joints) + parameters.get("delay", 0.0) - period.command_to_sample
+    lag = np.maximum(late, 1e-5)
     fallen = 1.0 - np.exp(-step / lag)
     share = fallen * lag / step
     start = np.stack((period.filled()[:, 0], np.zeros(joints)))
-    simulation = Simulation(model.base, parameters, start, np.zeros((2, joints)))
+    simulation = Simulation(model.base, as_moving(model.base, parameters), start, np.zeros((2, joints)))
     missing, slopes = np.full((1, joints), np.nan), np.zeros((1, steps, 2, joints))
     torque = np.empty((1, steps, joints))
     former = start.copy()

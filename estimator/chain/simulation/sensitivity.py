@@ -10,8 +10,7 @@ from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import places, split
 from hil.estimator.chain.model.kernels import room
 from hil.estimator.chain.model.tilt import TILT, tilt_slopes, tilted
-from hil.estimator.chain.simulation.drive_times import DriveTimes
-from hil.estimator.chain.simulation.stepping import JOINT_TERMS, LATE, SHARE, VISCOUS, run
+from hil.estimator.chain.simulation.stepping import JOINT_TERMS, run
 
 ABSENT = {"coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}
 """Values that disable a term that the model lacks; zero for all other terms."""
@@ -25,7 +24,7 @@ class ChainRun:
     torque: Array
     """Mean motor torque over each step after each sample, unscaled (samples, steps, joints) [N m]."""
     slopes: Array
-    """Derivatives of `torque` by delay, and by lag or lag difference (samples, steps, 2, joints) [N m/s]."""
+    """Derivatives of `torque` by delay and by lag (samples, steps, 2, joints) [N m/s]."""
     measured: Array
     """Measured angles (samples, joints) [rad]; NaN where a sample is missing."""
     step: float
@@ -60,13 +59,10 @@ class Simulation:
         at = {name: index for index, name in enumerate(names)}
         rotation, translation, axis, gravity = base.chain.arrays
         tilt = [parameters.get(name, 0.0) for name in TILT]
-        p = np.array([[parameters.get(f"{t}_{j + 1}", ABSENT.get(t, 0.0)) for j in range(n)] for t in JOINT_TERMS])
-        p[LATE] = DriveTimes.of(parameters, n).total
-        link, armature = split(base.chain, base.as_all(np.array([parameters[name] for name in base.names])))
         self._arm = (
             (rotation, translation, axis, tilted(gravity, *tilt)),
-            (link, armature - p[SHARE] * p[VISCOUS] * p[LATE]),
-            p,
+            split(base.chain, base.as_all(np.array([parameters[name] for name in base.names]))),
+            np.array([[parameters.get(f"{t}_{j + 1}", ABSENT.get(t, 0.0)) for j in range(n)] for t in JOINT_TERMS]),
             np.array(start, dtype=np.float64, order="C"),
         )
         # Unwanted derivatives are written to a spare column after all others.
@@ -74,7 +70,12 @@ class Simulation:
         self._columns = (
             where[places(n, base.columns)],
             np.array([[at.get(f"{term}_{joint + 1}", width) for joint in range(n)] for term in JOINT_TERMS]),
-            np.array([at.get("delay", width), at.get("lag", width)]),
+            np.array(
+                [
+                    [at.get("delay", width)] * n,
+                    [at.get(f"lag_ratio_{j + 1}", at.get("lag", width)) for j in range(n)],
+                ]
+            ),
             np.array([at[name] for name in TILT if name in at], dtype=np.int64),
             tilt_slopes(gravity, *tilt) if TILT[0] in at else np.zeros((2, 3)),
         )
@@ -98,7 +99,7 @@ class Simulation:
         """Simulate the next `piece` of the samples.
 
         Returns the angles (samples, joints) [rad], None if the motion diverges, and their derivatives (samples, joints,
-        causes).
+        causes). In place of that by a `lag_ratio` is the one by this joint's own lag, which that by `lag` excludes.
         """
         torque, measured = run_.torque[piece], run_.measured[piece]
         position = np.empty(measured.shape)

@@ -1,10 +1,9 @@
 """The compiled motion of a chain under given motor torques, and its derivatives by parameters and initial state.
 
-Friction and drive are those of `hil.estimator.simulation.arm`, including the back-EMF of joints driven by voltage
-(`hil.estimator.simulation.back_emf`), whose delay is given as a smaller armature. Each step uses that module's
-Rosenbrock method ROS2, with the second stage written so that both stages need the regressor at one acceleration only.
-With f the torques minus friction, S the slopes of friction, ID inverse dynamics, M the mass matrix, and primes for
-quantities at the end predicted by stage 1,
+Friction and drive are those of `hil.estimator.simulation.arm`. Each step uses that module's Rosenbrock method ROS2,
+with the second stage written so that both stages need the regressor at one acceleration only. With f the torques minus
+friction, S the slopes of friction, ID inverse dynamics, M the mass matrix, and primes for quantities at the end
+predicted by stage 1,
 
     ID(q, v, k) + gamma h S k = f        ID(q', v', l + 2 k) + gamma h S' l = f'
     v += h (3 k + l) / 2                 q += h v + h^2 k / 2
@@ -29,12 +28,11 @@ from hil.estimator.compiled import compiled
 from hil.estimator.simulation.arm import FADED, GAMMA
 
 # Rows of the joints' constants.
-VISCOUS, COULOMB, OFFSET, WIDTH, RISE, FADING, LOAD, SCALE, ZERO, SHARE, LATE = range(11)
+VISCOUS, COULOMB, OFFSET, WIDTH, RISE, FADING, LOAD, SCALE, ZERO = range(9)
 JOINT_TERMS = (
     *("viscous", "coulomb", "offset", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load"),
-    *("torque_scale", "zero", "back_emf", "lag_difference"),
+    *("torque_scale", "zero"),
 )
-"""`lag_difference` stands for the total delay of the joint's torque, of which it is a part (`Simulation`)."""
 NEAR = 6.0  # distance from standstill within which steps may be divided, in widths of friction's step
 CROSSED = 1.0  # number of such widths that a joint may cross in one step
 WORST = 1e4  # rad or rad/s: a simulation that reaches this has diverged
@@ -43,11 +41,10 @@ WORST = 1e4  # rad or rad/s: a simulation that reaches this has diverged
 def _left(p: Any, j: int, v: float, t: float, out: Any) -> None:
     """Compute the torque of drive j minus friction and offset, the slope of friction, and its shape, into `out`."""
     motor = p[SCALE, j] * t
-    carried = motor - p[SHARE, j] * p[VISCOUS, j] * v  # by the gears: torque of the voltage minus that of the back-EMF
     ratio = v / p[FADING, j]
     past = ratio * ratio
     bump = math.exp(-past) if past < FADED else 0.0
-    level = p[COULOMB, j] * (1.0 + p[RISE, j] * bump) + p[LOAD, j] * abs(carried)
+    level = p[COULOMB, j] * (1.0 + p[RISE, j] * bump) + p[LOAD, j] * abs(motor)
     bend = math.tanh(v / p[WIDTH, j])
     bent = (1.0 - bend * bend) / p[WIDTH, j]
     out[0, j] = motor - p[OFFSET, j] - p[VISCOUS, j] * v - level * bend
@@ -65,45 +62,39 @@ def _direct(
     slopes: Any,
     times: Any,
     ghk: float,
-    acceleration: float,
     by: Any,
     row: Any,
 ) -> None:
     """Compute the direct derivatives of joint j's step equation by the drive's parameters, and by v into `by`.
 
-    left: see `_left`. slopes: derivatives of the torque by delay and by lag. times: their columns. ghk: gamma h times
-    the stage's acceleration. acceleration: of the joint, as inverse dynamics has it.
+    left: see `_left`. slopes: derivatives of the torque by delay and by lag. times: columns of the delay and the
+    lag of each joint. ghk: gamma h times the stage's acceleration.
     """
     scale, width, fading = p[SCALE, j], p[WIDTH, j], p[FADING, j]
-    share, late = p[SHARE, j], p[LATE, j]
-    generated = share * p[VISCOUS, j]
-    motor = scale * t - generated * v
+    motor = scale * t
     sign = 1.0 if motor > 0.0 else -1.0
     bump, bend = left[2, j], left[3, j]
     coulomb, rise, load = p[COULOMB, j], p[RISE, j], p[LOAD, j]
     level = coulomb * (1.0 + rise * bump) + load * abs(motor)
     bent = (1.0 - bend * bend) / width
-    bump_v = -2.0 * coulomb * rise * bump * v / (fading * fading)
-    level_v = bump_v - load * sign * generated
+    level_v = -2.0 * coulomb * rise * bump * v / (fading * fading)
     bent_v = -2.0 * bend * bent / width
     # The equation is ID - left + ghk slope = 0; each entry: the decrease of `left` plus ghk times the slope's increase.
     by[j] = p[VISCOUS, j] + level_v * bend + level * bent + ghk * (level_v * bent + level * bent_v)
     shape = bend + ghk * bent
-    by_generated = -late * acceleration - load * sign * v * shape
-    row[at[VISCOUS, j]] = v + ghk + share * by_generated
-    row[at[SHARE, j]] = p[VISCOUS, j] * by_generated
+    row[at[VISCOUS, j]] = v + ghk
     row[at[COULOMB, j]] = (1.0 + rise * bump) * shape
     row[at[OFFSET, j]] = 1.0
     bend_w = -v / width * bent
     bent_w = -(bent + 2.0 * bend * bend_w) / width
     row[at[WIDTH, j]] = level * (bend_w + ghk * bent_w)
     row[at[RISE, j]] = coulomb * bump * shape
-    row[at[FADING, j]] = -bump_v * v / fading * shape
+    row[at[FADING, j]] = -level_v * v / fading * shape
     row[at[LOAD, j]] = abs(motor) * shape
     by_motor = load * sign * shape - 1.0
     row[at[SCALE, j]] = by_motor * t
-    row[times[0]] = by_motor * scale * slopes[0, j] - generated * acceleration
-    row[times[1]] = row[at[LATE, j]] = by_motor * scale * slopes[1, j] - generated * acceleration
+    row[times[0, j]] = by_motor * scale * slopes[0, j]
+    row[times[1, j]] = by_motor * scale * slopes[1, j]
 
 
 # These take whole arrays and indices: a view of a row costs as much as its arithmetic.
@@ -209,7 +200,7 @@ def _follow(
     differentiate(chain[3], work)
     regress(base, total, work, direct)
     for j in range(v.size):
-        _direct(p, at, j, v[j], t[j], solve[0], slopes, times, gh * found[j], total[j], by, direct[j])
+        _direct(p, at, j, v[j], t[j], solve[0], slopes, times, gh * found[j], by, direct[j])
         work[7][j, j] += by[j]
     for j in range(v.size):
         column = at[ZERO, j]
@@ -250,8 +241,7 @@ def _broken(p: Any, v: Any, k: Any, t: Any, solve: Any, step: float, most: int) 
         if p[COULOMB, j] > 0.0 and (min(abs(v[j]), abs(ahead)) < NEAR * width or v[j] * ahead < 0.0):
             bend = math.tanh(ahead / width)
             steepness = (left[1, j] - p[VISCOUS, j]) * width  # level of dry friction times (1 - bend^2) before the step
-            carried = p[SCALE, j] * t[j] - p[SHARE, j] * p[VISCOUS, j] * v[j]
-            level = p[COULOMB, j] * (1.0 + p[RISE, j] * left[2, j]) + p[LOAD, j] * abs(carried)
+            level = p[COULOMB, j] * (1.0 + p[RISE, j] * left[2, j]) + p[LOAD, j] * abs(p[SCALE, j] * t[j])
             wrong = abs(level * (bend - left[3, j]) - steepness * (ahead - v[j]) / width)
             inertia = 1.0 / inverse[j, j] + gh * (level * (1.0 - bend * bend) - steepness) / width
             needed = max(needed, step * wrong / (CROSSED * width * max(inertia, 1e-12)))

@@ -54,8 +54,12 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
         print("Regression on the measured torque: no motion was simulated, so there is no position residual.")
     if result.model_choice is not None:
         choice = result.model_choice
-        times = f"error {choice.error_divided_by:.3g} times smaller than with the simplest model"
-        print(f"Chosen on held-out segments: {choice.chosen}, {times}.")
+        compared = (
+            "the simplest model"
+            if choice.chosen == choice.plainest
+            else f"whose error, compared with that of the simplest model, is {_times(1.0 / choice.error_divided_by)}"
+        )
+        print(f"Chosen on held-out segments: {choice.chosen}, {compared}.")
     if result.physical is not None:
         print("\n".join(physical_lines(result.physical)))
     for note in result.notes:

@@ -63,6 +63,8 @@ class Difference:
     only_after: tuple[str, ...]
     detectable: Mapping[str, float] = field(default_factory=dict)
     trust: tuple[str | None, str | None] = (None, None)
+    other_joints: tuple[str, ...] = ()
+    """Joints that are described differently in the two, as sentences: they may not be the same arm."""
 
     @property
     def changed(self) -> tuple[Change, ...]:
@@ -71,13 +73,14 @@ class Difference:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """One sentence for each of the two models that should not be trusted as it is."""
-        return tuple(
+        """Sentences on joints that differ, and on each of the two models that should not be trusted as it is."""
+        untrusted = tuple(
             f"{name}: trust this model: {trust}. Its values may be biased by more than their standard errors, so a "
             "change may come from the model instead of the arm; the report says why."
             for name, trust in zip((self.before, self.after), self.trust, strict=True)
             if trust not in (None, "yes")
         )
+        return (*self.other_joints, *untrusted)
 
     def to_json(self) -> dict[str, Any]:
         """The changes as plain values; the JSON writer turns infinities into null."""
@@ -95,6 +98,15 @@ def diff_runs(
     rows = friction_changes(models, (_covariance(before), _covariance(after)))
     difference = diff_models(*models, str(before), str(after), false_alarms, least_share, rows)
     return replace(difference, trust=(_trust(before), _trust(after)))
+
+
+def _other_joints(before: ArmModel, after: ArmModel) -> tuple[str, ...]:
+    return tuple(
+        f"Joint {number} was {old.name!r} with an {old.servo} and is {new.name!r} with an {new.servo}: if these are "
+        "two arms, the changes are the difference between them."
+        for number, (old, new) in enumerate(zip(before.joints, after.joints, strict=True), 1)
+        if (old.name, old.servo) != (new.name, new.servo)
+    )
 
 
 def _trust(path: Path) -> str | None:
@@ -160,6 +172,7 @@ def diff_models(
         tuple(name for name in before.values if name not in after.values),
         tuple(name for name in after.values if name not in before.values),
         _detectable(before, friction, false_alarms / max(len(p), 1)),
+        other_joints=_other_joints(before, after),
     )
 
 

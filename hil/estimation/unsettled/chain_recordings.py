@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 FITTED_SHARE = 0.75  # of each recording, for the check on the rest
 EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
 TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative error of the torque on the last part: trusted, rejected
-UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
+UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder", "lags")
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,6 @@ def estimate_chain_recordings(
     model = ChainModel(
         *(base, wanted.fixed_friction, wanted.drive, wanted.zeros, wanted.torque_scale and base.chain.joints > 1),
         base_tilt=wanted.base_tilt,
-        lags=base.chain.joints > 1,
-        by_voltage=range(1, base.chain.joints + 1) if config.columns.drive in {"voltage", "pwm"} else (),
     )
     found = identify_recordings(recordings, model, prior)
     foretold = _held_out(recordings, model, prior)
@@ -184,8 +182,8 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     if not found.reached:
         trust = "with care" if trust == "yes" else trust
         sentences.append(
-            "The fit stopped before its minimum, where a joint sticks and breaks away; the standard errors include the "
-            "distance that remains. Record faster motion, so that fewer joints stick."
+            "The fit stopped short of its minimum, where a joint sticks and breaks away; the standard errors include "
+            "the distance that remains. Record faster motion, so that fewer joints stick."
         )
     return Verdict(trust, weakest, tuple(sentences))
 

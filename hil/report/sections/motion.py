@@ -54,7 +54,7 @@ def next_commands(data: RunData) -> Section:
             f"hil export {run} --format mjcf --samples 100 --out arms{length}",
         ),
         ("estimate again, after a change of [model] in its config.toml", f"hil estimate {run}"),
-        ("what changed since another run", f"hil diff OTHER_RUN {run}"),
+        ("what changed compared with another run", f"hil diff OTHER_RUN {run}"),
         ("other methods on the same recording", f"hil compare {run}"),
     )
     return Section("next", "What next", tables=(Table(("", ""), rows, 2),))

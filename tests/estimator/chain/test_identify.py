@@ -104,19 +104,16 @@ def test_derivatives_are_those_of_the_simulation(setup: bench.Setup) -> None:
     parameters = dict(zip(base.names, setup.truth.tolist(), strict=True))
     likely = {"viscous": 0.05, "coulomb": 0.05, "offset": 0.01, "coulomb_width": 0.05, "stribeck_rise": 0.3}
     likely |= {"stribeck_velocity": 0.2, "load": 0.03, "torque_scale": 1.02, "zero": 0.01}
-    likely |= {"back_emf": 0.9, "lag_difference": 2e-4}
     parameters |= {f"{term}_{joint + 1}": likely[term] for term in JOINT_TERMS for joint in range(joints)}
-    parameters |= {"delay": 1e-4, "lag": 1e-3}
-    names = tuple(parameters)
+    names = (*parameters, "delay", "lag")
     torque, late = 0.5 * rng.standard_normal((2, samples, steps, joints))
-    slopes = np.stack((np.zeros_like(late), late), axis=2)
+    slopes = np.stack((late, -late), axis=2)
     measured = 0.1 * rng.standard_normal((samples, joints))
     gain = np.array([[0.05] * joints, [0.4] * joints])
     start = np.stack((np.array(setup.arm.start), np.full(joints, 0.3)))
 
-    def run(values: dict[str, float], begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        lags = np.array([values["lag"] + values[f"lag_difference_{joint + 1}"] for joint in range(joints)])
-        recorded = ChainRun(torque + (lags - 1.2e-3) * late, slopes, measured, 1 / 1200)
+    def run(values: dict[str, float], begin: np.ndarray, nudge: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        recorded = ChainRun(torque + nudge * late, slopes, measured, 1 / 1200)
         simulation = Simulation(base, values, begin, gain, names)
         position, derivative = simulation.go_on(recorded, slice(0, samples))
         assert position is not None
@@ -133,6 +130,8 @@ def test_derivatives_are_those_of_the_simulation(setup: bench.Setup) -> None:
         nudge[index // joints, index % joints] = step
         differences = (run(parameters, start + nudge)[0] - run(parameters, start - nudge)[0]) / (2 * step)
         np.testing.assert_allclose(derivative[:, :, len(names) + index], differences, rtol=1e-4, atol=2e-6)
+    differences = (run(parameters, start, step)[0] - run(parameters, start, -step)[0]) / (2 * step)
+    np.testing.assert_allclose(derivative[:, :, names.index("delay")], differences, rtol=1e-4, atol=2e-6)
 
 
 def test_filtered_least_squares_takes_any_recording(setup: bench.Setup, period: SettledPeriod) -> None:

@@ -269,8 +269,8 @@ def test_an_unfinished_calibration_says_so() -> None:
     fit = CalibrationFit(residual_rms_ticks=((0.29,), (0.29,)), misfit=1.0, joints=1)
     result = CalibrationResult(1, {}, {}, fit)
     said = [" ".join(calibration_lines(replace(result, fit=replace(fit, reached=each)))) for each in (True, False)]
-    assert "stopped before its minimum" not in said[0]
-    assert "stopped before its minimum" in said[1]
+    assert "stopped short of its minimum" not in said[0]
+    assert "stopped short of its minimum" in said[1]
 
 
 def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
@@ -284,4 +284,4 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
     for estimate.reached in (True, False):
         verdicts.append(_verdict(config, estimate, known, np.full(4, 1e-3), []))
     assert [verdict.trust for verdict in verdicts] == ["yes", "with care"]
-    assert "stopped before its minimum" in verdicts[1].sentences[-1]
+    assert "stopped short of its minimum" in verdicts[1].sentences[-1]

@@ -61,6 +61,13 @@ def test_terms_of_one_model_alone_are_named() -> None:
     assert diff_models(richer, MODEL).only_before == ("load_1",)
 
 
+def test_joints_with_other_servos_may_be_another_arm() -> None:
+    other = replace(MODEL, joints=(FACTS, replace(FACTS, servo="XM540-W270")))
+    (said,) = diff_models(MODEL, other).doubts
+    assert said.startswith("Joint 2 was 'shoulder' with an XM430-W350 and is 'shoulder' with an XM540-W270")
+    assert not diff_models(MODEL, MODEL).doubts
+
+
 def test_arms_of_other_joint_count_are_refused(tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
     one = replace(MODEL, joints=(FACTS,))
     monkeypatch.setattr("hil.estimation.changes.diff.read_model", lambda path: one if "one" in str(path) else MODEL)

@@ -49,6 +49,8 @@ def test_a_difference_repeats_doubtful_verdicts() -> None:
     (doubt,) = Difference("a", "b", (), (), (), trust=("yes", "with care")).doubts
     assert doubt.startswith("b: trust this model: with care")
     assert Difference("a", "b", (), (), ()).doubts == ()
+    other = Difference("a", "b", (), (), (), other_joints=("Joint 1 was ...",))
+    assert other.doubts == ("Joint 1 was ...",)
 
 
 def test_a_choice_is_compared_with_the_plainest_model_that_could_be_judged() -> None:

@@ -7,6 +7,7 @@ import pytest
 
 from hil.config.schema import Config
 from hil.drivers.errors import PortLost
+from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import Cause, ExperimentError, NotSettled, SafetyStop, StopRequested
 from hil.plan.brake import Brake, braking_gains, may_brake
@@ -19,6 +20,20 @@ def test_full_current_at_half_of_the_velocity_limit(arm: Arm) -> None:
     """The limits of the joints are 1.2 A and 15 rad/s, 0.8 A and 20 rad/s."""
     assert braking_gains(arm()) == pytest.approx([1.2 / 7.5, 0.8 / 10.0])
     assert Brake(arm()).goals(MOVING) == pytest.approx([-1.2 * 3.0 / 7.5, 0.8 * 4.0 / 10.0])
+
+
+def test_a_light_joint_is_not_thrown_back(arm: Arm) -> None:
+    """With a velocity limit of 0.2 rad/s, the full current at half of it would reverse a light joint within 12 ms."""
+    config = arm()
+    joints = [joint.model_copy(update={"velocity_limit": 0.2}) for joint in config.joints]
+    slow = config.experiment.model_copy(update={"rate": 100.0})
+    config = config.model_copy(update={"joints": joints, "experiment": slow})
+    goals = Brake(config).goals(MOVING._replace(velocity=(0.3, -0.3)))
+    assert goals is not None
+    for goal, joint, velocity in zip(goals, config.joints, (0.3, -0.3), strict=True):
+        rotor = 0.5 * servo_prior(joint.joint.servo).armature.median
+        change = goal * joint.torque_per_goal * 0.012 / rotor
+        assert change == pytest.approx(-velocity), "stopped by one brake, not reversed"
 
 
 def test_never_more_than_the_current_limit(arm: Arm) -> None:

@@ -9,7 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from hil.config.schema import load_config
+from hil.drivers.state import State
 from hil.errors import ExperimentError, SafetyStop, StopRequested
+from hil.experiment.lowering import Lowering
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress
 from hil.runs.recording import Phase, load_samples
@@ -59,6 +61,22 @@ def test_ctrl_c_lowers_the_arm_to_its_rest_pose(tmp_path: Path) -> None:
     assert np.abs(lowered["goal_current"][-1]).max() < 0.1  # the arm does not drop when torque is cut
     assert np.abs(lowered["velocity"][120:]).max() < 1.0  # braked, then slowly
     assert len(lowered) / 400 < 12.0
+
+
+def test_a_second_signal_cuts_torque_on_the_way_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    look, seen = Lowering.look, []
+
+    def signalled(self: Lowering, index: int, state: State, gap: float, *, between: bool = False) -> None:
+        seen.append(index)
+        if index == 100:
+            os.kill(os.getpid(), signal.SIGINT)
+        look(self, index, state, gap, between=between)
+
+    monkeypatch.setattr(Lowering, "look", signalled)
+    error, samples = play(tmp_path, TEXT, (AT_S,))
+    lowered = samples[samples["phase"] == Phase.LOWERING]
+    assert any("Torque was cut while the arm was being lowered" in note for note in error.__notes__)
+    assert len(lowered) == 101 and set(lowered["period"]) == {-1}
 
 
 def test_a_joint_held_for_a_moment_is_noticed_and_the_arm_lowered(tmp_path: Path) -> None:

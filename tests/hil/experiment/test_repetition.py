@@ -114,6 +114,20 @@ def test_the_second_period_may_differ_from_the_first() -> None:
     assert unlike_at(periods + np.array([0.0, 0.0, 11.0, 0.0])[:, None, None]) is not None
 
 
+@pytest.mark.parametrize("rms", [0.0, 0.01])
+def test_in_the_second_half_of_the_second_period_differences_no_longer_grow(rms: float) -> None:
+    periods = drifting(6, rms)
+    periods[1, 0, :100] += 0.01  # a transient
+    allowed = 10.0 * math.hypot(rms, 0.01) + 0.05
+    periods[1, 0, 150:] += 1.3 * allowed
+    assert unlike_at(periods) == (1, 152, 0)
+    periods[1, 0, 150:] -= 0.6 * allowed
+    assert unlike_at(periods[:2]) is None
+    earlier = drifting(6, rms)
+    earlier[1, 0, 50:] += 1.0
+    assert unlike_at(earlier[:2]) is None, "it may be a transient"
+
+
 def test_other_torques_may_give_another_motion() -> None:
     """A held-out segment follows the one that is fitted."""
     first, second = drifting(4, 1e-3), drifting(5, 1e-3) * 0.3 + 0.5

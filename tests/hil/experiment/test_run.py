@@ -19,6 +19,7 @@ from hil.experiment.stream import Progress, Watch
 from hil.fakes.protocol_fake import FakeSerial
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
+from tests.support.short_experiment import CONFIG, short_config
 
 Arm = Callable[..., Config]
 
@@ -87,6 +88,21 @@ def test_a_warm_up_is_played_once_before_the_first_multisine_and_used_for_nothin
     assert np.array_equal(first[1:], second[1:])
     periodic = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == 0) & (samples["period"] == 1)
     assert np.array_equal(samples["goal_current"][periodic][1:], second[1:]), "the warm-up is the same motion"
+
+
+def test_further_periods_follow_the_settled_one_and_progress_is_shown_20_times_a_second(tmp_path: Path) -> None:
+    config = short_config(CONFIG.read_text(encoding="utf-8"))
+    last = []
+    for further in (0, 2):
+        experiment = config.experiment.model_copy(update={"periods": 1 + further})
+        shown: list[Progress] = []
+        made = run(config.model_copy(update={"experiment": experiment}), tmp_path / f"{further}", shown.append)
+        samples = load_samples(made.samples_path, 2)
+        assert set(samples["period"][samples["phase"] != Phase.PERIODIC]) == {-1}
+        last.append(samples["period"].max())
+        usual = [progress.taken for progress in shown if progress.state.slow is None]
+        assert set(np.diff(usual)) <= {10, 20} and usual[0] == 10, "at 200 Hz; slow states take the place of some"
+    assert last[1] == last[0] + 2
 
 
 def test_two_runs_of_one_seed_are_the_same_to_the_last_bit(arm: Arm, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hil import fakes
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import CHECK_S, ServoBus
 from hil.errors import Cause, ConfigError, SafetyStop, StopRequested
@@ -86,6 +87,7 @@ def test_a_slow_adapter_leaves_exchanges_out_and_delays_no_sample(
 @pytest.mark.parametrize(("rate", "count"), [(20.0, 5), (33.0, 3), (60.0, 1), (100.0, 1), (400.0, 1)])
 def test_exchanges_per_sample(arm: Arm, rate: float, count: int) -> None:
     config = arm(("rate = 400.0", f"rate = {rate}"), ("band = [0.5, 6.0]", "band = [0.5, 4.0]"))
+    fakes.register_for(config.url)
     with ServoBus.open(config.bus) as bus:
         assert bus.exchanges_per_sample == count
 

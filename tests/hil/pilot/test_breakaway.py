@@ -1,5 +1,6 @@
 """Joints that friction holds get more torque from run to run, between narrow limits, up to the current limit."""
 
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -112,6 +113,30 @@ def test_it_gives_up_only_at_the_current_limit(config: Config, tmp_path: Path) -
     with pytest.raises(ExperimentError, match="Elbow did not move by 26 encoder steps"):
         searched(config, tmp_path, player)._pilot()
     assert player.torques[-1][1] == pytest.approx(most_torque(config)[1])
+
+
+class Jumpy(Held):
+    """A player of an arm whose elbow exceeds its velocity limit as soon as it breaks away."""
+
+    def play(self, config: Config, folder: object, name: str, found: object, arms: object) -> Played:
+        played = super().play(config, folder, name, found, arms)
+        if played.step.peak_torque[1] <= self.friction[1]:
+            return played
+        played.seen.swing[1] = 0.01  # type: ignore[union-attr]
+        seen = np.zeros((4, 2))
+        seen[2] = 0.0, 1.1 * config.joints[1].velocity_limit
+        stop = SafetyStop("Elbow moves at ...", Cause.VELOCITY)
+        return replace(played, step=replace(played.step, seen=seen, ended=str(stop)), error=stop)
+
+
+def test_more_torque_does_not_help_a_joint_that_exceeds_its_velocity_limit(config: Config, tmp_path: Path) -> None:
+    player = Jumpy([1e3, 0.3 * most_torque(config)[1]])
+    with pytest.raises(ExperimentError, match=r"Elbow exceeded the velocity limit while .* raise velocity_limit"):
+        searched(config, tmp_path, player)._pilot()
+    torques = np.array(player.torques)[:, 1]
+    first = int(np.argmax(torques > player.friction[1]))
+    assert torques[first + 1] == pytest.approx(OPTIONS.torque_after_limit * torques[first])
+    assert torques.max() <= OPTIONS.breakaway_raise * player.friction[1]
 
 
 def test_without_any_torque_that_is_safe_in_the_whole_range_it_begins_between_narrow_limits(

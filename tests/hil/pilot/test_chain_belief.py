@@ -18,14 +18,11 @@ from tests.support.paths import CONFIGS
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory: pytest.TempPathFactory) -> Config:
-    """A leg whose second axis is nearly parallel to its first.
-
-    Its base parameters are many times as large as those of the links, and nearly cancel.
-    """
+    """A leg whose second axis is nearly parallel to its first, so that the weights of some links nearly cancel."""
     folder: Path = tmp_path_factory.mktemp("leg")
     urdf = (CONFIGS / "leg.urdf").read_text(encoding="utf-8")
     first, _, rest = urdf.partition('<axis xyz="0 1 0"/>')
-    (folder / "leg.urdf").write_text(first + '<axis xyz="0.999998 0.002 0"/>' + rest, encoding="utf-8")
+    (folder / "leg.urdf").write_text(first + '<axis xyz="0.99875 0.05 0"/>' + rest, encoding="utf-8")
     (folder / "leg.toml").write_text((CONFIGS / "leg.toml").read_text(encoding="utf-8"), encoding="utf-8")
     return chain_config(load_config(folder / "leg.toml"))
 
@@ -51,15 +48,12 @@ def recorded(config: Config, belief: ChainBelief, arm: int, share: float) -> np.
 
 
 def test_the_weight_in_any_pose_becomes_better_known(config: Config, prior: ChainBelief) -> None:
-    """However large the base parameters are: errors of each by itself would be amplified."""
-    moments = [name.startswith("moment") for name in prior.arms.base.names]
-    assert np.abs(prior.arms.rigid[0, moments]).max() > 0.5  # kg m, of an arm of 0.4 kg and 0.3 m
     learned = prior.learn(config, recorded(config, prior, 3, 0.3))
     for pose in _poses(config):
         before, after = (weights(belief.arms.first(SIMULATED), pose) for belief in (prior, learned))
-        true = weights(prior.arms.chosen([3]), pose)[0] * prior.arms.drive[3, 4]
+        true = weights(prior.arms.chosen([3]), pose)[0] / prior.arms.drive[3, 4]
         assert np.all(after.std(axis=0) < before.std(axis=0))
-        assert np.all(np.abs(after.mean(axis=0) - true) < 4 * after.std(axis=0) + 0.02)
+        assert np.all(np.abs(after.mean(axis=0) - true) < before.std(axis=0) + 0.02)
 
 
 def test_no_joint_becomes_lighter_than_an_arm_can_be(config: Config, prior: ChainBelief) -> None:
@@ -81,6 +75,6 @@ def test_no_joint_becomes_lighter_than_an_arm_can_be(config: Config, prior: Chai
 def test_an_arm_much_lighter_than_described_is_believed(config: Config, prior: ChainBelief) -> None:
     belief = replace(prior, arms=prior.arms.first(200))
     linear = np.concatenate((0.1 * belief.arms.rigid, belief.arms.drive[:, :3].reshape(200, -1)), axis=1)
-    np.testing.assert_allclose(
-        belief._arms(linear).rigid.mean(axis=0), linear[:, : prior.arms.base.count].mean(axis=0), rtol=0.2
-    )
+    count = prior.arms.base.count
+    scale = np.abs(linear[:, :count]).mean(axis=0)
+    np.testing.assert_allclose((belief._arms(linear).rigid - linear[:, :count]).mean(axis=0) / scale, 0.0, atol=0.1)

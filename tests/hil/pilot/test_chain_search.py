@@ -158,7 +158,7 @@ def test_where_little_of_a_path_is_safe_another_one_with_more_reserve_is_tried(
     found = search.safe(search.config, (1.0, 0.64, 0.4, 0.18))
     assert found.share == 0.64
     assert search.paths.identify is not designed.identify
-    assert said == ["Designed another path, which leaves more reserve to the limits."]
+    assert said == ["Designed another path, which stays farther from the limits."]
     (reserve,) = roomier
     assert reserve.clearance == pytest.approx(designed.reserve.clearance + 0.008)
     assert reserve.torque < designed.reserve.torque and reserve.position > designed.reserve.position
@@ -171,7 +171,7 @@ def test_where_little_of_a_path_is_safe_another_one_with_more_reserve_is_tried(
 def test_an_arm_too_heavy_for_any_path_is_refused_with_the_reason_and_what_helps() -> None:
     config = chain_config(load_config(LEG))
     search = search_of(config, heavier(ChainBelief.prior(config), 20.0), [])
-    with pytest.raises(NoSafeTorque, match=r"not even 90 % of the designed path: .*needs about.*What helps"):
+    with pytest.raises(NoSafeTorque, match=r"not even 90 % of the designed path: .*needs about.*these changes help"):
         search.safe(step_config(search.config), (1.0, 0.9))
 
 

@@ -120,12 +120,12 @@ def spoilt(change: Callable[[list[str]], list[str]]) -> Converted:
     ("change", "said", "recordings"),
     [
         (lambda rows: [each for row in rows for each in (row, row)], "800 repeated rows were left out", 1),
-        (lambda rows: [*rows[:300], *rows[340:]], "read as time time", 1),
+        (lambda rows: [*rows[:300], *rows[340:]], "columns read: time: time", 1),
         (lambda rows: [*rows[:300], "nan,,,,", *rows[300:]], "1 rows without a time", 1),
         (lambda rows: [*rows[:300], rows[301], rows[300], *rows[302:]], "1 rows out of order were sorted", 1),
         (lambda rows: [*rows[:300], rows[300].rpartition(",")[0] + ",", *rows[301:]], "torque was filled in for 1", 1),
         (lambda rows: [*rows, *rows], "treated as 2 recordings", 2),
-        (lambda rows: [*rows[:300], rows[300].replace("1.5,", "1.5001,"), *rows[300:]], "read as", 1),
+        (lambda rows: [*rows[:300], rows[300].replace("1.5,", "1.5001,"), *rows[300:]], "columns read", 1),
     ],
 )
 def test_rows_that_can_be_put_right_are_and_it_is_said(

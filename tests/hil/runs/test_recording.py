@@ -98,7 +98,7 @@ def test_samples_outlive_their_folder(tmp_path: Path, reason: str) -> None:
     assert (
         said.startswith(reason)
         and "was removed or renamed" in said
-        and f"2 samples have been saved again in {path}" in said
+        and f"2 samples have been saved to a new file, {path}" in said
     )
     assert load_samples(path, 2)["deadline"].tolist() == [7.0, 8.0]
 

@@ -61,3 +61,36 @@ def test_groups_are_readable() -> None:
     base = BaseParameters.of(bundled("open_manipulator_x_like"))
     assert "moment_x_3 + 0.124 mass_4" in base.groups
     assert "armature_3" in base.groups
+
+
+def turned(axes: np.ndarray) -> Chain:
+    """Three links of 0.15 m along z with these axes, normalised, and turned about z between them."""
+    yaw = np.array([-2.81, -1.385, 1.225])
+    c, s, zero, one = np.cos(yaw), np.sin(yaw), np.zeros(3), np.ones(3)
+    rotation = np.moveaxis(np.array([[c, -s, zero], [s, c, zero], [zero, zero, one]]), 2, 0)
+    translation = np.array([[0.0, 0.0, 0.07], [0.0, 0.0, 0.164], [0.0, 0.0, 0.09]])
+    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    return Chain(rotation, translation, axes, np.array([1.0, -2.0, -9.5]))
+
+
+@pytest.mark.parametrize("off", [1e-3, 3e-3, 0.01, 0.03])
+def test_an_axis_slightly_off_does_not_make_the_sums_nearly_cancel(off: float) -> None:
+    """The moment along an axis has hardly any effect, so that another parameter has to stand for it."""
+    chain = turned(np.array([[-0.2, -0.3, 0.9], [0.065, 1.0, -off], [-0.06, 1.0, off]]))
+    base = BaseParameters.of(chain)
+    kg, gyration = 0.2, 0.05
+    link = np.array([kg, *(0.05 * kg,) * 3, *(gyration**2 * kg,) * 6, 0.01])
+    values = base.of_all(np.tile(link, 3))
+    assert np.abs(values).max() < 20 * 0.05 * kg
+
+
+def test_rounded_angles_of_a_description_add_no_base_parameters() -> None:
+    axes = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
+    exact, rounded = turned(axes), turned(axes + np.array([[1e-5, 0.0, 0.0], [0.0, 0.0, 7e-6], [4e-6, 0.0, -7e-6]]))
+    one, other = BaseParameters.of(exact), BaseParameters.of(rounded)
+    assert one.names == other.names
+    q, v, a = np.random.default_rng(2).standard_normal((3, 3, 50))
+    every = np.abs(np.random.default_rng(3).standard_normal(33))
+    right = inverse_dynamics(rounded, every, q, v, a)
+    found = other.regressor(q, v, a) @ other.of_all(every)
+    assert np.abs(found - right).max() < 1e-3 * np.abs(right).max()

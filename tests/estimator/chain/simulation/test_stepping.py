@@ -6,7 +6,7 @@ import pytest
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation
-from hil.estimator.chain.simulation.stepping import COULOMB, FADING, JOINT_TERMS, LOAD, SCALE, WIDTH, _broken, _left
+from hil.estimator.chain.simulation.stepping import COULOMB, FADING, LOAD, SCALE, WIDTH, _broken, _left
 
 STEP = 1.25e-3
 TICK = 2.0 * np.pi / 4096
@@ -37,7 +37,7 @@ def test_breaking_away_is_resolved(phase: float) -> None:
 @pytest.mark.parametrize("load", [0.0, 0.3])
 def test_a_joint_that_sticks_needs_no_smaller_steps(load: float) -> None:
     """Within the linear part of its friction, load-dependent friction included, the tangent is exact."""
-    p = np.zeros((len(JOINT_TERMS), 1))
+    p = np.zeros((9, 1))
     p[COULOMB], p[WIDTH], p[FADING], p[LOAD], p[SCALE] = 0.13, 1e-2, 1.0, load, 1.0
     v, t = np.array([1e-5]), np.array([0.5])
     left = np.zeros((4, 1))

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from hil.estimation.position_jumps import position_jumps
+from hil.estimation.slips.position_jumps import position_jumps
 
 STEP = 2 * np.pi / 4096
 VELOCITY_STEP = 0.229 * 2 * np.pi / 60

@@ -1,0 +1,1 @@
+"""Horns and encoders that slipped: jumps of the position, and a rest position that changed."""

@@ -1,0 +1,79 @@
+"""Drives of a chain whose torque comes late: lags that differ, and the back-EMF of voltage-driven joints."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks import chain as bench
+from hil.estimator.chain.fit import stage2
+from hil.estimator.chain.fit.stage1 import fit_lines
+from hil.estimator.chain.identify import identify_chain
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.late_torque import as_moving, lags_of
+from hil.estimator.data.settled_period import SettledPeriod
+
+LAGS = (0.6e-3, 1.4e-3, 0.8e-3, 1.2e-3)
+
+
+@pytest.fixture(scope="module")
+def setup() -> bench.Setup:
+    """The four-joint arm with current loops as different as those of different servo models."""
+    plain = bench.set_up(bench.BENCHES[4], 1)
+    drives = [drive.model_copy(update={"current_lag": lag}) for drive, lag in zip(plain.arm.drives, LAGS, strict=True)]
+    return replace(plain, arm=plain.arm.model_copy(update={"drives": tuple(drives)}))
+
+
+@pytest.fixture(scope="module")
+def period(setup: bench.Setup) -> SettledPeriod:
+    return bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101))
+
+
+def test_lags_that_differ_are_found(setup: bench.Setup, period: SettledPeriod) -> None:
+    found = identify_chain(period, ChainModel(setup.base, lags=True), setup.prior)
+    std = dict(zip(found.names, found.std, strict=True))
+    for joint, (lag, true) in enumerate(zip(lags_of(found.parameters, 4), LAGS, strict=True), start=1):
+        relative = std["lag"] / LAGS[0] + (
+            std[f"lag_ratio_{joint}"] / found.parameters[f"lag_ratio_{joint}"] if joint > 1 else 0
+        )
+        assert abs(lag / true - 1.0) < 4 * relative
+        assert lag == pytest.approx(true, abs=2e-4)
+    away = np.abs(found.value[: setup.base.count] - setup.truth) / found.std[: setup.base.count]
+    assert np.mean(away < 1.96) > 0.8 and away.max() < 4
+
+
+@pytest.mark.parametrize("drive", ["lag", "delay_lag"])
+def test_derivatives_are_those_of_the_sum_of_squares(setup: bench.Setup, period: SettledPeriod, drive: str) -> None:
+    model = ChainModel(setup.base, drive=drive, lags=True, by_voltage=(1, 3))  # type: ignore[arg-type]
+    problem, x = stage2._problem([period], model, fit_lines([period], model, setup.prior), setup.prior, stage2.DEFAULTS)
+    x = x.copy()
+    for name, value in {"lag_ratio_2": 0.3, "delay": 0.4, "coulomb_width_1": np.log(0.1)}.items():
+        if name in model.names:
+            x[model.names.index(name)] = value
+    gradient = problem.evaluate(x).gradient
+    step = 1e-5
+    for name in ("viscous_1", "viscous_2", "back_emf_1", "back_emf_3", "lag", "lag_ratio_2", "lag_ratio_3"):
+        nudge = np.zeros(x.size)
+        nudge[model.names.index(name)] = step
+        difference = (problem.cost(x + nudge) - problem.cost(x - nudge)) / (
+            4 * step
+        )  # the cost's gradient is twice J'r
+        assert gradient[model.names.index(name)] == pytest.approx(difference, rel=2e-3, abs=1e-2), name
+
+
+def test_a_lagging_back_emf_makes_a_joint_move_like_a_lighter_one(setup: bench.Setup) -> None:
+    """In the time domain: a rotor on a lagging voltage, with its back-EMF lagging too, against the equivalent one."""
+    parameters = dict(zip(setup.base.names, setup.truth.tolist(), strict=True))
+    parameters |= {"back_emf_4": 0.9, "viscous_4": 0.2, "lag": 1e-3, "lag_ratio_4": 1.5}
+    moving = as_moving(setup.base, parameters)
+    assert moving["armature_4"] == pytest.approx(parameters["armature_4"] - 0.9 * 0.2 * 1.5e-3)
+    assert all(moving[name] == parameters[name] for name in parameters if name != "armature_4")
+    inertia, generated, rest, lag = 0.004, 0.18, 0.02, 1.5e-3
+    s = 2j * np.pi * np.linspace(0.1, 10.0, 50)
+    exact = 1.0 / (s * (inertia * s + rest) * (lag * s + 1.0) + s * generated)
+    # The equivalent lag is a little larger, the equivalent inertia that of `as_moving` with it.
+    longer = lag / (1.0 - generated * lag / inertia)
+    equivalent = 1.0 / (s * ((inertia - generated * longer) * s + rest + generated) * (longer * s + 1.0))
+    plain = 1.0 / (s * (inertia * s + rest + generated) * (longer * s + 1.0))
+    assert np.abs(equivalent / exact - 1.0).max() < 0.02
+    assert np.abs(plain / exact - 1.0).max() > 0.04
