@@ -120,6 +120,7 @@ class Middle(FakeSerial):
     @property
     def in_waiting(self) -> int:
         now = self.clock.now()
+        self._let_rivals_write(now)
         return super().in_waiting + sum(len(data) for due, data in self._queue if due <= now)
 
     def reset_input_buffer(self) -> None:
@@ -276,18 +277,23 @@ class Middle(FakeSerial):
             for each in self._fights:
                 overwrite_goals(each, self)
             self._fights.clear()
+        self._let_rivals_write(now)
         for each, due in self._again.items():
-            if due <= now < each.end and not self.over and not self.bus.on_the_way:
-                if each.kind == Kind.RIVAL:
-                    self._again[each] = now + RIVAL_EVERY_S
-                    overwrite_goals(each, self)
-                else:
-                    self._again[each] = now + each.amount + HICCUP_EVERY_S
-                    self.clock.wait_until(now + each.amount)
+            if each.kind == Kind.HICCUPS and due <= now < each.end and not self.over and not self.bus.on_the_way:
+                self._again[each] = now + each.amount + HICCUP_EVERY_S
+                self.clock.wait_until(now + each.amount)
         while self._to_come and self._to_come[0].start <= now:
             each = self._to_come.pop(0)
             if not self.over:
                 self._undo += happen(each, self)
+
+    def _let_rivals_write(self, now: float) -> None:
+        """Let other masters write at their own times, also between two calls of the program."""
+        for each in [each for each in self._again if each.kind == Kind.RIVAL and not self.over]:
+            while self._again[each] <= min(now, each.end) and not self.bus.on_the_way:
+                self.bus.advance(self._again[each])
+                overwrite_goals(each, self)
+                self._again[each] += RIVAL_EVERY_S
 
     def _lasting(self, now: float, kinds: frozenset[Kind] | set[Kind]) -> Iterator[Attack]:
         if self.over:

@@ -83,7 +83,7 @@ def overwrite_goals(attack: Attack, port: "Middle") -> None:
             address, goal = _write_goal(attack, servo)
             if attack.kind == Kind.RIVAL:  # the program hears it as well
                 said = encode(servo.id, Instruction.WRITE, address.to_bytes(2, "little") + goal)
-                port.bus._wire.put(said, port.bus.time)
+                port.bus._wire.put(said, port.bus.advanced_to)
 
 
 def _write_goal(attack: Attack, servo: EmulatedServo) -> tuple[int, bytes]:
@@ -132,7 +132,8 @@ def _reconfigure(attack: Attack, servo: EmulatedServo) -> Undo | None:
         case Kind.LOWERED_LIMIT:
             return _change(servo, limit, round(attack.amount * servo.value(limit)))
         case Kind.RAISED_LIMIT if limit == "Current Limit":
-            return _change(servo, limit, min(2 * servo.value(limit), servo.model.registers[limit].maximum))
+            # A tick less than the largest limit, which may be the user's own: that one is not the attack's to undo.
+            return _change(servo, limit, min(2 * servo.value(limit), servo.model.registers[limit].maximum - 1))
         case Kind.THROTTLED if servo.operating_mode == 0 and "Goal PWM" in servo.memory:
             return _change(servo, "Goal PWM", round(attack.amount * servo.value("PWM Limit")))
         case Kind.HOMING_MOVED:

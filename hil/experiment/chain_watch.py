@@ -2,6 +2,7 @@
 
 Prior knowledge is the ensemble's mean and inflated covariance. The ensemble is drawn around the description, and
 updated after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
+Nor is a joint that stands at its rest angle: on the way home it may reach the stop on which it rests before the others.
 """
 
 from collections.abc import Sequence
@@ -64,9 +65,10 @@ class ChainWatch:
         if goal is None:
             goal, seconds = state.goal_current, float("inf")
         position = np.array(state.position)
-        is_free = bool(np.abs(position - self._rest).max() > LYING_RAD)
+        away, velocity = np.abs(position - self._rest), np.array(state.velocity)
+        is_free = (away.max() > LYING_RAD) & ((away > LYING_RAD) | (np.abs(velocity) > _STILL_RAD_S))
         torque = self._constants * goal
-        joint = self._observer.observe(position, np.array(state.velocity), torque, seconds, is_free)
+        joint = self._observer.observe(position, velocity, torque, seconds, is_free)
         if joint >= 0:
             self._raise(joint, state)
 

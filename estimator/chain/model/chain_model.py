@@ -18,9 +18,6 @@ FRICTION: dict[str, dict[str, str]] = {
 }
 ADDED_MASS = "added_mass_scale"
 """Factor on the torque of a known added mass: ratio of the first joint's assumed to its true torque constant."""
-LAG_RATIO = "lag_ratio"
-MEANINGS = {LAG_RATIO: "lag of the joint's torque, relative to that of joint 1"}
-"""Descriptions of terms that only chains have, without the joint's number."""
 DRIVE = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
 
 
@@ -80,7 +77,7 @@ class ChainModel:
         terms += [(f"back_emf_{joint}", "1") for joint in self.by_voltage]
         terms += [(name, "s") for name in DRIVE[self.drive]]
         if self.lags and "lag" in DRIVE[self.drive]:
-            terms += [(f"{LAG_RATIO}_{joint}", "1") for joint in self._numbers[1:]]
+            terms += [(f"lag_ratio_{joint}", "1") for joint in self._numbers[1:]]
         return terms
 
     @property

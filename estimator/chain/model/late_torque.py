@@ -13,6 +13,8 @@ from hil.estimator.arrays import Array
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS
 
+MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
+"""What the kinds of parameters that only chains have mean."""
 _ARMATURE = 10  # of a link's parameters
 
 

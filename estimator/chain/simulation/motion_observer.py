@@ -80,7 +80,7 @@ class ChainObserver:
         self.observe(nothing, nothing, nothing, interval, False)
         self.observe(nothing, nothing, nothing, math.inf, False)
 
-    def observe(self, position: Any, velocity: Any, torque: Any, seconds: float, is_free: bool) -> int:
+    def observe(self, position: Any, velocity: Any, torque: Any, seconds: float, is_free: Any) -> int:
         """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1 if there is none.
 
         Args:
@@ -88,12 +88,12 @@ class ChainObserver:
             velocity: velocities [rad/s].
             torque: torques commanded since the previous sample [N m].
             seconds: time since the previous sample [s].
-            is_free: whether only the motors hold the arm.
+            is_free: whether only its motor holds each joint; one value for all or one per joint.
         """
         return _observe(
             *(self._memory, self._theta, self._covariance, self._constants, self._chain, self._work),
             *(np.asarray(each, dtype=np.float64) for each in (position, velocity, torque)),
-            *(seconds, is_free),
+            *(seconds, np.broadcast_to(is_free, (self._joints,)).astype(np.bool_)),
         )
 
     @property
@@ -118,7 +118,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
     v: Any,
     torque: Any,
     dt: float,
-    is_free: bool,
+    is_free: Any,
 ) -> int:
     floor, least_noise, drift, interval, expected = constants
     arrays, column, base = chain
@@ -142,9 +142,12 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         memory[STANDS, j] += fallen * (standing - memory[STANDS, j])
     memory[TIMES_OF_ALL, 0] += dt
     memory[TIMES_OF_ALL, 1] += dt
-    if not is_free:
-        for j in range(n):
+    supported = 0
+    for j in range(n):
+        if not is_free[j]:
             memory[HELD, j] = memory[SAMPLES, j] = memory[LACKING, j] = 0.0
+            supported += 1
+    if supported == n:
         return -1
     if memory[TIMES_OF_ALL, 1] <= WARM_S:
         return -1
@@ -164,6 +167,8 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
     regress(column, memory[SLOPE, :n], rooms, Y)
     alarm = -1
     for j in range(n):
+        if not is_free[j]:
+            continue
         for i in range(count):
             row[i] = Y[j, i] if i < base else 0.0
         row[base + j] = memory[VELOCITY, j]

@@ -3,7 +3,8 @@
 import math
 from collections.abc import Mapping
 
-from hil.estimator.chain.model import chain_model, tilt
+from hil.estimator.chain.model.late_torque import MEANINGS as LATE
+from hil.estimator.chain.model.tilt import MEANINGS
 from hil.estimator.models.terms import kind_of, term_of
 from hil.report.run_data import RunData
 from hil.report.section import Section, Table
@@ -45,8 +46,7 @@ def _row(name: str, entry: Quantity, truth: Mapping[str, float], groups: Mapping
     value, std = entry.value, entry.std
     known = (number(truth[name]) if name in truth else "",) if truth else ()
     unit = "" if entry.unit == "1" else entry.unit.replace("^2", "²")
-    own = tilt.MEANINGS.get(name) or chain_model.MEANINGS.get(kind_of(name))
-    meaning = groups.get(name) or own or term_of(name).meaning
+    meaning = groups.get(name) or MEANINGS.get(name) or LATE.get(kind_of(name)) or term_of(name).meaning
     if not math.isfinite(std):
         return (name, meaning, unit, number(value), "not determined", "", *known)
     relative = percent(std / abs(value)) if value else ""

@@ -1,0 +1,52 @@
+"""What the watch of a spatial arm judges, and what it does not."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.config.schema import Config, load_config
+from hil.errors import SafetyStop
+from hil.experiment.chain_watch import ChainWatch
+from tests.support.paths import CONFIGS
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(CONFIGS / "leg.toml")
+
+
+def look(config: Config, watch: ChainWatch, position: tuple[float, ...], goal: tuple[float, ...], number: int) -> None:
+    at = number / config.experiment.rate
+    n = len(position)
+    state: Any = SimpleNamespace(
+        missing=(False,) * n, goal_current=goal, position=position, velocity=(0.0,) * n, time_before_write=at
+    )
+    watch.look(state)
+
+
+def stands(config: Config, knee: float, current: float) -> None:
+    """The knee stands still under this current for half a second, while the hip is away from the rest pose."""
+    watch = ChainWatch(config, [1.0, 1.0, 1.0])
+    rest = np.array(config.arm.rest_pose)
+    for number in range(200):
+        look(config, watch, (rest[0] + 0.3, rest[1], rest[2] + knee), (0.0, 0.0, current), number)
+
+
+def test_a_joint_on_the_stop_on_which_it_rests_is_not_blocked(config: Config) -> None:
+    """The others are still on their way home."""
+    stands(config, 0.02, -0.9)
+
+
+def test_the_same_joint_elsewhere_is(config: Config) -> None:
+    with pytest.raises(SafetyStop, match="stands still although a torque"):
+        stands(config, 0.5, -0.9)
+
+
+def test_nor_does_it_keep_others_from_being_judged(config: Config) -> None:
+    watch = ChainWatch(config, [1.0, 1.0, 1.0])
+    rest = config.arm.rest_pose
+    with pytest.raises(SafetyStop, match="hip_roll"):
+        for number in range(200):
+            look(config, watch, (rest[0] + 0.5, rest[1] + 0.3, rest[2]), (1.0, 0.0, 0.0), number)
