@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from hil.estimator.chain.identify import EXPLAINED_RESIDUAL, ROUNDING, ChainEstimate, identify_chain
+from hil.estimator.chain.identify import ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod
@@ -20,8 +20,6 @@ from hil.estimator.errors import ConvergenceError
 class ChoiceOptions:
     """Options of the choice."""
 
-    explained_residual: float = EXPLAINED_RESIDUAL
-    """RMS residual of the worst joint, in units of encoder rounding, below which no further term is tried."""
     significance: float = 1e-3
     """Significance level at which a term is kept (likelihood ratio, corrected for the residual's correlation)."""
 
@@ -32,13 +30,13 @@ OPTIONS = ChoiceOptions()
 def choose_chain(
     periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior, options: ChoiceOptions = OPTIONS
 ) -> ChainEstimate:
-    """Estimate under `model`, and under richer ones if its residual exceeds encoder rounding; return the best
+    """Estimate under `model`, and under richer ones if its residual is more than encoder rounding; return the best
     supported.
 
     Raises what `identify_chain` raises for `model` itself.
     """
     best = identify_chain(periods, model, prior)
-    while float(best.residual_steps.max()) > options.explained_residual * ROUNDING:
+    while not best.explained:
         found = [_tried(periods, richer, prior) for richer in _richer(best.model)]
         gains = [(_gain(best, each, options), each) for each in found if each is not None]
         if not gains:

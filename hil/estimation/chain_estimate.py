@@ -16,7 +16,7 @@ from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.truth import back_emf
 from hil.estimator.chain.choice import choose_chain
-from hil.estimator.chain.identify import ChainEstimate, identify_chain
+from hil.estimator.chain.identify import SYSTEMATIC, ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.tilt import TILT, tilt_between
 from hil.estimator.chain.simulation.prediction import predict
@@ -172,9 +172,9 @@ def _verdict(
     worst = config.joints[int(np.argmax(over))].name
     sentences = [
         f"The residual of {worst} is the largest: {over.max():.2f} times encoder rounding; "
-        + ("nothing remains unexplained." if over.max() <= EXPLAINED else "the model is incomplete.")
+        + _remains(estimate, float(over.max()))
     ]
-    trust = "yes" if over.max() <= EXPLAINED else "with care"
+    trust = "yes" if over.max() <= EXPLAINED and estimate.systematic <= SYSTEMATIC else "with care"
     if held_out is None:
         sentences.append("No second path was recorded, so the prediction could not be validated.")
         trust = "with care"
@@ -207,3 +207,18 @@ def _verdict(
             f"assumed to be zero within their standard errors."
         )
     return Verdict(trust, weakest, tuple(sentences))
+
+
+def _remains(estimate: ChainEstimate, over: float) -> str:
+    """What the residual, relative to encoder rounding, says about the model."""
+    if over <= EXPLAINED and estimate.systematic <= SYSTEMATIC:
+        return "nothing remains unexplained."
+    causes = "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time"
+    if estimate.model.friction != "stribeck_load":
+        causes = f'load-dependent friction ([model] friction = "auto" tries that), {causes}'
+    if over > EXPLAINED:
+        return f"the model is incomplete. Possible causes: {causes}."
+    return (
+        f"but part of it repeats with the motion, which increases the standard errors {estimate.systematic:.1f} times, "
+        f"and some values may be wrong by more than these say. A small effect is missing from the model: {causes}."
+    )

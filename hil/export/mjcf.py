@@ -12,7 +12,7 @@ from hil.export.mass_distribution import LinkMass, distribute
 from hil.export.source import Source, write_text
 from hil.export.xml_text import axis, describe, numbers, to_text
 
-_CARRIED = ("armature", "offset", "lag", "cable_stiffness")
+_CARRIED = ("armature", "offset", "lag", "lag_difference", "cable_stiffness")
 
 
 def export_mjcf(source: Source, path: Path) -> list[str]:

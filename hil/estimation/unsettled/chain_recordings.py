@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 FITTED_SHARE = 0.75  # of each recording, for the check on the rest
 EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
 TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative error of the torque on the last part: trusted, rejected
-UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder", "lags")
+UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ def estimate_chain_recordings(
     model = ChainModel(
         *(base, wanted.fixed_friction, wanted.drive, wanted.zeros, wanted.torque_scale and base.chain.joints > 1),
         base_tilt=wanted.base_tilt,
+        lags=base.chain.joints > 1,
+        by_voltage=tuple(range(1, base.chain.joints + 1)) if config.columns.drive in {"voltage", "pwm"} else (),
     )
     found = identify_recordings(recordings, model, prior)
     foretold = _held_out(recordings, model, prior)

@@ -22,6 +22,7 @@ from hil.estimation.changes.diff import diff_runs
 from hil.estimation.comparison.compare import compare_run
 from hil.estimation.settled_estimate import estimate_run
 from hil.estimation.unsettled.estimate import estimate_unsettled
+from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.dynamics import inverse_dynamics
 from hil.estimator.chain.model.geometry import Chain, parameter_names
 from hil.experiment.run import run_experiment
@@ -278,10 +279,15 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
     known = known_chain(config)
     explained = 0.29 * np.ones(4)
     estimate: Any = SimpleNamespace(
-        std=0.01 * known.prior.std, residual_steps=explained, from_prior=(), unseen=(), reached=True
+        **{"std": 0.01 * known.prior.std, "residual_steps": explained, "systematic": 0.8},
+        **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base)},
     )
     verdicts = []
     for estimate.reached in (True, False):
         verdicts.append(_verdict(config, estimate, known, np.full(4, 1e-3), []))
     assert [verdict.trust for verdict in verdicts] == ["yes", "with care"]
     assert "stopped short of its minimum" in verdicts[1].sentences[-1]
+    estimate.reached, estimate.systematic = True, 3.0
+    hidden = _verdict(config, estimate, known, np.full(4, 1e-3), [])
+    assert hidden.trust == "with care"
+    assert "part of it repeats with the motion" in hidden.sentences[0]
