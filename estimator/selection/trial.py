@@ -63,7 +63,9 @@ class Choice:
     @property
     def plainest(self) -> Trial:
         """The trial with the fewest parameters among those that could be fitted."""
-        return min((each for each in self.trials if each.estimate is not None), key=lambda each: len(each.model.names))
+        judged = [each for each in self.trials if each.estimate is not None]
+        judged = [each for each in judged if np.isfinite(each.score)] or judged
+        return min(judged, key=lambda each: len(each.model.names))
 
     @property
     def gained(self) -> float:

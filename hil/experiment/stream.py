@@ -338,7 +338,7 @@ class Stream:
 
     def _brake(self) -> None:
         """Brake until the arm is slow, a read fails, time is up, or a second signal arrives. Never raises."""
-        brake = Brake(self._config)
+        brake = Brake(self._config, self._apart)
         state = self._state
         ticks = FixedRate(self._clock, 1 / self._apart)
         with suppress(DriverError):

@@ -110,13 +110,13 @@ class Search:
             self.from_earlier, self.earlier_swing = False, None
             self.belief = prior_belief(self.config, self.options.arms)
             self.player.say("The arm does not move as the earlier run predicts: starting from the prior instead.")
+        swing = played.step.seen[1] - played.step.seen[0] if played.seen is None else played.seen.swing
+        self.swing = swing if self.swing is None else np.fmax(self.swing, swing)
+        self._slow_down(played)
         if played.seen is None:
             return
         self.belief = self.belief.after(config, played.seen)
         self.pose = _within_limits(self.config, played.seen.end, self.options.start_inside)
-        swing = played.seen.swing
-        self.swing = swing if self.swing is None else np.maximum(self.swing, swing)
-        self._slow_down(played)
 
     def _slow_down(self, played: Played) -> None:
         """Limit the torque of joints that exceeded their velocity limit before they had moved."""
@@ -180,11 +180,14 @@ class Search:
             if not still.any():
                 return
             if (again := self.fast & np.isfinite(before)).any():
-                self._refuse_velocity_limit(again)
+                self._refuse_velocity_limit(
+                    again, still & (found.peak_torque >= options.at_limit * most_torque(config))
+                )
             at_limit = found.peak_torque >= options.at_limit * np.minimum(most_torque(config), before)
             if at_limit[still].all() or len(self.steps) >= options.max_pilots:
-                if (calm := still & np.isfinite(self.calm)).any():
-                    self._refuse_velocity_limit(calm)
+                calm = still & np.isfinite(self.calm)
+                if calm.any():
+                    self._refuse_velocity_limit(calm, still & ~calm)
                 self._give_up(config, _names(self.config, still))
             self.player.say(" ".join(self._of_still(still)))
 
@@ -306,7 +309,8 @@ class Search:
         """Fraction of the limit that a typical arm reaches (joints,)."""
         return np.asarray(np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0))
 
-    def _refuse_velocity_limit(self, fast: NDArray[np.bool_]) -> NoReturn:
+    def _refuse_velocity_limit(self, fast: NDArray[np.bool_], held: NDArray[np.bool_]) -> NoReturn:
+        """fast: joints that exceeded their velocity limit. held: joints that did not move with all their torque."""
         said = "; ".join(
             f"{joint.name}: velocity_limit = {joint.velocity_limit:g} rad/s, {MOVED_STEPS} encoder steps are "
             f"{MOVED_STEPS * joint.joint.servo.position_unit:.2g} rad"
@@ -316,6 +320,7 @@ class Search:
         raise ExperimentError(
             f"{_and(_names(self.config, fast))} exceeded the velocity limit while breaking away, before moving far "
             f"enough to be measured ({said}). More torque would only increase the speed: raise velocity_limit."
+            + (f" {_and(_names(self.config, held))} did not move with all the torque allowed." if held.any() else "")
         )
 
     def _give_up(self, config: Config, still: list[str]) -> None:

@@ -6,6 +6,7 @@ way. Torque is cut afterwards in any case.
 """
 
 from hil.config.schema import Config
+from hil.drivers.preparation.cadence import CHECK_S
 from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import ExperimentError, SafetyStop
@@ -22,8 +23,8 @@ LIGHTEST = 0.5
 A light joint that is braked too hard is thrown back faster than it came before its velocity is read again.
 """
 
-LONGEST_HELD_S, DELAY_S = 0.01, 0.002
-"""Longest time between two exchanges, and the delay until a goal takes effect [s]: a brake acts for their sum."""
+DELAY_S = 0.002
+"""Time until a goal takes effect [s]: a brake acts from one exchange to the next, and for that long."""
 
 GETS_FASTER = 0.2
 """Increase in speed, relative to the velocity limit, at which braking is abandoned.
@@ -42,11 +43,13 @@ def may_brake(config: Config, error: BaseException) -> bool:
     return error.cause.allows_braking if isinstance(error, SafetyStop) else True
 
 
-def braking_gains(config: Config) -> list[float]:
-    """Braking gain of each joint [A s/rad, or V s/rad in PWM mode]: until the next exchange, a brake at most stops the
-    lightest joint.
+def braking_gains(config: Config, interval: float | None = None) -> list[float]:
+    """Braking gain of each joint [A s/rad, or V s/rad in PWM mode]: one brake at most stops the lightest joint.
+
+    interval: time between two exchanges [s]; by default, that on a fast bus.
     """
-    held = min(1.0 / config.experiment.rate, LONGEST_HELD_S) + DELAY_S
+    sample = 1.0 / config.experiment.rate
+    held = (sample / max(1, int(sample / CHECK_S + 1e-6)) if interval is None else interval) + DELAY_S
     return [
         min(
             joint.goal_limit / (FULL_AT * joint.velocity_limit),
@@ -59,8 +62,8 @@ def braking_gains(config: Config) -> list[float]:
 class Brake:
     """Computes goal currents that oppose the measured velocities."""
 
-    def __init__(self, config: Config) -> None:
-        self._gains = braking_gains(config)
+    def __init__(self, config: Config, interval: float | None = None) -> None:
+        self._gains = braking_gains(config, interval)
         self._limits = [joint.goal_limit for joint in config.joints]
         self._allowed = [GETS_FASTER * joint.velocity_limit for joint in config.joints]
         self._enough = config.safety.rest_velocity

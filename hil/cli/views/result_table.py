@@ -57,7 +57,7 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
         compared = (
             "the simplest model"
             if choice.chosen == choice.plainest
-            else f"whose error, compared with that of the simplest model, is {_times(1.0 / choice.error_divided_by)}"
+            else f"with an error {_times(_inverse(choice.error_divided_by))} compared with the simplest model's"
         )
         print(f"Chosen on held-out segments: {choice.chosen}, {compared}.")
     if result.physical is not None:
@@ -171,12 +171,16 @@ def _choice(result: SettledResult) -> list[str]:
         return [f"Model chosen from {among}: {choice.chosen}, which has the fewest parameters of them."]
     return [
         f"Model chosen from {among}: {choice.chosen}. Compared with {choice.plainest}, its prediction error is "
-        f"{_times(1.0 / choice.error_divided_by)} and its standard errors are {_times(cost)}."
+        f"{_times(_inverse(choice.error_divided_by))} and its standard errors are {_times(cost)}."
     ]
 
 
+def _inverse(ratio: float) -> float | None:
+    return 1.0 / ratio if 0.0 < ratio < math.inf else None
+
+
 def _times(ratio: float | None) -> str:
-    if ratio is None:
+    if ratio is None or not 0.0 < ratio < math.inf:
         return "not comparable"
     if abs(ratio - 1.0) < _ALIKE:
         return "about the same"

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_prior import servo_prior
+from hil.plan.plan import rest_window
 from hil.results.result import SettledResult
 from hil.runs.recording import Phase
 
@@ -17,7 +18,8 @@ LEAST_RAD = 0.1
 _FRICTION_TIMES = 2.0
 """Multiple of the servo's typical friction, with breakaway, that may hold a joint away from where it would hang."""
 
-_LAST = 20  # samples that are averaged
+_STILL_RAD = 0.02
+"""Range of positions within which an arm counts as resting [rad]."""
 
 
 def rest_shift_warnings(config: Config, samples: NDArray[np.void], result: SettledResult) -> list[str]:
@@ -28,27 +30,37 @@ def rest_shift_warnings(config: Config, samples: NDArray[np.void], result: Settl
     trusted = result.verdict is not None and result.verdict.trust == "yes"
     if trusted or config.arm.gravity == 0.0 or config.stabiliser is not None or config.is_chain:
         return []
-    before = _resting(samples, Phase.REST)
-    after = _resting(samples, Phase.COMING_TO_REST)
+    before = _resting(config, samples, Phase.REST)
+    after = _resting(config, samples, Phase.COMING_TO_REST)
     if before is None or after is None:
         return []
+    change = np.abs(_gravity(result, after) - _gravity(result, before))
     found = []
-    for number, (joint, shift) in enumerate(zip(config.joints, (after - before).tolist(), strict=True), 1):
-        weight = abs(result.parameters[f"gravity_{number}"].value)
+    for joint, more, shift in zip(config.joints, change.tolist(), (after - before).tolist(), strict=True):
         friction = servo_prior(joint.joint.servo)
         held = _FRICTION_TIMES * friction.coulomb.median * (1.0 + friction.stribeck_rise.median)
-        if abs(shift) > LEAST_RAD and held < weight * abs(shift):
+        if abs(shift) > LEAST_RAD and more > held:
             found.append(
-                f"{joint.name}: it came to rest {shift:+.2f} rad from where it had rested before the run. If friction "
-                "does not hold it there, its horn slipped on the shaft, or its encoder moved: tighten the screws, set "
-                "zero_ticks again, and record again."
+                f"{joint.name}: it came to rest {shift:+.2f} rad from where it had rested before the run, where "
+                f"gravity pulls it by {more:.2g} N m more. If friction does not hold it there, its horn slipped on the "
+                "shaft, or its encoder moved: tighten the screws, set zero_ticks again, and record again."
             )
     return found
 
 
-def _resting(samples: NDArray[np.void], phase: Phase) -> NDArray[np.float64] | None:
-    """Median of the last positions of a phase (joints,) [rad]; None if a joint has none."""
-    position = samples["position"][samples["phase"] == phase][-_LAST:]
-    if not len(position) or not np.isfinite(position).any(axis=0).all():
+def _gravity(result: SettledResult, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Torque of gravity at a pose (joints,) [N m]."""
+    weight = [result.parameters[f"gravity_{number}"].value for number in range(1, len(pose) + 1)]
+    each = weight * np.cos(np.cumsum(pose))
+    return np.asarray(np.cumsum(each[::-1])[::-1])  # each joint carries the links beyond it
+
+
+def _resting(config: Config, samples: NDArray[np.void], phase: Phase) -> NDArray[np.float64] | None:
+    """Median of the last positions of a phase (joints,) [rad]; None if a joint has none or still moves."""
+    rows = samples[samples["phase"] == phase][-rest_window(config.experiment.rate) :]
+    position = rows["position"]
+    if not len(rows) or not np.isfinite(position).any(axis=0).all():
+        return None
+    if (np.nanmax(position, axis=0) - np.nanmin(position, axis=0) > _STILL_RAD).any():
         return None
     return np.asarray(np.nanmedian(position, axis=0), dtype=np.float64)

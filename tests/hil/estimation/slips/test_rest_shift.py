@@ -22,22 +22,43 @@ def run(identified: Path) -> tuple[Config, np.ndarray, SettledResult]:
     return RunFolder.open(identified).load_config(), load_samples(identified / "samples.npy", 2), doubted
 
 
-def slipped(samples: np.ndarray, by: float) -> np.ndarray:
+def slipped(samples: np.ndarray, *by: float) -> np.ndarray:
+    """The samples of an arm that came to rest elsewhere by these angles (joints,) [rad]."""
     changed = samples.copy()
-    changed["position"][changed["phase"] == Phase.COMING_TO_REST, 1] += by
+    changed["position"][changed["phase"] == Phase.COMING_TO_REST] += by
     return changed
 
 
 def test_a_joint_that_rests_elsewhere_is_named(run: tuple[Config, np.ndarray, SettledResult]) -> None:
     config, samples, result = run
     assert rest_shift_warnings(config, samples, result) == []
-    (said,) = rest_shift_warnings(config, slipped(samples, 1.2), result)
+    (said,) = rest_shift_warnings(config, slipped(samples, 0.0, 1.2), result)
     assert said.startswith(f"{config.joints[1].name}: it came to rest +1.") and "horn slipped" in said
+
+
+def test_what_counts_is_the_change_of_gravity_on_each_joint(run: tuple[Config, np.ndarray, SettledResult]) -> None:
+    """A shoulder that friction holds away from rest turns the freely hanging elbow back by as much."""
+    config, samples, result = run
+    heavy = {**result.parameters, "gravity_1": Quantity(0.1, 0.01, "N m"), "gravity_2": Quantity(1.0, 0.01, "N m")}
+    doubted = replace(result, parameters=heavy)
+    assert rest_shift_warnings(config, slipped(samples, 0.5, -0.5), doubted) == []
+    found = rest_shift_warnings(config, slipped(samples, 0.0, 0.3), doubted)
+    assert [said.partition(":")[0] for said in found] == [config.joints[1].name]
+    assert len(rest_shift_warnings(config, slipped(samples, 0.3, 0.0), doubted)) == 2, "both carry the second link"
+    assert rest_shift_warnings(config, slipped(samples, 0.0, 0.12), doubted) == []
+
+
+def test_an_arm_that_still_swings_has_not_come_to_rest(run: tuple[Config, np.ndarray, SettledResult]) -> None:
+    config, samples, result = run
+    swings = slipped(samples, 0.0, 1.2)
+    at = swings["phase"] == Phase.COMING_TO_REST
+    swings["position"][at, 1] += 0.1 * np.sin(0.02 * np.arange(at.sum()))
+    assert rest_shift_warnings(config, swings, result) == []
 
 
 def test_nothing_is_said_where_it_means_nothing(run: tuple[Config, np.ndarray, SettledResult]) -> None:
     config, samples, result = run
-    moved = slipped(samples, 1.2)
+    moved = slipped(samples, 0.0, 1.2)
     trusted = replace(result, verdict=replace(result.verdict, trust="yes"))
     light = {**result.parameters, "gravity_2": Quantity(0.01, 0.001, "N m")}
     flat = config.model_copy(update={"arm": config.arm.model_copy(update={"gravity": 0.0})})
