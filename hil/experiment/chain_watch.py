@@ -53,6 +53,7 @@ class ChainWatch:
         self._observer = ChainObserver(arms.base, mean, covariance, largest, interval)
         self._names = [joint.joint.title for joint in config.joints]
         self._rest = np.array(config.arm.rest_pose)
+        self._has_left = np.zeros(n, dtype=np.bool_)
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
 
@@ -66,7 +67,10 @@ class ChainWatch:
             goal, seconds = state.goal_current, float("inf")
         position = np.array(state.position)
         away, velocity = np.abs(position - self._rest), np.array(state.velocity)
-        is_free = (away.max() > LYING_RAD) & ((away > LYING_RAD) | (np.abs(velocity) > _STILL_RAD_S))
+        self._has_left |= away > LYING_RAD
+        # A joint that has come home may stand on the stop on which it rests. One that never left is expected to move.
+        is_home = self._has_left & (away <= LYING_RAD) & (np.abs(velocity) <= _STILL_RAD_S)
+        is_free = (away.max() > LYING_RAD) & ~is_home
         torque = self._constants * goal
         joint = self._observer.observe(position, velocity, torque, seconds, is_free)
         if joint >= 0:
