@@ -43,10 +43,13 @@ class Reserve:
 
     def larger(self, shortage: float) -> "Reserve":
         """Return a larger reserve. shortage: by how much the predicted clearance was too small [m], otherwise 0."""
-        return Reserve(MORE * self.position, self.speed / MORE, self.torque / MORE, self.clearance + shortage)
+        position = min(MORE * self.position, MOST_POSITION)
+        return Reserve(position, self.speed / MORE, self.torque / MORE, self.clearance + shortage)
 
 
 MORE = 1.4
+MOST_POSITION = 0.3
+"""Largest reserve of position: at one half, nothing of a joint's range would be left."""
 RESERVE = Reserve()
 
 

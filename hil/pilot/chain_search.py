@@ -100,17 +100,18 @@ class ChainSearch:
         kept. Raises NoSafeTorque if no share of any path is safe.
         """
         found, why, shortage = self._largest(config, shares)
+        reserve = self.paths.reserve
         for _ in range(REDESIGNS):
             if found is not None and found.share >= SMALL * shares[0]:
                 break
-            former = self.paths
+            former, reserve = self.paths, reserve.larger(shortage)
             try:
-                self.paths = Paths.of(self.given, self.belief.torque, former.reserve.larger(shortage))
+                self.paths = Paths.of(self.given, self.belief.torque, reserve)
             except NoSafeTorque:
                 break
             other, other_why, shortage = self._largest(config, shares)
             if other is None or (found is not None and self._worth(former, found) <= self._worth(self.paths, other)):
-                self.paths = replace(former, reserve=self.paths.reserve)
+                self.paths = former
             else:
                 found = other
                 self.say("Designed another path, which stays farther from the limits.")

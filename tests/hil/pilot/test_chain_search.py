@@ -14,7 +14,7 @@ from hil.dry_run.chain_summary import unsafe
 from hil.errors import Cause, ConfigError, DidNotMove, NoSafeTorque, NotSettled, SafetyStop
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.pilot.chain_belief import ChainBelief
-from hil.pilot.chain_paths import Paths, chain_config
+from hil.pilot.chain_paths import RESERVE, Paths, Reserve, chain_config
 from hil.pilot.chain_search import ChainSearch, Found, step_config
 from hil.plan.chain_model import known_chain
 from hil.runs.recording import load_samples
@@ -181,3 +181,34 @@ def test_a_path_that_is_safe_is_kept() -> None:
     designed = search.paths
     assert search.safe(step_config(search.config), (0.3,)).share == 0.3
     assert search.paths is designed
+
+
+def test_paths_that_are_rejected_do_not_make_later_ones_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = chain_config(load_config(LEG))
+    search = search_of(config, ChainBelief.prior(config), [])
+    designed, tried = search.paths, []
+
+    def of(_: object, __: object, reserve: Reserve) -> Paths:
+        tried.append(reserve)
+        return replace(designed, reserve=reserve)
+
+    def largest(_: object, __: object) -> tuple[Found | None, str, float]:
+        share = 0.18 if search.paths is designed else 0.06
+        return Found(share, cast("Any", None), cast("Any", None)), "shank and floor: 2 mm", 0.0
+
+    monkeypatch.setattr(Paths, "of", of)
+    monkeypatch.setattr(search, "_largest", largest)
+    for _ in range(3):
+        search.safe(search.config, (1.0, 0.18))
+    assert search.paths is designed
+    assert tried == 3 * [RESERVE.larger(0.0), RESERVE.larger(0.0).larger(0.0)]
+
+
+def test_a_reserve_always_leaves_some_range() -> None:
+    reserve = RESERVE
+    for _ in range(8):
+        reserve = reserve.larger(0.01)
+    assert reserve.position < 0.35
+    config = chain_config(load_config(LEG))
+    with pytest.raises(NoSafeTorque, match="no range of position is left"):
+        Paths.of(config, ChainBelief.prior(config).torque, replace(RESERVE, position=0.5))
