@@ -108,6 +108,11 @@ class Paths:
             ) from error
         return cls(config, designer, best, other, reserve)
 
+    def amplitude_over(self, other: "Paths") -> float:
+        """Return the largest ratio of a joint's peak excursion or speed in these paths to that in others."""
+        pairs = (self.identify, other.identify), (self.held_out, other.held_out)
+        return max(float((_peaks(mine.path) / _peaks(its.path)).max()) for mine, its in pairs)
+
     def plan(self, config: Config, thought: ChainTorque, share: float) -> Plan:
         """Plan both paths at this fraction of their amplitude."""
 
@@ -115,6 +120,13 @@ class Paths:
             return self.designer.scaled(self.held_out if role == HELD_OUT else self.identify, share)
 
         return path_plan(config, thought, path)
+
+
+def _peaks(path: Path) -> Array:
+    """Peak excursion from the centre [rad] and peak speed [rad/s] of each joint (2, joints)."""
+    excursion = path.position - path.position.mean(axis=1, keepdims=True)
+    peaks: Array = np.maximum(np.abs(np.stack((excursion, path.velocity))).max(axis=2), 1e-9)
+    return peaks
 
 
 def chain_config(config: Config) -> Config:
