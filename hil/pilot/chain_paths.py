@@ -11,7 +11,7 @@ from hil.errors import NoSafeTorque
 from hil.estimator.chain.excitation.fourier_path import Path
 from hil.estimator.chain.excitation.path_design import Design, PathDesigner, PathLimits
 from hil.estimator.errors import ExcitationError
-from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
+from hil.plan.chain_model import ChainTorque, known_chain, limit_names, torque_limits
 from hil.plan.chain_plan import check_rest_pose, path_plan
 from hil.plan.plan import HELD_OUT, Plan
 
@@ -103,8 +103,8 @@ class Paths:
             other = designer.widest(best.centre, experiment.seed + 1)
         except ExcitationError as error:
             raise NoSafeTorque(
-                f"{config.path}: {error}. Widen position_limit, raise current_limit, correct [clearance], or give "
-                "[joint_path] and pilot = false."
+                f"{config.path}: {error}. Widen position_limit, raise {limit_names(config)}, correct [clearance], or "
+                "give [joint_path] and pilot = false."
             ) from error
         return cls(config, designer, best, other, reserve)
 

@@ -26,6 +26,7 @@ from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
 from hil.pilot.punctual import punctual
 from hil.pilot.steps import Say, Step, tells_of_the_arm
+from hil.plan.chain_model import limit_names
 from hil.plan.chain_plan import NoHeadroom
 from hil.plan.plan import Plan
 from hil.results.result import SettledResult
@@ -235,8 +236,9 @@ def _remedy(config: Config) -> str:
     spread = 0.3 if config.arm.prior is None else config.arm.prior.spread
     return (
         "Depending on the reason, these changes help: a rest_pose farther from limits and obstacles; a wider "
-        "position_limit; more room in [clearance] (floor, boxes, margin), if there is more; a larger current_limit "
-        f"or velocity_limit; or masses in the URDF that are known better, with [arm.prior] spread below {spread:g}."
+        "position_limit; more room in [clearance] (floor, boxes, margin), if there is more; a larger "
+        f"{limit_names(config)} or velocity_limit; or masses in the URDF that are known better, with [arm.prior] "
+        f"spread below {spread:g}."
     )
 
 
