@@ -1,5 +1,6 @@
 """Drives of a chain whose torque comes late: lags that differ, and the back-EMF of voltage-driven joints."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from hil.estimator.chain.fit.stage1 import fit_lines
 from hil.estimator.chain.identify import identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.late_torque import as_moving, lags_of
+from hil.estimator.chain.simulation.sensitivity import Simulation
 from hil.estimator.data.settled_period import SettledPeriod
 
 LAGS = (0.6e-3, 1.4e-3, 0.8e-3, 1.2e-3)
@@ -59,6 +61,22 @@ def test_derivatives_are_those_of_the_sum_of_squares(setup: bench.Setup, period:
             4 * step
         )  # the cost's gradient is twice J'r
         assert gradient[model.names.index(name)] == pytest.approx(difference, rel=2e-3, abs=1e-2), name
+
+
+def test_a_diverging_simulation_costs_infinitely_much_without_a_warning(
+    setup: bench.Setup, period: SettledPeriod, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = ChainModel(setup.base, drive="lag", by_voltage=(1,))
+    problem, x = stage2._problem([period], model, fit_lines([period], model, setup.prior), setup.prior, stage2.DEFAULTS)
+
+    def diverge(_: Simulation, run: object, part: slice) -> tuple[None, np.ndarray]:
+        del run
+        return None, np.full((part.stop - part.start, 4, len(model.names) + 8), np.inf)
+
+    monkeypatch.setattr(Simulation, "go_on", diverge)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert problem.evaluate(x).cost == np.inf
 
 
 def test_a_lagging_back_emf_makes_a_joint_move_like_a_lighter_one(setup: bench.Setup) -> None:
