@@ -2,12 +2,16 @@
 
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from benchmarks import chain as bench
 from hil.estimator.chain.fit import stage2
+from hil.estimator.chain.fit.objective import ChainProblem
+from hil.estimator.chain.fit.resolved_widths import resolved_widths
 from hil.estimator.chain.fit.stage1 import fit_lines
 from hil.estimator.chain.identify import identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -77,6 +81,19 @@ def test_a_diverging_simulation_costs_infinitely_much_without_a_warning(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert problem.evaluate(x).cost == np.inf
+
+
+def test_the_narrowest_coulomb_step_is_that_of_the_lighter_joint(setup: bench.Setup, period: SettledPeriod) -> None:
+    model = ChainModel(setup.base, drive="lag", by_voltage=(4,))
+    parameters = dict(zip(setup.base.names, setup.truth.tolist(), strict=True))
+    parameters |= {f"coulomb_{joint}": 0.1 for joint in (1, 2, 3, 4)}
+    parameters |= {"viscous_4": 0.2, "back_emf_4": 0.9, "lag": 1e-3}
+
+    def width(parameters: dict[str, float]) -> float:
+        problem = SimpleNamespace(model=model, periods=[period], parameters=lambda _: parameters)
+        return float(resolved_widths(cast("ChainProblem", problem), np.zeros(1), 1e-4, 4.0)[3])
+
+    assert width(parameters) > 1.0001 * width(parameters | {"lag": 0.0})
 
 
 def test_a_lagging_back_emf_makes_a_joint_move_like_a_lighter_one(setup: bench.Setup) -> None:
