@@ -108,6 +108,11 @@ class JointConfig(Table):
         return self.torque_per_volt_std if self.drive_mode is Mode.PWM else self.torque_constant_std
 
     @property
+    def goal_limit_name(self) -> str:
+        """Name of the setting that limits the goal in this joint's mode."""
+        return "voltage_limit" if self.drive_mode is Mode.PWM else "current_limit"
+
+    @property
     def goal_limit(self) -> float:
         """Largest allowed goal: A, or V in pwm mode."""
         value = self.voltage_limit if self.drive_mode is Mode.PWM else self.current_limit

@@ -47,7 +47,8 @@ class LoweringForeseen:
     """Predicted lowering.
 
     seconds: longest duration [s]. nearest: least clearance. lies: fraction of simulations that end in the rest pose.
-    joint: name of the joint that ends farthest from it, `away` [rad].
+    joint: name of the joint that ends farthest from it, `away` [rad]. limit: name of the setting that limits its
+    torque. slower: the change of settings that makes the lowering slower.
     """
 
     seconds: float
@@ -55,6 +56,8 @@ class LoweringForeseen:
     lies: float
     joint: str
     away: float
+    limit: str
+    slower: str
 
 
 @dataclass(frozen=True)
@@ -75,9 +78,9 @@ class ChainStops:
             )
         if down.lies < LAID_DOWN:
             return (
-                f"a stop brings only {100 * down.lies:.0f} % of the simulated arms to the rest pose, of at least "
+                f"only {100 * down.lies:.0f} % of the simulated stops bring the arm to the rest pose, of at least "
                 f"{100 * LAID_DOWN:.0f} % required: {down.joint!r} ends up to {down.away:.2g} rad away. Raise its "
-                "current_limit or safety.lower_time, choose a rest_pose in which gravity pulls it less or farther from "
+                f"{down.limit}, {down.slower}, choose a rest_pose in which gravity pulls it less or farther from "
                 "its limits, or give the masses more accurately"
             )
         return ""
@@ -130,6 +133,11 @@ def _dropped(space: Space, first: Array, before: Array, last: Array, rate: float
     return float(((top - bottom) @ up).max()), float(np.linalg.norm(bottom - former, axis=-1).max() * rate)
 
 
+def _slower(config: Config, longest: float) -> str:
+    """Say how to make a lowering slower whose path takes at most `longest` [s]."""
+    return "raise safety.lower_time" if longest >= config.safety.lower_time else "lower safety.lower_speed"
+
+
 def _lowered(
     config: Config, plan: Plan, segment: PathSegment, arms: ChainArms, starts: list[tuple[float, Array, Array]]
 ) -> LoweringForeseen:
@@ -160,4 +168,6 @@ def _lowered(
         float(np.mean(lies)),
         config.joints[farthest].name,
         float(min(away[farthest], np.pi)),
+        config.joints[farthest].goal_limit_name,
+        _slower(config, longest),
     )

@@ -1,6 +1,8 @@
 """The links of an identified spatial arm: physically consistent, with the identified dynamics, closest to the URDF."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isclose
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +44,11 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
     geometry = model.geometry
     chain = Chain(geometry.rotation, geometry.translation, geometry.axis, geometry.gravity)
     base = BaseParameters.of(chain, tilts=TILT[0] in model.values)
+    if not _same_groups(base, model.groups):
+        raise ExportError(
+            f"{source.run}: the version that estimated this run groups the parameters of the links differently "
+            "than this one. Run hil estimate again."
+        )
     value = np.array([model.values[name] for name in base.names])
     std = np.array([model.stds[name] for name in base.names])
     rotors = np.array([max(model.values.get(f"armature_{n}", 0.0), 1e-3) for n in range(1, len(model.joints) + 1)])
@@ -54,6 +61,24 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
         )
     bodies = tuple(_body(row) for row in found.links)
     return ChainLinks(path, arm, bodies, tuple(found.armature.tolist()), (*said, *_left_out(model)))
+
+
+def _same_groups(base: BaseParameters, groups: Mapping[str, str]) -> bool:
+    """Return whether these groups are those of the base parameters, up to rounding of their factors."""
+    if set(groups) != set(base.names):
+        return False
+    return all(_same_sum(group, groups[name]) for name, group in zip(base.names, base.groups, strict=True))
+
+
+def _same_sum(one: str, other: str) -> bool:
+    words, others = one.split(), other.split()
+    return len(words) == len(others) and all(map(_same_word, words, others))
+
+
+def _same_word(one: str, other: str) -> bool:
+    if one[0].isdigit() and other[0].isdigit():
+        return isclose(float(one), float(other), rel_tol=1e-4)
+    return one == other
 
 
 def _left_out(model: ChainArmModel) -> list[str]:

@@ -11,7 +11,7 @@ from hil.errors import NoSafeTorque
 from hil.estimator.chain.excitation.fourier_path import Path
 from hil.estimator.chain.excitation.path_design import Design, PathDesigner, PathLimits
 from hil.estimator.errors import ExcitationError
-from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
+from hil.plan.chain_model import ChainTorque, known_chain, limit_names, torque_limits
 from hil.plan.chain_plan import check_rest_pose, path_plan
 from hil.plan.plan import HELD_OUT, Plan
 
@@ -43,10 +43,13 @@ class Reserve:
 
     def larger(self, shortage: float) -> "Reserve":
         """Return a larger reserve. shortage: by how much the predicted clearance was too small [m], otherwise 0."""
-        return Reserve(MORE * self.position, self.speed / MORE, self.torque / MORE, self.clearance + shortage)
+        position = min(MORE * self.position, MOST_POSITION)
+        return Reserve(position, self.speed / MORE, self.torque / MORE, self.clearance + shortage)
 
 
 MORE = 1.4
+MOST_POSITION = 0.3
+"""Largest reserve of position: at one half, nothing of a joint's range would be left."""
 RESERVE = Reserve()
 
 
@@ -100,10 +103,15 @@ class Paths:
             other = designer.widest(best.centre, experiment.seed + 1)
         except ExcitationError as error:
             raise NoSafeTorque(
-                f"{config.path}: {error}. Widen position_limit, raise current_limit, correct [clearance], or give "
-                "[joint_path] and pilot = false."
+                f"{config.path}: {error}. Widen position_limit, raise {limit_names(config)}, correct [clearance], or "
+                "give [joint_path] and pilot = false."
             ) from error
         return cls(config, designer, best, other, reserve)
+
+    def amplitude_over(self, other: "Paths") -> float:
+        """Return the largest ratio of a joint's peak excursion or speed in these paths to that in others."""
+        pairs = (self.identify, other.identify), (self.held_out, other.held_out)
+        return max(float((_peaks(mine.path) / _peaks(its.path)).max()) for mine, its in pairs)
 
     def plan(self, config: Config, thought: ChainTorque, share: float) -> Plan:
         """Plan both paths at this fraction of their amplitude."""
@@ -112,6 +120,13 @@ class Paths:
             return self.designer.scaled(self.held_out if role == HELD_OUT else self.identify, share)
 
         return path_plan(config, thought, path)
+
+
+def _peaks(path: Path) -> Array:
+    """Peak excursion from the centre [rad] and peak speed [rad/s] of each joint (2, joints)."""
+    excursion = path.position - path.position.mean(axis=1, keepdims=True)
+    peaks: Array = np.maximum(np.abs(np.stack((excursion, path.velocity))).max(axis=2), 1e-9)
+    return peaks
 
 
 def chain_config(config: Config) -> Config:

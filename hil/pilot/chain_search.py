@@ -26,6 +26,7 @@ from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
 from hil.pilot.punctual import punctual
 from hil.pilot.steps import Say, Step, tells_of_the_arm
+from hil.plan.chain_model import limit_names
 from hil.plan.chain_plan import NoHeadroom
 from hil.plan.plan import Plan
 from hil.results.result import SettledResult
@@ -64,7 +65,11 @@ class Found:
 
 @dataclass
 class ChainSearch:
-    """Runs so far and the current belief."""
+    """Runs so far and the current belief.
+
+    last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are shares of `paths`,
+    and are converted when these are replaced.
+    """
 
     given: Config
     run: RunFolder
@@ -75,6 +80,7 @@ class ChainSearch:
     paths: Paths
     steps: list[Step] = field(default_factory=list)
     cap: float = 1.0
+    last: float = np.inf
 
     @classmethod
     def of(cls, config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say) -> "ChainSearch":
@@ -93,26 +99,33 @@ class ChainSearch:
         """The configuration with a stabiliser suited to the current ensemble."""
         return self.belief.with_stabiliser(self.given)
 
-    def safe(self, config: Config, shares: tuple[float, ...]) -> Found:
+    def safe(self, config: Config, shares: tuple[float, ...], most: float = np.inf) -> Found:
         """Find the first of the `shares` of the designed path that is safe for all simulated arms.
+
+        most: largest share; of other paths, it is the share with the same amplitude. The shares are scaled to it.
 
         If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
         kept. Raises NoSafeTorque if no share of any path is safe.
         """
-        found, why, shortage = self._largest(config, shares)
+        most = min(most, self.cap) if self.cap < 1.0 else most
+        found, why, shortage = self._largest(config, _up_to(most, shares))
+        reserve = self.paths.reserve
         for _ in range(REDESIGNS):
-            if found is not None and found.share >= SMALL * shares[0]:
+            if found is not None and found.share >= SMALL * min(most, shares[0]):
                 break
-            former = self.paths
+            former, reserve = self.paths, reserve.larger(shortage)
             try:
-                self.paths = Paths.of(self.given, self.belief.torque, former.reserve.larger(shortage))
+                self.paths = Paths.of(self.given, self.belief.torque, reserve)
             except NoSafeTorque:
                 break
-            other, other_why, shortage = self._largest(config, shares)
+            times = self.paths.amplitude_over(former)
+            other, other_why, shortage = self._largest(config, _up_to(most / times, shares))
             if other is None or (found is not None and self._worth(former, found) <= self._worth(self.paths, other)):
-                self.paths = replace(former, reserve=self.paths.reserve)
+                self.paths = former
             else:
                 found = other
+                most, self.last = most / times, self.last / times
+                self.cap = min(self.cap / times, 1.0) if self.cap < 1.0 else 1.0
                 self.say("Designed another path, which stays farther from the limits.")
             why = why if other is not None else other_why
         if found is None:
@@ -154,7 +167,7 @@ class ChainSearch:
     def step(self, name: str, folder: str, shares: tuple[float, ...]) -> Found:
         """Play one step, compare it with the prediction, and update the belief."""
         config = step_config(self.config)
-        found = self.safe(config, shares)
+        found = self.safe(config, shares, shares[0] if self.steps else np.inf)
         below = self.run.below(folder, config)
         error = self.play(config, below, name, found)
         if error is not None:
@@ -170,11 +183,11 @@ class ChainSearch:
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
-        """Play a run; return the error that ended it early, or None.
+        """Play a run, whose share is then the `last`; return the error that ended it early, or None.
 
         Only errors that are informative about the arm are returned; all others that a run raises are raised.
         """
-        error = None
+        error, self.last = None, found.share
         try:
             self.torque = punctual(
                 lambda: run_experiment(config, folder, self.shown_path, self.watch, found.plan, self.belief.arms),
@@ -213,13 +226,19 @@ class ChainSearch:
             )
 
 
+def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the shares, scaled so that the first is at most `most`."""
+    return tuple(min(1.0, most / shares[0]) * share for share in shares)
+
+
 def _remedy(config: Config) -> str:
     """Return the changes with which a user may make a path safe."""
     spread = 0.3 if config.arm.prior is None else config.arm.prior.spread
     return (
         "Depending on the reason, these changes help: a rest_pose farther from limits and obstacles; a wider "
-        "position_limit; more room in [clearance] (floor, boxes, margin), if there is more; a larger current_limit "
-        f"or velocity_limit; or masses in the URDF that are known better, with [arm.prior] spread below {spread:g}."
+        "position_limit; more room in [clearance] (floor, boxes, margin), if there is more; a larger "
+        f"{limit_names(config)} or velocity_limit; or masses in the URDF that are known better, with [arm.prior] "
+        f"spread below {spread:g}."
     )
 
 
@@ -232,20 +251,16 @@ def identify_chain_in_steps(
     """
     with StopRequest(), servo_session(config, run.path, say):
         search = ChainSearch.of(config, run, shown_path, watch, say)
-        found = search.step("Pilot", "pilot", PILOT_SHARES)
-        last = found.share
+        search.step("Pilot", "pilot", PILOT_SHARES)
         while len(search.steps) < MOST_STEPS:
-            shares = tuple(search.cap * share for share in SHARES)
-            wanted = search.safe(step_config(search.config), shares)
-            if wanted.share <= RAISED * last and search.cap == 1.0:
+            wanted = search.safe(step_config(search.config), SHARES)
+            if wanted.share <= RAISED * search.last and search.cap == 1.0:
                 break
-            if len(search.steps) > 1 and wanted.share <= MOST_RAISE * last:
+            if len(search.steps) > 1 and wanted.share <= MOST_RAISE * search.last:
                 break
             number = len(search.steps) + 1
-            share = min(wanted.share, MOST_RAISE * last)
-            last = search.step(
-                f"Step {number}", f"step-{number}", tuple(share * each for each in (1.0, 0.8, 0.6))
-            ).share
+            share = min(wanted.share, MOST_RAISE * search.last)
+            search.step(f"Step {number}", f"step-{number}", tuple(share * each for each in (1.0, 0.8, 0.6)))
         torque = _full(search)
         result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))
     run.write_result(result)
@@ -257,7 +272,7 @@ def _full(search: ChainSearch) -> str:
     tries = 3
     for number in range(1, tries + 1):
         config = search.config
-        found = search.safe(config, tuple(search.cap * share for share in SHARES))
+        found = search.safe(config, SHARES, MOST_RAISE * search.last)
         search.run.write_played(config)
         error = search.play(config, search.run, "Full run", found)
         if error is None:

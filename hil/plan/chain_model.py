@@ -67,6 +67,11 @@ def described_torque(config: Config, known: KnownChain) -> ChainTorque:
     return ChainTorque(known.base, known.base.of_all(known.described), rough, rough, np.zeros_like(rough))
 
 
+def limit_names(config: Config) -> str:
+    """Name the settings that limit the joints' torque: current_limit, voltage_limit in PWM mode, or both."""
+    return " or ".join(sorted({joint.goal_limit_name for joint in config.joints}))
+
+
 def torque_limits(config: Config) -> Array:
     """Largest torque of each joint (joints,) [N m]."""
     return np.array([joint.goal_limit * joint.torque_per_goal for joint in config.joints])

@@ -88,6 +88,8 @@ class PathDesigner:
                 f"a path of {period:g} s with harmonics up to {highest:g} Hz at {rate:g} samples/s: needs at least two "
                 "harmonics below an eighth of the rate"
             )
+        if (limits.low >= limits.high).any():
+            raise ExcitationError("no range of position is left for a path")
         self._base, self._prior, self._limits, self._friction = base, prior, limits, friction
         self._samples, self._period = round(rate * period), period
         few = min(LOOKED_AT, self._samples)

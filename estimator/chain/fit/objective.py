@@ -247,12 +247,12 @@ class ChainProblem:
         kept = []
         for part in pieces(len(run.measured)):
             position, derivative = simulation.go_on(run, part)
+            if position is None:  # the derivatives are not finite either
+                yield part, None, derivative
+                return
             complete(self.model.base, parameters, names, derivative)
             if added is not None:
                 derivative[:, :, names.index(ADDED_MASS)] = derivative[:, :, : added.size] @ added
-            if position is None:
-                yield part, None, derivative
-                return
             r = np.where(np.isnan(run.measured[part]), 0.0, position - run.measured[part])
             yield part, r, derivative
             latest.size += derivative.nbytes

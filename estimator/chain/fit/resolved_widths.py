@@ -5,6 +5,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.model.dynamics import mass_matrix
+from hil.estimator.chain.model.late_torque import as_moving
 
 POSES = 40  # of a recording, in which the joints' inertias are computed
 
@@ -21,7 +22,8 @@ def resolved_widths(problem: ChainProblem, x: Array, shortest_step: float, width
         shortest_step: shortest integration step, near standstill [s].
         widths_per_substep: number of widths through which a reversal of friction may take a joint in `shortest_step`.
     """
-    model, parameters = problem.model, problem.parameters(x)
+    model = problem.model
+    parameters = as_moving(model.base, problem.parameters(x))
     every = model.base.as_all(np.array([parameters[name] for name in model.base.names]))
     inertia = np.inf * np.ones(model.joints)
     for period in problem.periods:

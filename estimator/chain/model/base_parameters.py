@@ -106,10 +106,15 @@ class BaseParameters:
 
 
 def _norms_by_kind(norm: Array) -> Array:
-    """Return the largest norm of the columns of the same link and kind, for each column."""
+    """Return the largest norm of the columns of the same link and kind, for each column.
+
+    Where a kind has hardly any effect in a link, such as the moments of the first link if its axis is vertical up to
+    rounding, it is that of all links: these columns must not be scaled up.
+    """
     largest = norm.reshape(-1, TERMS).copy()
     for kind in KINDS:
-        largest[:, kind] = largest[:, kind].max(axis=1, keepdims=True)
+        of_link = largest[:, kind].max(axis=1, keepdims=True)
+        largest[:, kind] = np.where(of_link < INDEPENDENT * of_link.max(), of_link.max(), of_link)
     return largest.reshape(-1)
 
 

@@ -1,16 +1,22 @@
 """Drives of a chain whose torque comes late: lags that differ, and the back-EMF of voltage-driven joints."""
 
+import warnings
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from benchmarks import chain as bench
 from hil.estimator.chain.fit import stage2
+from hil.estimator.chain.fit.objective import ChainProblem
+from hil.estimator.chain.fit.resolved_widths import resolved_widths
 from hil.estimator.chain.fit.stage1 import fit_lines
 from hil.estimator.chain.identify import identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.late_torque import as_moving, lags_of
+from hil.estimator.chain.simulation.sensitivity import Simulation
 from hil.estimator.data.settled_period import SettledPeriod
 
 LAGS = (0.6e-3, 1.4e-3, 0.8e-3, 1.2e-3)
@@ -59,6 +65,35 @@ def test_derivatives_are_those_of_the_sum_of_squares(setup: bench.Setup, period:
             4 * step
         )  # the cost's gradient is twice J'r
         assert gradient[model.names.index(name)] == pytest.approx(difference, rel=2e-3, abs=1e-2), name
+
+
+def test_a_diverging_simulation_costs_infinitely_much_without_a_warning(
+    setup: bench.Setup, period: SettledPeriod, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = ChainModel(setup.base, drive="lag", by_voltage=(1,))
+    problem, x = stage2._problem([period], model, fit_lines([period], model, setup.prior), setup.prior, stage2.DEFAULTS)
+
+    def diverge(_: Simulation, run: object, part: slice) -> tuple[None, np.ndarray]:
+        del run
+        return None, np.full((part.stop - part.start, 4, len(model.names) + 8), np.inf)
+
+    monkeypatch.setattr(Simulation, "go_on", diverge)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert problem.evaluate(x).cost == np.inf
+
+
+def test_the_narrowest_coulomb_step_is_that_of_the_lighter_joint(setup: bench.Setup, period: SettledPeriod) -> None:
+    model = ChainModel(setup.base, drive="lag", by_voltage=(4,))
+    parameters = dict(zip(setup.base.names, setup.truth.tolist(), strict=True))
+    parameters |= {f"coulomb_{joint}": 0.1 for joint in (1, 2, 3, 4)}
+    parameters |= {"viscous_4": 0.2, "back_emf_4": 0.9, "lag": 1e-3}
+
+    def width(parameters: dict[str, float]) -> float:
+        problem = SimpleNamespace(model=model, periods=[period], parameters=lambda _: parameters)
+        return float(resolved_widths(cast("ChainProblem", problem), np.zeros(1), 1e-4, 4.0)[3])
+
+    assert width(parameters) > 1.0001 * width(parameters | {"lag": 0.0})
 
 
 def test_a_lagging_back_emf_makes_a_joint_move_like_a_lighter_one(setup: bench.Setup) -> None:

@@ -13,8 +13,9 @@ from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_summary import unsafe
 from hil.errors import Cause, ConfigError, DidNotMove, NoSafeTorque, NotSettled, SafetyStop
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
+from hil.estimator.chain.excitation.path_design import Design
 from hil.pilot.chain_belief import ChainBelief
-from hil.pilot.chain_paths import Paths, chain_config
+from hil.pilot.chain_paths import RESERVE, Paths, Reserve, chain_config
 from hil.pilot.chain_search import ChainSearch, Found, step_config
 from hil.plan.chain_model import known_chain
 from hil.runs.recording import load_samples
@@ -181,3 +182,63 @@ def test_a_path_that_is_safe_is_kept() -> None:
     designed = search.paths
     assert search.safe(step_config(search.config), (0.3,)).share == 0.3
     assert search.paths is designed
+
+
+def test_paths_that_are_rejected_do_not_make_later_ones_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = chain_config(load_config(LEG))
+    search = search_of(config, ChainBelief.prior(config), [])
+    designed, tried = search.paths, []
+
+    def of(_: object, __: object, reserve: Reserve) -> Paths:
+        tried.append(reserve)
+        return replace(designed, reserve=reserve)
+
+    def largest(_: object, __: object) -> tuple[Found | None, str, float]:
+        share = 0.18 if search.paths is designed else 0.06
+        return Found(share, cast("Any", None), cast("Any", None)), "shank and floor: 2 mm", 0.0
+
+    monkeypatch.setattr(Paths, "of", of)
+    monkeypatch.setattr(search, "_largest", largest)
+    for _ in range(3):
+        search.safe(search.config, (1.0, 0.18))
+    assert search.paths is designed
+    assert tried == 3 * [RESERVE.larger(0.0), RESERVE.larger(0.0).larger(0.0)]
+
+
+def test_a_reserve_always_leaves_some_range() -> None:
+    reserve = RESERVE
+    for _ in range(8):
+        reserve = reserve.larger(0.01)
+    assert reserve.position < 0.35
+    config = chain_config(load_config(LEG))
+    with pytest.raises(NoSafeTorque, match="no range of position is left"):
+        Paths.of(config, ChainBelief.prior(config).torque, replace(RESERVE, position=0.5))
+
+
+def wider(paths: Paths, times: float) -> Paths:
+    def design(each: Design) -> Design:
+        return replace(each, path=paths.designer.scaled(each, times))
+
+    return replace(paths, identify=design(paths.identify), held_out=design(paths.held_out))
+
+
+def test_another_path_starts_with_no_more_amplitude_than_the_one_it_replaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shares of different paths cannot be compared; those of the previous run and of its limit are converted."""
+    config = chain_config(load_config(LEG))
+    search = search_of(config, ChainBelief.prior(config), [])
+    designed, tried = search.paths, []
+    search.last, search.cap = 0.2, 0.8
+    other = wider(designed, 4.0)
+    assert other.amplitude_over(designed) == pytest.approx(4.0)
+
+    def largest(_: object, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
+        tried.append(shares)
+        share = 0.0 if search.paths is designed else shares[0]
+        return Found(share, cast("Any", None), cast("Any", None)) if share else None, "too much torque", 0.0
+
+    monkeypatch.setattr(Paths, "of", lambda *_: other)
+    monkeypatch.setattr(search, "_largest", largest)
+    found = search.safe(search.config, (1.0, 0.5), 2.5 * search.last)
+    assert tried == [(0.5, 0.25), (pytest.approx(0.125), pytest.approx(0.0625))]
+    assert found.share == pytest.approx(0.125)
+    assert search.last == pytest.approx(0.05) and search.cap == pytest.approx(0.2)
