@@ -93,30 +93,24 @@ def run_experiment(
                 _play(config, plan, bus, recorder, stop, shown, note, arms)
             torque = str(bus.torque_off_report)
             note(torque)
-            _close(recorder, torque)
+            with _with_torque(torque):
+                recorder.close()
             try:
                 write_json(run.path / "lateness.json", lateness_histogram(recorder.samples))
             except RunFolderError as lost:
                 torque = f"{torque} {lost} The recording itself is complete."
-        _check_still_wanted(stop, torque)
+        with _with_torque(torque):
+            stop.check()  # the recording is kept, but nothing more is run
     return torque
 
 
-def _close(recorder: Recorder, torque: str) -> None:
-    """Close the recording; the error of a failure also states whether torque is off."""
+@contextmanager
+def _with_torque(torque: str) -> Iterator[None]:
+    """Add whether torque is off to a recording that cannot be closed, and to a stop requested while it was cut."""
     try:
-        recorder.close()
-    except RunFolderError as error:
+        yield
+    except (RunFolderError, StopRequested) as error:
         error.add_note(torque)
-        raise
-
-
-def _check_still_wanted(stop: StopRequest, torque: str) -> None:
-    """Raise a stop request that arrived while torque was being cut: the recording is kept, but nothing more is run."""
-    try:
-        stop.check()
-    except StopRequested as request:
-        request.add_note(torque)
         raise
 
 
