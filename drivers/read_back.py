@@ -16,7 +16,8 @@ _READ_BACK_S = 0.015
 _GOALS_PER_MODE = 2
 """Largest number of goal read-backs between two mode read-backs.
 
-Number and times are random, because a regular pattern might never see a program that overwrites every other goal.
+This number and the times are random, because regular checks might never detect a program that overwrites every other
+goal.
 """
 
 _GOALS_PER_MODE_IN_DOUBT = 4

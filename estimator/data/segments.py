@@ -121,7 +121,7 @@ def grid_torque(recording: Recording, grid: Grid, delay: float, lag: float) -> A
 
 
 def grid_torque_slopes(recording: Recording, grid: Grid, delay: float, lag: float) -> Array:
-    """Return the derivatives of `grid_torque` by delay and lag (2, joints, steps) [N m/s], by central differences."""
+    """Differentiate `grid_torque` with respect to delay and lag (2, joints, steps) [N m/s], by central differences."""
 
     def at(delay: float, lag: float) -> Array:
         return grid_torque(recording, grid, delay, lag)

@@ -210,12 +210,12 @@ def _flattened(order: Harmonics, phase: Array, samples: int, norms: tuple[int, .
 
 
 def _norm(phase: Array, order: Harmonics, samples: int, p: int) -> tuple[float, Array]:
-    """Return the logarithm of the wave's L2p norm, and its gradient by the phases (lines,)."""
+    """Return the logarithm of the wave's L2p norm, and its gradient with respect to the phases (lines,)."""
     wave = _wave(order, phase, samples)
     peak = float(np.abs(wave).max())
     steep = (wave / peak) ** (2 * p - 1)
     total = float(np.sum(steep * wave)) / peak
-    # The derivative of the wave by a phase is -sin; its sum over time with `steep` is a Fourier line of `steep`.
+    # The derivative with respect to a phase is -sin; its sum over time with `steep` is a Fourier line of `steep`.
     lines = np.fft.rfft(steep)[order]
     gradient = np.imag(np.exp(-1j * phase) * lines) / (peak * total)
     return math.log(total) / (2 * p) + math.log(peak), gradient

@@ -132,10 +132,10 @@ def robust_covariance(
 
 
 def is_unpredictable(at: Quadratic, samples: int) -> bool:
-    """Return whether the motion is so sensitive that its derivatives are meaningless for all but the smallest changes.
+    """Return whether the motion is so sensitive that its derivatives are only valid for the smallest changes.
 
-    Coordinates are of order 1. If a change of one in a million alters a sample by ten times the noise, the simulation
-    diverges; its standard errors would be tiny and meaningless.
+    Coordinates are of order 1. If a change of 1e-6 alters a sample by ten times the noise, the simulation diverges; its
+    standard errors would be tiny and meaningless.
     """
     return bool(np.max(np.diag(at.normal), initial=0.0) > (samples * SENSITIVE**2))
 

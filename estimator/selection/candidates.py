@@ -1,11 +1,11 @@
 """Missing model terms, judged without fitting them: score tests, and the effect of omission on standard errors.
 
 Near an estimate the motion is linear in small changes of any parameter, including those of terms that the model lacks.
-One simulation with the derivatives by all of them yields the decrease of the sum of squares if a term were added (C. R.
-Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the fitted parameters. Terms
-that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the standard errors even if
-the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3 (1966) 293), with
-their typical size as the prior and the information from the motion in addition.
+One simulation with the derivatives with respect to all of them yields the decrease of the sum of squares if a term were
+added (C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the fitted
+parameters. Terms that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the standard
+errors even if the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3
+(1966) 293), with their typical size as the prior and the information from the motion in addition.
 """
 
 from collections.abc import Mapping, Sequence
@@ -285,7 +285,8 @@ def _sizes(period: SettledPeriod, estimate: Estimate) -> Sizes:
 
 
 def by_parameters(period: SettledPeriod, estimate: Estimate) -> Array:
-    """Return derivatives of the positions of `period` by all causes (joints, samples, causes), over the residual's RMS.
+    """Return the derivatives of positions with respect to all causes (joints, samples, causes), over the residual's
+    RMS.
 
     The causes are the estimate's parameters, followed by the initial state, as in `Linearised`.
     """

@@ -186,7 +186,7 @@ class Selection:
         return best
 
     def _closest(self) -> list[Trial]:
-        """Return the trials that explain most, with and without presliding, best first.
+        """Return the trials that explain the most, with and without presliding, best first.
 
         Ripple is most visible where other terms explain most, whether or not they are significant yet; but bristles may
         have absorbed part of it.
@@ -196,7 +196,7 @@ class Selection:
         return sorted(kinds.values(), key=self._left)
 
     def _steadied(self, trial: Trial | None) -> Trial | None:
-        """Correct the periods for a change of friction, if one is seen and the motion is explained as well then.
+        """Correct the periods for a change of friction, if one is found and the motion is then explained as well.
 
         The change is sought with the recordings as they are, so that a later call, with a better model, replaces or
         withdraws an earlier correction. Returns the fit of the periods as they are then, or else `trial`.

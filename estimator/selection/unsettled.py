@@ -187,7 +187,7 @@ class _Search:
     def judged(self, plain: ShootingEstimate, best: ShootingEstimate) -> SegmentChoice:
         """Return the choice: `best`, or the simplest model if that predicts held-out segments much better.
 
-        If no model explains the motion, predicting better at all is enough.
+        If no model explains the motion, any improvement is enough.
         """
         simple = Model(plain.model.joints, "coulomb", plain.model.drive)
         plainest, chosen = self.trial(plain, simple), self.trial(best, best.model)

@@ -28,8 +28,8 @@ def wave_peaks(
 
     What the fitted parameters explain is removed first. The result is by parameter name. If the estimate's model
     includes a wave that is sought, that wave is disabled first. While other terms have absorbed part of a wave, the
-    best number
-    may be a wrong one: those that explain at least `COMPARABLE` of what it does are returned as well.
+    best number may be wrong: those that explain at least the fraction `COMPARABLE` of what it does are returned as
+    well.
 
     only: joints, from 1, that are considered; by default all.
     """

@@ -130,14 +130,12 @@ def _print_difference(difference: "Difference") -> None:
 
 
 def _would_show(detectable: "Mapping[str, float]") -> list[str]:
-    """Say which change of a single friction term two such runs would have revealed [% by name], and for which terms
-    none.
-    """
+    """Describe the smallest change of each friction term alone that two such runs would reveal [%, by name], if any."""
     least = [f"{name} {percent:.2g} %" for name, percent in detectable.items() if percent <= _WHOLE]
     never = [name for name, percent in detectable.items() if percent > _WHOLE]
     lines = []
     if least:
-        known = "Smallest changes of single terms that 95 of 100 such pairs of runs reveal"
+        known = "Smallest changes of single terms that 95 of 100 such pairs of runs would detect"
         lines.append(f"{known}: {', '.join(least)}.")
     if never:
         lines.append(f"Not even a doubling would be detected: {', '.join(never)}.")

@@ -153,8 +153,8 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
     ]
     if run.shapes_guessed:
         lines.append(
-            f"No collision geometry could be read for {', '.join(run.shapes_guessed)}: replaced by capsules from joint "
-            "to joint (a base is left out)."
+            f"No collision geometry could be read for {', '.join(run.shapes_guessed)}: these links are replaced by "
+            "capsules from joint to joint (a base link is left out)."
         )
     if run.as_built:
         pairs = ", ".join(f"{a} and {b}" for a, b in run.as_built)

@@ -49,7 +49,7 @@ class Silence:
         return self._asked_at is not None and self._asked_at < self._busy_until
 
     def woke_up(self, now: float, late: float) -> None:
-        """Record that this program woke up at `now` [s], `late` [s] after it wanted to."""
+        """Record that this program woke up at `now` [s], `late` [s] after the intended time."""
         if late >= LATE_WAKE_UP_S:
             self._busy_until = now + BUSY_S
 

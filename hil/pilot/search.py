@@ -196,7 +196,7 @@ class Search:
         if self.fast.any():
             yield (
                 f"{_and(_names(self.config, self.fast))} exceeded the velocity limit before moving by {MOVED_STEPS} "
-                "encoder steps: less torque is next."
+                "encoder steps: the next run uses less torque."
             )
         held = still & ~self.fast
         if held.any():

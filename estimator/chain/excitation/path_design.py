@@ -162,7 +162,7 @@ class PathDesigner:
         return best[1], best[2]
 
     def widest(self, centre: Array, seed: int, tries: int = WIDEST_OF) -> Design:
-        """Return the random path about a centre whose least moved joint moves most, for validation.
+        """Return, for validation, the random path about a centre in which the joint that moves least moves farthest.
 
         A prediction cannot be verified to be more accurate than encoder rounding relative to the motion. Raises
         ExcitationError if no path is allowed.

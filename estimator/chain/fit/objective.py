@@ -66,8 +66,8 @@ class ChainProblem:
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; less near the minimum."""
     prior_weight: float = 1.0
-    """Factor of the prior's precision: above 1 while model errors exceed the noise that the weights assume, so that
-    the prior still decides what the data do not determine."""
+    """Factor on the prior's precision: above 1 while model errors exceed the noise that the weights assume, so that the
+    prior still decides what the data do not determine."""
     added: tuple[Array | None, ...] = ()
     """Known base parameters of what was added to the arm in each period (base parameters,) [SI]; None for nothing."""
     _latest: _Latest = field(init=False, repr=False, compare=False, default_factory=_Latest)
@@ -185,7 +185,9 @@ class ChainProblem:
         return tuple(found)
 
     def _motions(self, x: Array) -> Iterator[tuple[ChainRun, Array | None]]:
-        """Yield each period's run and its simulated positions (samples, joints) [rad], None if they diverge."""
+        """Yield each period's run and its simulated positions (samples, joints) [rad], or None if the simulation
+        diverges.
+        """
         parameters = self.parameters(x)
         for index, period in enumerate(self.periods):
             run = self.run_of(period, parameters)
@@ -232,7 +234,7 @@ class ChainProblem:
         """Yield the samples, residuals and derivatives of a period, piece by piece.
 
         The residuals, predicted minus measured (samples, joints) [rad], are 0 where a sample is missing, and None if
-        the motion diverges. The derivatives are by parameters and initial state.
+        the motion diverges. The derivatives are with respect to parameters and initial state.
         """
         latest = self._latest
         if latest.x is None or not np.array_equal(latest.x, x):
@@ -273,7 +275,9 @@ class ChainProblem:
         return parameters | {name: parameters[name] + scale * float(x) for name, x in zip(names, added, strict=True)}
 
     def _where(self, x: Array, index: int) -> tuple[list[int], Array]:
-        """Return the coordinates on which a period's motion depends, and the slopes of parameters and state by them."""
+        """Return the coordinates on which a period's motion depends, and the derivatives of parameters and state with
+        respect to them.
+        """
         size = self.state_scale.size
         first = self.count + index * size
         where = [*range(self.count), *range(first, first + size)]

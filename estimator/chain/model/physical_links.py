@@ -91,7 +91,7 @@ def _link(x: Array) -> Array:
 
 
 def _link_slopes(x: Array) -> Array:
-    """Return the derivatives of `_link` by its coordinates (10, 10)."""
+    """Return the derivatives of `_link` with respect to its coordinates (10, 10)."""
     columns = []
     for k, step in enumerate(STEP * _scales()):
         ahead, behind = x.copy(), x.copy()

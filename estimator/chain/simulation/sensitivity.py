@@ -99,7 +99,8 @@ class Simulation:
         """Simulate the next `piece` of the samples.
 
         Returns the angles (samples, joints) [rad], None if the motion diverges, and their derivatives (samples, joints,
-        causes). In place of that by a `lag_ratio` is the one by this joint's own lag, which that by `lag` excludes.
+        causes). The column of a `lag_ratio` holds the derivative with respect to that joint's own lag, which the column
+        of `lag` excludes.
         """
         torque, measured = run_.torque[piece], run_.measured[piece]
         position = np.empty(measured.shape)
