@@ -192,7 +192,7 @@ def found_beside(folder: Path, name: str) -> Path:
 
 
 def _known_names(name: str) -> str:
-    """The hint for a bare name that is not an arm's."""
+    """The hint for a bare name that is not that of an arm."""
     if "." in name or "/" in name:
         return ""
     close = get_close_matches(name, arm_names(), 1, 0.75)

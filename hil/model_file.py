@@ -138,7 +138,7 @@ def _check_chain(values: dict[str, float], geometry: Geometry, chain: ChainFacts
         raise ResultError(f"{path}: is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
     bad = [name for name, value in values.items() if not math.isfinite(value)]
     if bad:
-        raise ResultError(f"{path}: {', '.join(bad)} is not a finite number. Run hil estimate again.")
+        raise ResultError(f"{path}: not a finite number: {', '.join(bad)}. Run hil estimate again.")
 
 
 def _damaged(path: Path, error: FormError) -> ResultError:
@@ -164,7 +164,7 @@ def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
         )
     bad = [name for name, value in values.items() if not math.isfinite(value)]
     if bad:
-        raise ResultError(f"{path}: {', '.join(bad)} is not a finite number. Run hil estimate again.")
+        raise ResultError(f"{path}: not a finite number: {', '.join(bad)}. Run hil estimate again.")
 
 
 def _newer(schema: object) -> bool:

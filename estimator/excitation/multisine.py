@@ -80,7 +80,7 @@ def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tup
 
 
 def detecting_lines(period: float, band: tuple[float, float], joints: int, seed: int) -> tuple[tuple[int, ...], ...]:
-    """Assign odd harmonics to the joints in turn, leaving one of every DETECTION unexcited, drawn by `seed`.
+    """Assign odd harmonics to the joints in turn, leaving one of every DETECTION unexcited, at random (`seed`).
 
     On the unexcited lines, odd or even, the arm's nonlinear distortion becomes visible: see
     `hil.estimator.selection.distortion`. Raises ExcitationError if fewer lines than joints are left.
@@ -203,7 +203,7 @@ def _low_crest_phases(harmonics: tuple[int, ...], seed: int, joint: int) -> Arra
 
 
 def _flattened(order: Harmonics, phase: Array, samples: int, norms: tuple[int, ...]) -> Array:
-    """Return phases that lower the wave's peak, by minimising one L2p norm after the other."""
+    """Return phases that lower the wave's peak, by minimising successive L2p norms."""
     for p in norms:
         phase = descend(partial(_norm, order=order, samples=samples, p=p), phase, ITERATIONS)
     return phase

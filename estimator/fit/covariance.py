@@ -157,7 +157,7 @@ def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: fl
 def _measured(
     at: Quadratic, scatter: Array | None, samples: int, structured: float, prior: Array
 ) -> tuple[Mask, Array, Array, Array]:
-    """Return two covariances from the data alone: for independent errors, and robust ones.
+    """Return two covariances from the data alone: one for independent errors, and a robust one.
 
     The mask that is returned first shows which coordinates they cover: those that influence the residual. Both are
     relative to the scale that is returned next.

@@ -242,7 +242,7 @@ class Shooting:
         return np.stack([(segment.state / self.state_scale).reshape(-1) for segment in self.segments])
 
     def _zeros_of(self, segment: RecordingSegment) -> slice:
-        """Return the places of a segment's encoder zeros among those of all recordings; none if they are known."""
+        """Return the indices of a segment's encoder zeros among those of all recordings; empty if they are known."""
         if not self.zeros:
             return slice(0, 0)
         first = segment.recording * self._model.joints

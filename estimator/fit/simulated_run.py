@@ -84,7 +84,7 @@ class SimulatedRun:
         Args:
             physics: physical constants.
             start: state at the first sample (2, joints) [rad, rad/s].
-            names: parameters by which to differentiate, followed by the initial state.
+            names: parameters with respect to which to differentiate, followed by the initial state.
             tracking_stiffness: stiffness of springs that pull the simulated arm to the measured angles (joints,) [N
                 m/rad].
             horizon: fraction of the samples to simulate.

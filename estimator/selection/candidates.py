@@ -31,7 +31,7 @@ from hil.estimator.options import IntegrationOptions
 MAX_LAG_SHARE = 0.05  # fraction of the samples over which a residual's autocorrelation is summed
 INTEGRATION = IntegrationOptions()
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
-"""Terms that vanish smoothly, so that including them costs a fit little."""
+"""Terms that vanish smoothly, so that including them adds little cost to a fit."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, fl
 def ranked(
     about: Linearised, fitted: Sequence[str], richer: Mapping[str, Model], known: Mapping[str, float]
 ) -> list[Candidate]:
-    """Return the score tests of the models `richer`, given by the part that each adds to the parameters `fitted`."""
+    """Return the score tests of the models `richer`, keyed by the part that each adds to the parameters `fitted`."""
     new = {part: tuple(n for n in more.names if n not in fitted) for part, more in richer.items()}
     base, _ = about.fall(fitted)
     found = []

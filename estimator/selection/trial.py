@@ -39,7 +39,7 @@ class Trial:
     """RMS error of the free prediction in units of the noise; without a held-out motion, the equivalent criterion."""
     seconds: float
     coarse: bool = False
-    """Whether the fit was stopped early if it left much of the motion unexplained."""
+    """Whether the fit was allowed to stop early if it left much of the motion unexplained."""
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from hil.estimator.selection.segments import held_out_errors, missing_terms
 DEFAULTS = SelectionOptions()
 FITTED, PREDICTED = slice(0, None, 2), slice(1, None, 2)
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable")
-"""Terms that vanish smoothly, so that including them costs a fit little."""
+"""Terms that vanish smoothly, so that including them adds little cost to a fit."""
 FINE = ShootingOptions()
 QUICK = ShootingOptions(ftol=1e-3, max_step=FINE.coarse_step, reweightings=1)
 """Options of fits that are only compared with each other."""

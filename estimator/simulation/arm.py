@@ -179,7 +179,7 @@ def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float,
     """Return how many of the `left` substeps of length `piece` [s] may be taken at once.
 
     v1, v2: velocities [rad/s]. a1, a2: last accelerations [rad/s^2]. pieces: number of substeps in a step while each
-    joint is near standstill (joints,); a substep is a step divided by the larger one.
+    joint is near standstill (joints,); a substep is a step divided by the larger of them.
     """
     ahead = 2.0 * left * piece
     u1, u2 = v1 + ahead * a1, v2 + ahead * a2

@@ -1,6 +1,7 @@
 """Motor torque from the commanded torque: held, delayed, and averaged over each integration step.
 
-It is compiled because the likelihood needs it in every simulation; with numpy it would take a third of the time.
+It is compiled because the likelihood needs it in every simulation; with numpy it would take a third of the simulation's
+time.
 """
 
 import math

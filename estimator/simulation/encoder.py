@@ -49,7 +49,7 @@ def measured_and_slopes(
     The derivatives are with respect to `names`, then the initial state.
 
     position: true angles (joints, samples) [rad]. derivative: derivatives of the true angles (joints, samples, causes)
-    by `moving`, those of `names` on which the motion depends, then by the initial state.
+    with respect to `moving`, those of `names` on which the motion depends, then the initial state.
     """
     wanted = [name for name in names if kind_of(name) in ENCODER]
     if not wanted and not physics.encoder.any():

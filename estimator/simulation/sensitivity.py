@@ -81,7 +81,7 @@ class Sensitive:
 
     physics: physical constants.
     start: angles [rad] and velocities [rad/s] at the first sample (2, joints).
-    causes: names of the quantities by which to differentiate, from CAUSES.
+    causes: names of the quantities with respect to which to differentiate, from CAUSES.
     step: length of an integration step [s].
     max_substeps: maximum number of substeps into which a step is divided when a joint is near standstill.
     tracking_stiffness: stiffness of additional springs that pull the joints to given angles (joints,) [N m/rad].

@@ -69,7 +69,7 @@ def note(
     name: Annotated[str | None, typer.Option("--name", help="Short name, shown by `hil runs`.")] = None,
     text: Annotated[str | None, typer.Option("--text", help="Free text.")] = None,
 ) -> None:
-    """Give a run a name and a note; without options, print them. Example: hil note RUN --text "new gearbox"."""
+    """Give a run a name and a note; without options, print them."""
     from hil.runs.collection import Note, read_note, write_note
 
     kept = read_note(run)

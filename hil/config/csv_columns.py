@@ -211,7 +211,7 @@ def parse_recording_config(text: str, path: Path) -> RecordingConfig:
 
 
 def _with_urdf_beside(values: dict[str, object], path: Path) -> dict[str, object]:
-    """Return the tables with a relative arm.urdf found from the TOML file's folder."""
+    """Return the tables with a relative arm.urdf resolved relative to the TOML file's folder."""
     arm = values.get("arm")
     if isinstance(arm, dict) and isinstance(arm.get("urdf"), str):
         return {**values, "arm": {**arm, "urdf": str(path.parent / arm["urdf"])}}

@@ -61,7 +61,7 @@ class ExperimentConfig(Table):
         return self
 
     def _meant(self, band: list[float]) -> str:
-        """Name the unit in which a band that is not below a quarter of the rate would make sense."""
+        """Name the unit in which a band that is too high for the rate would make sense."""
         hint = in_other_units(band, "Hz", lambda line: 0.5 / self.period <= line < self.rate / 4)
         return f". {hint}" if hint and band[0] < band[1] else ""
 

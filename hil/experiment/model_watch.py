@@ -66,7 +66,7 @@ _USUAL_S = 1.0
 _GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which changes of velocity are not judged."""
 _WINDOW_S = 0.3
-"""Time over which a message about a stationary joint gives the range of its torque [s]: a single value may be near
+"""Time span over which a message about a stationary joint gives the range of its torque [s]: a single value may be near
 zero.
 """
 

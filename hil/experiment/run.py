@@ -162,7 +162,7 @@ def _try_again(bus: ServoBus, note: Note) -> None:
 
 
 def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
-    """If no servo was heard: which ones answered when torque was cut, since a silent servo hides those after it."""
+    """If no servo was heard, return which ones answered when torque was cut: a silent servo hides those after it."""
     report = bus.torque_off_report
     if not isinstance(stop, SafetyStop) or stop.cause is not Cause.MISSING or report is None:
         return ""

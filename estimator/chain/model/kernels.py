@@ -324,7 +324,7 @@ def _into(f: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
 
 
 def invert(matrix: Any, inverse: Any, factor: Any) -> bool:  # noqa: PLR0912
-    """Invert a symmetric positive definite matrix by its Cholesky factor; return False if it is not one."""
+    """Invert a symmetric matrix by its Cholesky factor; return False if the matrix is not positive definite."""
     n = matrix.shape[0]
     for i in range(n):
         for j in range(i + 1):

@@ -102,7 +102,7 @@ def _link_slopes(x: Array) -> Array:
 
 
 def _coordinates(link: Array) -> Array:
-    """Return a link's coordinates; a link that is not physical is first made so."""
+    """Return a link's coordinates; an unphysical link is first made physically consistent."""
     mass = max(float(link[0]), LEAST_MASS)
     centre = link[1:4] / mass if link[0] > LEAST_MASS else np.zeros(3)
     inertia = np.zeros((3, 3))

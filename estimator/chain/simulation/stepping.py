@@ -65,8 +65,8 @@ def _direct(
     by: Any,
     row: Any,
 ) -> None:
-    """Compute the direct derivatives of joint j's step equation with respect to the drive's parameters; those by v go
-    to `by`.
+    """Compute the direct derivatives of joint j's step equation with respect to the drive's parameters; those with
+    respect to v go to `by`.
 
     left: see `_left`. slopes: derivatives of the torque with respect to delay and lag. times: columns of the delay and
     the lag of each joint. ghk: gamma h times the stage's acceleration.

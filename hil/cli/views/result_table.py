@@ -224,6 +224,6 @@ def _is_useless(result: Result) -> bool:
 
 
 def _usual_format(result: Result) -> str:
-    """A format that can hold this arm: MJCF needs the length of link 1, which only gravity determines."""
+    """A format that can hold this arm: MJCF needs the length of link 1, which can only be determined with gravity."""
     flat = result.chain is None and result.arm is not None and not result.arm.gravity
     return "toml" if flat else "mjcf"
