@@ -132,7 +132,7 @@ def _constant_std(result: SettledResult, name: str) -> float:
 
 
 def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
-    """counted: standard error with which an error is compared, including that of the torque constant."""
+    """Return the cells of a parameter. counted: its standard error, including that of the torque constant."""
     value, std = entry.value, entry.std
     cells = [f"{value:.5g}", f"{std:.1e}"]
     if truth is not None:
