@@ -307,7 +307,7 @@ def load_config(path: Path) -> Config:
             within = next(iter(sorted(path.glob("*.toml"))), None)
             reason = "it is a folder" + ("" if within is None else f"; did you mean {within}?")
         end = "" if reason.endswith("?") else f".{meant(path)}"
-        raise ConfigError(f"{path}: cannot be read: {reason}{end}") from error
+        raise ConfigError(f"{path} cannot be read: {reason}{end}") from error
     return parse_config(text, path)
 
 

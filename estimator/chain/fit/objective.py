@@ -30,7 +30,7 @@ MOST_KEPT = 1 << 26  # bytes of derivatives
 
 @dataclass
 class _Latest:
-    """The latest simulation with derivatives: at the end of a fit, the covariance needs that of the minimum again."""
+    """The latest simulation with derivatives, kept because the covariance needs the one at the minimum again."""
 
     x: Array | None = None
     parts: dict[int, list[tuple[slice, Array, Array]]] = field(default_factory=dict)
