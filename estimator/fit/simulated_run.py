@@ -39,8 +39,9 @@ class SimulatedRun:
     max_substeps: int
     """Maximum number of substeps into which a step is divided near standstill."""
     pulled_to: Array | None = None
-    """Readings of the encoders at the angles to which springs pull the arm, held between samples (joints, samples)
-    [rad]. By default springs pull to the angles `measured`, whatever the errors of the encoders.
+    """Encoder readings at the angles to which springs pull the arm, held between samples (joints, samples) [rad].
+
+    By default, springs pull towards `measured`, regardless of encoder errors.
     """
 
     @classmethod

@@ -103,7 +103,7 @@ class ChainProblem:
         )
 
     def _thinned(self, of_steps: Array) -> Array:
-        """Return the means over each `every` samples of values given for each step (samples, steps, ...)."""
+        """Average values per step (samples, steps, ...) over groups of `every` samples."""
         if self.every > 1:
             whole = of_steps[: len(of_steps) // self.every * self.every]
             of_steps = whole.reshape(-1, self.every, *of_steps.shape[1:]).mean(axis=1)
