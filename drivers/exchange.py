@@ -169,6 +169,11 @@ class Exchange:
         """Whether a read-back has just found a value that this program did not write."""
         return self._read_back is not None and self._now() < self._read_back.doubts_until
 
+    @property
+    def sighted(self) -> Overruled | None:
+        """A value that a servo held a moment ago although this program did not write it; None if there was none."""
+        return self._read_back.sighted if self._read_back is not None and self.is_in_doubt else None
+
     def overruled(self, due: float) -> Overruled | None:
         """Read goals or operating modes back if there is time before the next cycle, which is due at `due` [s].
 
