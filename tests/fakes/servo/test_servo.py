@@ -176,6 +176,15 @@ def test_reverse_mode_turns_positions_and_by_series_all_else(make_bench: Make, m
     assert bench.servo().motor_current_a == pytest.approx(sign * 100 * load_model(model).current_unit_a)
 
 
+def test_a_goal_beyond_a_limit_that_was_lowered_later_is_limited(bench: Any) -> None:
+    bench.arm(goal_ticks=500)
+    assert bench.write(1, 64, 0) == 0
+    assert bench.write(1, 38, 100, 2) == 0
+    assert bench.write(1, 64, 1) == 0
+    assert bench.read(1, 102, 2, signed=True) == 500
+    assert bench.servo().motor_current_a == pytest.approx(100 * bench.servo().model.current_unit_a)
+
+
 def test_reverse_mode_mirrors_the_turns_too(make_bench: Make) -> None:
     bench = make_bench({"model": load_model("XM430-W350"), "zero_ticks": 2048})
     bench.plant.position[0] = 10.0
