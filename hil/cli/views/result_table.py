@@ -169,10 +169,9 @@ def _choice(result: SettledResult) -> list[str]:
     cost = choice.standard_errors_times
     if choice.chosen == choice.plainest:
         return [f"Model chosen from {among}: {choice.chosen}, which has the fewest parameters of them."]
-    return [
-        f"Model chosen from {among}: {choice.chosen}. Compared with {choice.plainest}, its prediction error is "
-        f"{_times(_inverse(choice.error_divided_by))} and its standard errors are {_times(cost)}."
-    ]
+    smaller = f"its prediction error is {_times(_inverse(choice.error_divided_by))}"
+    wider = "" if cost is None else f" and its standard errors are {_times(cost)}"
+    return [f"Model chosen from {among}: {choice.chosen}. Compared with {choice.plainest}, {smaller}{wider}."]
 
 
 def _inverse(ratio: float) -> float | None:

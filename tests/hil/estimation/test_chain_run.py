@@ -279,7 +279,7 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
     known = known_chain(config)
     explained = 0.29 * np.ones(4)
     estimate: Any = SimpleNamespace(
-        **{"std": 0.01 * known.prior.std, "residual_steps": explained, "systematic": 0.8},
+        **{"std": 0.01 * known.prior.std, "over_noise": np.ones(4), "noise_steps": explained, "systematic": 0.8},
         **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base)},
     )
     verdicts = []
