@@ -20,10 +20,13 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.data.fourier import white_noise
 
-__all__ = ["repeated_noise"]
+__all__ = ["agreed_noise", "repeated_noise"]
 
 FEWEST = 32  # samples of a pass
 ROUNDING = 1.0 / 12.0  # steps^2
+AGREE = 2.0  # standard errors
+_LINES = 8.0  # samples of a period per line that its noise is measured by
+_LINE_ERROR = 0.72  # relative standard error of the noise from the median power of one line
 _STD = np.linspace(0.0, 1.0, 401)
 _ORDERS = np.arange(1, 30)[:, None]
 _REPEATS = np.sum(np.exp(-((2.0 * np.pi * _ORDERS * _STD) ** 2)) / (2.0 * np.pi**2 * _ORDERS**2), axis=0)
@@ -48,6 +51,26 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
     differs: Array = 0.5 * np.mean([_power(later - former) for former, later in pairwise(passes)], axis=0) / step**2
     repeats = np.interp(differs, _DIFFERS, _REPEATS)
     noise: Array = step * np.sqrt(differs / averaged + repeats)
+    return noise
+
+
+def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:
+    """Return the noise (joints,) [rad] from two upper bounds of it: their mean where they agree, else the smaller.
+
+    Each is the median of a few lines and so has an error of its own; the smaller of two would be too small.
+
+    Args:
+        white: from the fastest lines of a period of `samples` samples (joints,) [rad].
+        repeated: from the difference of two halves of such periods (joints,) [rad], if known.
+        samples: number of samples of the period.
+    """
+    if repeated is None:
+        return white
+    lines = samples / _LINES
+    apart = np.abs(np.log(np.maximum(white, 1e-300) / np.maximum(repeated, 1e-300)))
+    agree = apart < AGREE * _LINE_ERROR * np.sqrt(3.0 / lines)
+    mean = np.sqrt((2.0 * white**2 + repeated**2) / 3.0)  # the difference has half as many lines
+    noise: Array = np.where(agree, mean, np.minimum(white, repeated))
     return noise
 
 

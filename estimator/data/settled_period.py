@@ -8,6 +8,7 @@ from scipy.ndimage import median_filter
 
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.fourier import white_noise
+from hil.estimator.data.repeated_noise import agreed_noise
 from hil.estimator.errors import RecordingError, ShapeError, StandstillError
 from hil.estimator.simulation.closed_loop import Stabilised
 
@@ -77,9 +78,7 @@ class SettledPeriod:
         _check_values(self)
         _check_motion(self)
         rounding = self.position_step / np.sqrt(12.0)
-        white = white_noise(self.filled())
-        if self.repeated_noise is not None:
-            white = np.minimum(white, self.repeated_noise)
+        white = agreed_noise(white_noise(self.filled()), self.repeated_noise, self.samples)
         object.__setattr__(self, "noise", np.maximum(white, rounding))
 
     @property

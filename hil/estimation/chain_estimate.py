@@ -15,6 +15,7 @@ from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
 from hil.estimation.result_checks import describe_chain_choice
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
+from hil.estimation.slips.position_jumps import jump_disturbances
 from hil.estimation.truth import back_emf
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import SYSTEMATIC, ChainEstimate, identify_chain
@@ -81,7 +82,14 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
             held_out_rms=None if held_out is None else tuple(map(float, held_out)),
             residual_over_floor=tuple(estimate.over_noise.tolist()),
         ),
-        verdict=_verdict(config, estimate, known, held_out, unmoved(config, period.position)),
+        verdict=_verdict(
+            config,
+            estimate,
+            known,
+            held_out,
+            unmoved(config, period.position),
+            jump_disturbances(config, facts, samples),
+        ),
         model_choice=None if choice is None else describe_chain_choice(choice),
         warnings=tuple(warnings_of(config, facts, samples, period)),
         timing=RunTiming.of(timing(samples, config.experiment.rate), seconds),
@@ -168,6 +176,7 @@ def _verdict(
     known: KnownChain,
     held_out: NDArray[np.float64] | None,
     still: list[str],
+    disturbances: tuple[str, ...] = (),
 ) -> Verdict:
     """Decide whether the result can be trusted, name the least well identified base parameter, and give the reasons."""
     count = known.base.count
@@ -184,6 +193,9 @@ def _verdict(
         joint = config.joints[int(np.argmax(held_out))].name
         sentences.append(f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst.")
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
+    if disturbances:
+        trust = "with care" if trust == "yes" else trust
+        sentences += disturbances
     if still:
         trust = "no"
         sentences.append(

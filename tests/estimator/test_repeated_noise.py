@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hil.estimator.data.fourier import white_noise
-from hil.estimator.data.repeated_noise import repeated_noise
+from hil.estimator.data.repeated_noise import agreed_noise, repeated_noise
 
 STEP = np.array([1.5e-3, 1.5e-3])
 SAMPLES = 4000
@@ -53,3 +53,11 @@ def test_missing_samples_are_bridged_and_single_passes_say_nothing() -> None:
     np.testing.assert_allclose(found / STEP, np.sqrt(1.0 / 12.0 + 0.34**2), rtol=0.12)
     assert repeated_noise([one], STEP) is None
     assert repeated_noise([one[:, :20], other[:, :20]], STEP) is None
+
+
+def test_two_measurements_are_averaged_where_they_agree() -> None:
+    white, repeated = np.array([1.0, 3.0, 1.0]), np.array([1.05, 1.0, 3.0])
+    found = agreed_noise(white, repeated, SAMPLES)
+    assert 1.0 < found[0] < 1.05
+    np.testing.assert_allclose(found[1:], 1.0)
+    np.testing.assert_allclose(agreed_noise(white, None, SAMPLES), white)
