@@ -112,8 +112,8 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
     A reading is an outlier if its distance from the median of itself and two neighbours on either side, and that from
     a cubic through its neighbours, exceed SPIKE encoder steps and SPIKE times the typical distance from the median. The
     median alone would take every fast reversal at a low rate for an outlier, as most readings are the median of a joint
-    that moves on. If the fraction of such readings exceeds MOST_SPIKES, they are not outliers: the joint moves that
-    fast, compared with the sample rate.
+    that moves on. If the fraction of such readings exceeds MOST_SPIKES, they are not outliers: the joint moves fast
+    compared with the sample rate.
     """
     position = period.filled()
     away = np.abs(position - median_filter(position, size=(1, 5), mode="wrap"))

@@ -235,6 +235,8 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     if over <= EXPLAINED and estimate.systematic <= SYSTEMATIC:
         return f"{said} nothing remains unexplained."
     causes = "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time"
+    if not estimate.model.base_tilt and np.any(estimate.model.base.chain.gravity):
+        causes = f"a base that is not level ([model] base_tilt = true identifies it), {causes}"
     tried = ""
     if estimate.model.friction != "stribeck_load":
         if config.model.friction == "auto":
@@ -244,7 +246,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     if over > EXPLAINED:
         return f"{said} the model is incomplete.{tried} Possible causes: {causes}."
     return (
-        f"{said} but part of it repeats with the motion, which increases the standard errors "
-        f"{estimate.systematic:.1f} times, and some values may be wrong by more than these say. A small effect is "
+        f"{said} but part of it repeats with the motion, which increases the standard errors by a factor of "
+        f"{estimate.systematic:.1f}, and some values may be wrong by more than these indicate. A small effect is "
         f"missing from the model: {causes}.{tried}"
     )

@@ -102,7 +102,7 @@ class ChainSearch:
     def safe(self, config: Config, shares: tuple[float, ...], most: float = np.inf) -> Found:
         """Find the first of the `shares` of the designed path that is safe for all simulated arms.
 
-        most: largest share; of other paths, it is the share with the same amplitude. The shares are scaled to it.
+        most: largest share; for other paths, the share with the same amplitude. The shares are scaled to it.
 
         If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
         kept. Raises NoSafeTorque if no share of any path is safe.
@@ -183,9 +183,9 @@ class ChainSearch:
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
-        """Play a run, whose share is then the `last`; return the error that ended it early, or None.
+        """Play a run and set `last` to its share; return the error that ended it early, or None.
 
-        Only errors that are informative about the arm are returned; all others that a run raises are raised.
+        Only errors that are informative about the arm are returned; all others are raised.
         """
         error, self.last = None, found.share
         try:
