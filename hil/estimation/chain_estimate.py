@@ -18,6 +18,7 @@ from hil.estimation.truth import back_emf
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import SYSTEMATIC, ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.model.tilt import TILT, tilt_between
 from hil.estimator.chain.simulation.prediction import predict
 from hil.fakes.plants.arm import armature
@@ -195,6 +196,9 @@ def _verdict(
             f"The recording hardly determines {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
             "wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
         )
+    if said := vague(known.prior, known.base.names, estimate.std, estimate.from_prior):
+        trust = "with care" if trust == "yes" else trust
+        sentences.append(said)
     if not estimate.reached:
         trust = "with care" if trust == "yes" else trust
         sentences.append(
@@ -207,6 +211,17 @@ def _verdict(
             f"assumed to be zero within their standard errors."
         )
     return Verdict(trust, weakest, tuple(sentences))
+
+
+def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_prior: tuple[str, ...]) -> str:
+    """Name base parameters, besides `from_prior`, with standard errors larger than the prior's; empty if none."""
+    found = [name for name in prior.surpassing(names, std) if name not in from_prior]
+    if not found:
+        return ""
+    return (
+        f"The standard errors of {', '.join(found)} are larger than the uncertainty that the URDF's values are assumed "
+        "to have: errors of the model, or a fit that stopped short, outweigh what the recording says about them."
+    )
 
 
 def _remains(estimate: ChainEstimate, over: float) -> str:
