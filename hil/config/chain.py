@@ -36,6 +36,12 @@ def base_gravity(config: "Config") -> NDArray[np.float64]:
     return turned
 
 
+def base_up(config: "Config") -> NDArray[np.float64]:
+    """The direction opposite to gravity in the base frame (3,)."""
+    turned: NDArray[np.float64] = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, 1.0])
+    return turned
+
+
 def describes_planar(config: "Config") -> bool:
     """Whether the arm of `[arm] urdf` is a planar one; False if the file cannot be read."""
     try:
@@ -66,6 +72,8 @@ def chain_slips(config: "Config") -> Iterator[str]:
     if not config.is_chain:
         yield from _planar_slips(config)
         return
+    if config.arm.link_lengths is not None:
+        yield "arm.link_lengths: a spatial arm has its lengths from arm.urdf; remove one of the two"
     fake = None if config.fake is None or config.fake.chain is None else Path(config.fake.chain.urdf)
     if fake is not None and fake.name == Path(config.arm.urdf).name and fake != Path(config.arm.urdf):
         yield (

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hil.config.chain import described_arm
 from hil.config.schema import Config
+from hil.description.arm import ArmDescription
 from hil.errors import RecordingCutShort
 from hil.estimation.model_from_config import voltage_driven
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
@@ -79,7 +80,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
             residual_over_floor=tuple(over_floor.tolist()),
         ),
         verdict=_verdict(config, estimate, known, held_out, unmoved(config, period.position)),
-        warnings=tuple(warnings_of(config, facts, samples, period)),
+        warnings=(*warnings_of(config, facts, samples, period), *doubted_inertias(described_arm(config))),
         timing=RunTiming.of(timing(samples, config.experiment.rate), seconds),
         arm=arm_facts(config),
         chain=_facts(config, estimate, known),
@@ -150,6 +151,11 @@ def _quantities(estimate: ChainEstimate, start: int, end: int) -> dict[str, Quan
         estimate.names[index]: Quantity(float(estimate.value[index]), float(estimate.std[index]), estimate.units[index])
         for index in range(start, end)
     }
+
+
+def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
+    """Warn of described inertias that no mass distribution can have, one sentence each."""
+    return tuple(f"{arm.path.name}: {doubt}." for doubt in arm.doubts)
 
 
 def unmoved(config: Config, position: NDArray[np.float64]) -> list[str]:

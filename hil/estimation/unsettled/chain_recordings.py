@@ -13,7 +13,7 @@ from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
-from hil.estimation.chain_estimate import vague
+from hil.estimation.chain_estimate import doubted_inertias, vague
 from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -87,6 +87,7 @@ def estimate_chain_recordings(
             residual_over_floor=tuple(found.residual_over_noise.tolist()) if found.simulated else None
         ),
         verdict=_verdict(found, arm, foretold, prior),
+        warnings=doubted_inertias(arm),
         timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),
         chain=ChainFacts(
             urdf=Path(config.arm.urdf or "").name,
