@@ -30,5 +30,5 @@ def only_steps(path: Path, steps: Sequence[Path]) -> str:
     names = ", ".join(each.name for each in steps)
     return (
         f"{path}: its identification ended before the full run, so there is no result; recorded: {names}. Identify "
-        f"again, or look at what the arm did: {command('report', steps[-1])}"
+        f"again, or look at what the arm did: {command('export', steps[-1], '--format', 'csv')}"
     )

@@ -23,7 +23,7 @@ def refused(tmp_path: Path) -> Path:
 
 def test_the_last_recorded_step_is_named_in_place_of_a_run(refused: Path) -> None:
     for error, opened in ((RunFolderError, RunFolder.open), (RunFolderError, read_note), (ResultError, hil.load_model)):
-        with pytest.raises(error, match=r"ended before the full run.*pilot, step-2.*hil report .*step-2"):
+        with pytest.raises(error, match=r"ended before the full run.*pilot, step-2.*hil export .*step-2"):
             opened(refused)  # type: ignore[operator]
 
 
