@@ -33,7 +33,7 @@ def rehearse(config: Config, arms: int, servos: bool = False, tell: Tell | None 
         return _simulated(config, plan, drawn, 1.0, None, tell, said)
     given = chain_config(config)
     belief = ChainBelief.prior(given)
-    search = SafeShares(given, belief, Paths.of(given, belief.torque), lambda _: None)
+    search = SafeShares(given, belief, Paths.of(given, belief.torque), lambda _: None, tell=tell)
     played, refused = step_config(search.config), ""
     try:
         found = search.safe(played, PILOT_SHARES)

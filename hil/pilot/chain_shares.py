@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hil.config.schema import Config
-from hil.dry_run.chain_prediction import ChainPrediction, predict_chain
+from hil.dry_run.chain_prediction import ChainPrediction, Tell, predict_chain
 from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import unsafe
 from hil.errors import NoSafeTorque
@@ -45,7 +45,7 @@ class SafeShares:
     """The current belief about the arm, and the paths designed for it.
 
     last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are shares of `paths`,
-    and are converted when these are replaced.
+    and are converted when these are replaced. tell: called with the progress of each simulation of the arms.
     """
 
     given: Config
@@ -54,6 +54,7 @@ class SafeShares:
     say: Say
     cap: float = 1.0
     last: float = np.inf
+    tell: Tell | None = None
 
     @property
     def config(self) -> Config:
@@ -106,7 +107,7 @@ class SafeShares:
                 why = str(error)
                 continue
             for count in (SEARCH_ARMS, ARMS):
-                foreseen = predict_chain(config, plan, self.belief.arms.first(count))
+                foreseen = predict_chain(config, plan, self.belief.arms.first(count), self.tell)
                 not_safe = unsafe(config, foreseen)
                 shortage = max(shortage, -float(foreseen.rooms.min()))
                 if not_safe:

@@ -18,7 +18,7 @@ from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import RESERVE, Paths, Reserve, chain_config
 from hil.pilot.chain_rehearsal import rehearse
 from hil.pilot.chain_search import ChainSearch
-from hil.pilot.chain_shares import ARMS, PILOT_SHARES, Found, SafeShares, step_config
+from hil.pilot.chain_shares import ARMS, PILOT_SHARES, SEARCH_ARMS, Found, SafeShares, step_config
 from hil.pilot.steps import Say
 from hil.plan.chain_model import known_chain
 from hil.runs.recording import load_samples
@@ -253,7 +253,9 @@ def test_another_path_starts_with_no_more_amplitude_than_the_one_it_replaces(mon
 
 def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) -> None:
     config = load_config(LEG)
-    first = rehearse(config, 20)
+    told: list[int] = []
+    first = rehearse(config, 20, tell=lambda done, of: told.append(of))
+    assert told.count(SEARCH_ARMS) == SEARCH_ARMS and told.count(ARMS) == 2 * ARMS  # also while it searches
     pilot = ChainSearch.of(config, cast("Any", None), LEG, cast("Any", None), lambda _: None)
     found = pilot.safe(step_config(pilot.config), PILOT_SHARES)
     assert (first.share, first.is_safe(first.config)) == (found.share, True)
