@@ -18,7 +18,7 @@ from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import RESERVE, Paths, Reserve, chain_config
 from hil.pilot.chain_rehearsal import rehearse
 from hil.pilot.chain_search import ChainSearch
-from hil.pilot.chain_shares import ARMS, PILOT_SHARES, SEARCH_ARMS, Found, SafeShares, step_config
+from hil.pilot.chain_shares import PILOT_SHARES, Found, SafeShares, step_config
 from hil.pilot.steps import Say
 from hil.plan.chain_model import known_chain
 from hil.runs.recording import load_samples
@@ -252,27 +252,30 @@ def test_another_path_starts_with_no_more_amplitude_than_the_one_it_replaces(mon
 
 
 def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = load_config(LEG)
-    told: list[int] = []
-    first = rehearse(config, 20, tell=lambda done, of: told.append(of))
-    assert told.count(SEARCH_ARMS) == SEARCH_ARMS and told.count(ARMS) == 2 * ARMS  # also while it searches
+    for place in ("chain_shares.SEARCH_ARMS", "chain_shares.ARMS", "chain_rehearsal.ARMS"):
+        monkeypatch.setattr(f"hil.pilot.{place}", 4 if "SEARCH" in place else 12)
+    text = LEG.read_text(encoding="utf-8").replace("period = 10.0", "period = 5.0")
+    config, told = parse_config(text, LEG), list[int]()
+    first = rehearse(config, 4, tell=lambda _, of: told.append(of))
+    assert (told.count(4), told.count(12)) == (4, 2 * 12)  # also while it searches
     pilot = ChainSearch.of(config, cast("Any", None), LEG, cast("Any", None), lambda _: None)
     found = pilot.safe(step_config(pilot.config), PILOT_SHARES)
     assert (first.share, first.is_safe(first.config)) == (found.share, True)
-    np.testing.assert_array_equal(first.prediction.values[:ARMS], found.foreseen.peaks.values)
+    np.testing.assert_array_equal(first.prediction.values[:12], found.foreseen.peaks.values)
 
     # More arms than the pilot looks at may add a doubt, which the dry run tells but does not decide by.
-    monkeypatch.setattr("hil.dry_run.chain_summary.unsafe", lambda *_: "joint 'knee' reaches speed 9")
-    assert first.is_safe(first.config)
-    assert any("'knee' reaches speed 9" in line for line in chain_dry_run_lines(first))
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        patch.setattr("hil.dry_run.chain_summary.unsafe", lambda *_: "joint 'knee' reaches speed 9")
+        assert first.is_safe(first.config)
+        assert any("'knee' reaches speed 9" in line for line in chain_dry_run_lines(first))
 
     # Where no share is safe, both refuse, for the same reason.
     monkeypatch.setattr(SafeShares, "_largest", lambda *_: (None, "shank and floor: 2 mm", 0.0))
     monkeypatch.setattr("hil.pilot.chain_shares.REDESIGNS", 0)
     with pytest.raises(NoSafeTorque) as refused:
         pilot.safe(step_config(pilot.config), PILOT_SHARES)
-    again = rehearse(config, 20)
+    monkeypatch.setattr(Paths, "of", lambda *_: pilot.paths)
+    again = rehearse(config, 4)
     assert again.why_not(again.config) == str(refused.value)
     assert not again.is_safe(again.config)
 
