@@ -29,6 +29,11 @@ def described_arm(config: "Config") -> ArmDescription:
     return _read(config.arm.urdf, tuple(joint.name for joint in config.joints), _changed(config.arm.urdf))
 
 
+def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
+    """Warn of described inertias that no mass distribution can have, one sentence each."""
+    return tuple(f"{arm.path.name}: {doubt}." for doubt in arm.doubts)
+
+
 def base_gravity(config: "Config") -> NDArray[np.float64]:
     """Gravity in the base frame (3,) [m/s^2]."""
     down = np.array([0.0, 0.0, -config.arm.gravity])

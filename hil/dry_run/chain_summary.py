@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from hil.config.chain import described_arm, doubted_inertias
 from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction
 from hil.dry_run.chain_stop import LAID_DOWN, ChainStops
@@ -168,6 +169,7 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
             "Parts of these links that touch in nearly every pose, by design, are not checked; the other parts "
             f"of them are: {pairs}."
         )
+    lines += [f"Warning: {warning}" for warning in doubted_inertias(described_arm(run.config))]
     if run.share < 1.0:
         lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which this shows.")
     if run.refused == "" and (doubt := run.doubt(run.config)):

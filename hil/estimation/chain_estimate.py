@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config.chain import described_arm
+from hil.config.chain import described_arm, doubted_inertias
 from hil.config.schema import Config
-from hil.description.arm import ArmDescription
 from hil.errors import RecordingCutShort
 from hil.estimation.model_from_config import voltage_driven
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
@@ -151,11 +150,6 @@ def _quantities(estimate: ChainEstimate, start: int, end: int) -> dict[str, Quan
         estimate.names[index]: Quantity(float(estimate.value[index]), float(estimate.std[index]), estimate.units[index])
         for index in range(start, end)
     }
-
-
-def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
-    """Warn of described inertias that no mass distribution can have, one sentence each."""
-    return tuple(f"{arm.path.name}: {doubt}." for doubt in arm.doubts)
 
 
 def unmoved(config: Config, position: NDArray[np.float64]) -> list[str]:

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from hil.config.chain import doubted_inertias
 from hil.description.arm import ArmFileError, Body
 from hil.description.urdf import read_urdf
 from tests.support.chains import random_urdf
@@ -87,7 +88,9 @@ def test_a_negative_moment_of_inertia_is_named(tmp_path: Path) -> None:
 
 def test_an_inertia_that_no_body_has_is_a_doubt(tmp_path: Path) -> None:
     odd = TWO.replace('ixx="1e-3"', 'ixx="9e-3"', 1)
-    assert "upper" in read_urdf(written(tmp_path, odd + "</robot>")).doubts[0]
+    arm = read_urdf(written(tmp_path, odd + "</robot>"))
+    (warning,) = doubted_inertias(arm)
+    assert warning == f"{arm.path.name}: {arm.doubts[0]}." and "upper" in warning
 
 
 @pytest.mark.parametrize(
