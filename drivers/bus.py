@@ -94,7 +94,7 @@ class ServoBus:
         """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
         self._exchange: Exchange | None = None
         self.exchanges_per_sample = 1
-        """Number of exchanges needed to keep them at most CHECK_S apart, if the bus is fast enough; set by `prepare`.
+        """Number of exchanges per sample, at most CHECK_S apart if the bus is fast enough; set by `prepare`.
         """
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._without_watchdog: set[Joint] = set()
@@ -274,7 +274,9 @@ class ServoBus:
         return self._exchange
 
     def read_positions(self) -> tuple[float, ...]:
-        """Read each joint's angle [rad] outside the control cycle; a joint with several servos has the first's."""
+        """Read each joint's angle [rad] outside the control cycle; for a joint with several servos, that of the first
+        one.
+        """
         first = [self._of.index(index) for index in range(len(self.joints))]
         return tuple(
             self._measured[place].angle(self._servos[self._drives[place]].read("Present Position")) for place in first

@@ -162,7 +162,7 @@ class Exchange:
 
     @property
     def is_in_doubt(self) -> bool:
-        """Whether a read-back has just found something that was not written here."""
+        """Whether a read-back has just found a value that this program did not write."""
         return self._read_back is not None and self._now() < self._read_back.doubts_until
 
     def overruled(self, due: float) -> Overruled | None:
@@ -262,8 +262,8 @@ class Exchange:
         return read.unpack(received) or self._search(read, received, deadline)
 
     def _other_span(self, between: bool) -> int:
-        """Choose the span for a cycle that does not read the usual one: another after a loss, a slow one, or the
-        status.
+        """Choose the span for a cycle that does not read the usual one: another one after a lost reply, a slow one, or
+        the status.
         """
         if self._late_possible:
             self._late_possible = False
@@ -355,7 +355,9 @@ class _GoalWrite:
         self.size = packet.size + 2
 
     def pack(self, goal_ticks: Sequence[int]) -> bytes:
-        """Return the packet for these goals, one per servo of the exchange; raises struct.error for one too big."""
+        """Return the packet for these goals, one per servo of the exchange; raises struct.error for one that is too
+        large.
+        """
         fields, places = self._fields, self._places
         if places is not None:
             if len(goal_ticks) != self._count:

@@ -192,7 +192,7 @@ def found_beside(folder: Path, name: str) -> Path:
 
 
 def _known_names(name: str) -> str:
-    """The hint for a bare name that is not an arm's."""
+    """The hint for a bare name that is not that of an arm."""
     if "." in name or "/" in name:
         return ""
     close = get_close_matches(name, arm_names(), 1, 0.75)
@@ -208,14 +208,14 @@ def load_fake(path: Path | str) -> FakeArm:
         text = find_arm(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise DescriptionError(f"{path}: cannot be read: {reason}{_known_names(str(path))}") from error
+        raise DescriptionError(f"{path} cannot be read: {reason}{_known_names(str(path))}") from error
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise DescriptionError(f"{path}: is not TOML: {error}") from error
+        raise DescriptionError(f"{path} is not TOML: {error}") from error
     table = document.get("fake")
     if not isinstance(table, dict):
-        raise DescriptionError(f"{path}: has no [fake] table, so there is no fake arm to open")
+        raise DescriptionError(f"{path} has no [fake] table, so there is no fake arm to open")
     try:
         return FakeArm.model_validate(beside(table, Path(path).parent))
     except ValidationError as error:

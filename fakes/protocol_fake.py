@@ -157,7 +157,7 @@ class FakeSerial(SerialBase):
         return bus
 
     def _unplugged(self, bus: FakeBus) -> _Unplugged:
-        """Return the error for an unplugged cable, at the time of unplugging, of which the bus may know in advance."""
+        """Wait until the cable is unplugged, of which the bus may know in advance, and return the error."""
         self.clock.wait_until(bus.pulled_at)
         return _Unplugged()
 

@@ -30,8 +30,8 @@ OPTIONS = ChoiceOptions()
 def choose_chain(
     periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior, options: ChoiceOptions = OPTIONS
 ) -> ChainEstimate:
-    """Estimate under `model`, and under richer ones if its residual is more than encoder rounding; return the best
-    supported.
+    """Estimate under `model`, and under richer ones if its residual exceeds encoder rounding; return the one that is
+    best supported.
 
     Raises what `identify_chain` raises for `model` itself.
     """

@@ -22,10 +22,12 @@ EXPLAINED_RESIDUAL = 1.06
 """RMS residual of the worst joint, in units of encoder rounding, below which a motion counts as explained."""
 
 SYSTEMATIC = 1.5
-"""Ratio of standard errors to those under white noise, above which the residual holds a model error rather than noise.
+"""Ratio of standard errors to those under white noise, above which the residual contains a model error rather than
+noise.
 
-It is 0.6 to 0.9 for encoder rounding. Torque ripple of 0.2 %, or 0.3 % of the torque as friction, increase it to 2 or
-3, while the residual is still within a tenth of rounding."""
+It is 0.6 to 0.9 for encoder rounding. Torque ripple of 0.2 %, or load-dependent friction of 0.3 % of the torque, raises
+it to 2 or 3, while the residual still exceeds rounding by less than a tenth.
+"""
 
 BELIEVED = 0.5  # standard errors under white noise above this fraction of the prior's: values come from the prior
 
@@ -48,8 +50,9 @@ class ChainEstimate(FittedParameters):
     white_std: Array
     correlation_time: float
     systematic: float
-    """Median ratio of the base parameters' standard errors to those under white noise: how far errors of the model
-    exceed noise at the frequencies that determine the parameters."""
+    """Median ratio of the base parameters' standard errors to those under white noise: how far model errors exceed
+    noise at the frequencies that determine the parameters.
+    """
     softness: float
     """Natural frequency of the observer that couples the simulation to the measurements [Hz]."""
     reached: bool
@@ -119,7 +122,7 @@ def identify_chain(
 
 
 def median_ratio(one: Array, other: Array) -> float:
-    """Return the median ratio of two vectors of standard errors, of those that are finite; infinite without any."""
+    """Return the median ratio of two vectors of standard errors, over the finite ones; infinite if there are none."""
     known = np.isfinite(one) & np.isfinite(other)
     return float(np.median(one[known] / other[known])) if known.any() else np.inf
 

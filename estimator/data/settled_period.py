@@ -99,7 +99,7 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
 
     A reading is an outlier if its distance from the median of itself and two neighbours on either side exceeds SPIKE
     encoder steps and SPIKE times the typical distance. If the fraction of such readings exceeds MOST_SPIKES, they are
-    not outliers: the joint moves that fast, compared with the sample rate.
+    not outliers: the joint moves fast compared with the sample rate.
     """
     position = period.filled()
     away = np.abs(position - median_filter(position, size=(1, 5), mode="wrap"))

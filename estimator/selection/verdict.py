@@ -245,7 +245,7 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
 
 
 def improvement_of(name: str, torque_limit: str = "") -> str:
-    """What would determine the parameter `name` better; torque_limit: as in `Evidence`."""
+    """Advice on how to determine the parameter `name` better; torque_limit: as in `Evidence`."""
     return IMPROVEMENT[kind_of(name)].format(
         torque=torque_limit or "peak_torque", own_torque=torque_limit or "its peak_torque"
     )

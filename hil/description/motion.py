@@ -1,4 +1,4 @@
-"""Where a described arm is, and which way each joint moves it, in terms that a person can compare."""
+"""Where a described arm is, and which way each joint moves it, in terms that a person can compare with the real arm."""
 
 import numpy as np
 

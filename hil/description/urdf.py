@@ -82,18 +82,18 @@ def parse_urdf(path: Path) -> ET.Element:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ArmFileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+        raise ArmFileError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ArmFileError(f"{path}: contains a document type or entities, which a URDF does not need: remove them")
+        raise ArmFileError(f"{path} contains a document type or entities, which a URDF does not need: remove them")
     try:
         root = ET.fromstring(text, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     except ET.ParseError as error:
-        raise ArmFileError(f"{path}: is not XML: {error}") from error
+        raise ArmFileError(f"{path} is not XML: {error}") from error
     if root.tag != "robot":
         raise ArmFileError(f"{path}: its root is <{root.tag}>, not <robot>: it is not a URDF")
     if "<xacro:" in text:
         raise ArmFileError(
-            f"{path}: contains xacro macros: expand them into another file first, xacro {path.name} > "
+            f"{path} contains xacro macros: expand them into another file first, xacro {path.name} > "
             f"{path.stem}_expanded.urdf, and name that file"
         )
     return root
@@ -107,7 +107,7 @@ def _links(root: ET.Element, path: Path) -> tuple[dict[str, Body], dict[str, boo
             raise ArmFileError(f'{path}: two links are named "{name}"')
         bodies[name] = _body(element.find("inertial"), f'link "{name}"', path)
     if not bodies:
-        raise ArmFileError(f"{path}: has no links")
+        raise ArmFileError(f"{path} has no links")
     return bodies, {name: body.mass == 0.0 or body.is_physical for name, body in bodies.items()}
 
 
@@ -219,7 +219,7 @@ def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) ->
     for name in names:
         if name not in tree:
             turning = [joint.name for joint in tree.values() if joint.kind in TURNING]
-            raise ArmFileError(f'{path}: has no joint "{name}"; the rotating joints are {", ".join(turning) or "none"}')
+            raise ArmFileError(f'{path} has no joint "{name}"; the rotating joints are {", ".join(turning) or "none"}')
         joint = tree[name]
         if joint.kind not in TURNING:
             raise ArmFileError(f'{path}: joint "{name}" is {joint.kind}: only rotating joints can be identified')

@@ -90,15 +90,14 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, added: AddedMass) -
     if config.is_chain:
         if added.at is None or added.distance is not None or added.length is not None:
             raise ConfigError(
-                "a spatial arm: give the position of the mass in its link's frame, --at X Y Z in metres (and --joint "
-                "NAME "
-                "if it is not on the last link), instead of --distance and --length."
+                "for a spatial arm, give the position of the mass in its link's frame, --at X Y Z in metres (and "
+                "--joint NAME if it is not on the last link), instead of --distance and --length."
             )
         mass = MassOnLink(added.mass, added.at, link_of(config, added.joint), added.inertia)
         return _described_chain(config, calibrate_chain_runs((without, with_mass), (config, other), mass))
     if added.distance is None or added.at is not None or added.joint is not None:
         raise ConfigError(
-            "a planar arm: give --distance (from the last joint to the mass) instead of --at and --joint."
+            "for a planar arm, give --distance (from the last joint to the mass) instead of --at and --joint."
         )
     length = added.length
     if length is None and config.known is not None and config.known.length_1 is not None:

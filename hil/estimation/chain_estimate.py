@@ -234,6 +234,7 @@ def _remains(estimate: ChainEstimate, over: float) -> str:
     if over > EXPLAINED:
         return f"the model is incomplete. Possible causes: {causes}."
     return (
-        f"but part of it repeats with the motion, which increases the standard errors {estimate.systematic:.1f} times, "
-        f"and some values may be wrong by more than these say. A small effect is missing from the model: {causes}."
+        "but part of it repeats with the motion, which increases the standard errors by a factor of "
+        f"{estimate.systematic:.1f}, and some values may be wrong by more than these indicate. A small effect is "
+        f"missing from the model: {causes}."
     )

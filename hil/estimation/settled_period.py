@@ -122,7 +122,7 @@ def scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
     seen = np.isfinite(position).sum(axis=0)
     mean = np.nansum(position, axis=0) / np.maximum(seen, 1)
     squares = np.nansum((position - mean) ** 2, axis=0)
-    # Samples that are there in one period only, or in none, tell nothing about the scatter.
+    # Samples received in only one period, or in none, say nothing about the scatter.
     several = seen > 1
     variance = np.where(several, squares / np.maximum(seen - 1, 1), 0.0).sum(axis=1)
     std: NDArray[np.float64] = np.sqrt(variance / np.maximum(several.sum(axis=1), 1) / count)

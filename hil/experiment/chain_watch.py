@@ -2,7 +2,8 @@
 
 Prior knowledge is the ensemble's mean and inflated covariance. The ensemble is drawn around the description, and
 updated after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
-Nor is a joint that stands at its rest angle: on the way home it may reach the stop on which it rests before the others.
+Nor is a joint that stands still at its rest angle: on the way home it may reach the end stop on which it rests before
+the others do.
 """
 
 from collections.abc import Sequence

@@ -91,7 +91,7 @@ class Guard:
         self._commands.holding(goals)
 
     def woke_up(self, now: float, late: float) -> None:
-        """Record that this program woke up at `now` [s], `late` [s] after it wanted to (negative: earlier)."""
+        """Record that this program woke up at `now` [s], `late` [s] after the intended time (negative: earlier)."""
         self._silence.woke_up(now, late)
 
     def late(self, seconds: float = 0.0) -> None:

@@ -42,7 +42,7 @@ _INERTIA = 0.3
 """Standard deviations for an arm without a description, as multiples of the planned torque in SI units.
 
 If a small first torque moves an arm by a tenth of a radian, the arm's gravity torque is ten times as large. But the arm
-does move, which it would not if viscous friction or inertia were several times the planned torque.
+does move, which it would not if viscous friction or inertia were several times as large as the planned torque.
 """
 _FLAT = 0.3
 """Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the same units."""
@@ -66,7 +66,7 @@ _USUAL_S = 1.0
 _GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which changes of velocity are not judged."""
 _WINDOW_S = 0.3
-"""Time over which a message about a stationary joint gives the range of its torque [s]: a single value may be near
+"""Time span over which a message about a stationary joint gives the range of its torque [s]: a single value may be near
 zero.
 """
 

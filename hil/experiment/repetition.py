@@ -1,12 +1,12 @@
 """Comparison of successive periods sample by sample, which avoids a burst of work at the end of a period.
 
-The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated during the period:
-at its end only a few divisions remain. The previous period is kept in one buffer, which the latest one overwrites.
+The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated during the period, so that
+only a few divisions remain at its end. The previous period is kept in one buffer, which the latest one overwrites.
 
 The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same
 sample of the previous period. If they differ by more than `TIMES` the RMS difference between the two previous periods,
 plus `FLOOR_RAD`, for `LASTING_S`, the joint does not repeat its motion (`unlike`). In the second half of the second
-period, it is the RMS difference in its first half, since transients only decay.
+period, the RMS difference in its first half is used instead, since transients only decay.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,7 +40,7 @@ _SUMS = np.dtype(
 
 lowest, highest: range of its positions [rad]. first: first one compared, which is subtracted from the others to avoid
 cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of squares
-and number of changes from the period before. early_squared, early_pairs: of those in the first half of the period.
+and number of changes from the period before. early_squared, early_pairs: the same for the first half of the period.
 """
 
 

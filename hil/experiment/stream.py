@@ -354,7 +354,7 @@ class Stream:
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
 
     def _lower(self, lowering: Lowering, error: ExperimentError) -> None:
-        """Brake and lower the arm until it lies, anything is wrong, or a second signal comes. Never raises."""
+        """Brake and lower the arm until it is at rest, a check fails, or a second signal arrives. Never raises."""
         state = self._state
         if state is None or any(state.missing) or any(state.error) or lowering.lies(state):
             return

@@ -140,7 +140,7 @@ def _not_in_mjcf(found: ChainLinks, solids: Sequence[Solid]) -> list[str]:
 
 
 def _add_geoms(body: ET.Element, solids: Sequence[Solid]) -> None:
-    """Add the boxes, cylinders, capsules and spheres of a link; they touch nothing unless contype is set."""
+    """Add the boxes, cylinders, capsules and spheres of a link; they collide with nothing unless contype is set."""
     for solid in solids:
         if solid.size:
             place = {"pos": numbers(*solid.translation), "quat": numbers(*_quaternion(solid.rotation))}

@@ -52,8 +52,8 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
     base = BaseParameters.of(chain, tilts=TILT[0] in model.values)
     if not _same_groups(base, model.groups):
         raise ExportError(
-            f"{source.run}: the version that estimated this run groups the parameters of the links differently "
-            "than this one. Run hil estimate again."
+            f"{source.run}: this run was estimated by a version of hil that groups the links' parameters differently. "
+            "Run hil estimate again."
         )
     value = np.array([model.values[name] for name in base.names])
     std = np.array([model.stds[name] for name in base.names])

@@ -76,7 +76,7 @@ def export(run: Path, name: str, out: Path | None = None, link_length: float | N
 
 
 def _each_its_own(name: str) -> str:
-    """How to name several formats that were given as a list."""
+    """Advice on how to request several formats, if `name` is a list of them; otherwise ""."""
     parts = [part for part in re.split(r"[,; ]+", name) if part]
     if len(parts) < 2 or any(part not in (*FORMATS, *RECORDING_FORMATS) for part in parts):
         return ""

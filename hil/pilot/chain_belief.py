@@ -43,9 +43,7 @@ _HALVINGS = 6
 _LIGHTER = 0.25
 """Smallest plausible inertia of a joint, relative to that of the lightest arm of the prior."""
 _LIGHTER_THAN_MEAN = 0.5
-"""Smallest plausible inertia of a joint, relative to that of the arm with the fitted parameters, if that arm is lighter
-still.
-"""
+"""The same relative to the inertia of the arm with the fitted parameters, if that arm is lighter still."""
 
 SIMULATED = 100
 """Largest number of arms that are simulated."""
@@ -131,8 +129,8 @@ class ChainBelief:
 
     @property
     def _links(self) -> Array:
-        """Derivatives of the base parameters by the parameters of links and rotors, in units of their spread (base
-        parameters, all).
+        """Derivatives of the base parameters with respect to the parameters of links and rotors, in units of their
+        spread (base parameters, all).
         """
         described = known_chain(self.config).described.reshape(-1, TERMS)
         found: Array = self.arms.base.grouping * spread_of(described).reshape(-1)

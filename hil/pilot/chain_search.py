@@ -76,9 +76,9 @@ class ChainSearch(SafeShares):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
-        """Play a run, whose share is then the `last`; return the error that ended it early, or None.
+        """Play a run and set `last` to its share; return the error that ended it early, or None.
 
-        Only errors that are informative about the arm are returned; all others that a run raises are raised.
+        Only errors that are informative about the arm are returned; all others are raised.
         """
         error, self.last = None, found.share
         try:

@@ -64,7 +64,7 @@ class SafeShares:
     def safe(self, config: Config, shares: tuple[float, ...], most: float = np.inf) -> Found:
         """Find the first of the `shares` of the designed path that is safe for all simulated arms.
 
-        most: largest share; of other paths, it is the share with the same amplitude. The shares are scaled to it.
+        most: largest share; for other paths, the share with the same amplitude. The shares are scaled to it.
 
         If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
         kept. Raises NoSafeTorque if no share of any path is safe.

@@ -66,7 +66,8 @@ class _Spectrum:
 
     joint: int
     lines: NDArray[np.complex128]
-    """Jacobian by scaled coordinates (lines, coordinates), normalised as in a real orthonormal transform."""
+    """Jacobian with respect to scaled coordinates (lines, coordinates), normalised as in a real orthonormal transform.
+    """
     power: Array
     """Power of the residual (lines,); 1 for white noise with the variance that the weights assume."""
     share: Array

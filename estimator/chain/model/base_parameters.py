@@ -55,8 +55,8 @@ class BaseParameters:
     def of(cls, chain: Chain, seed: int = 1, *, tilts: bool = False) -> "BaseParameters":
         """Return the base parameters of this chain.
 
-        tilts: those for any direction of gravity, since the base may be tilted. A first joint that is vertical then
-        counts as one that gravity may turn, so there are more of them.
+        tilts: allow for a tilted base, that is, for any direction of gravity. Gravity may then also act on a vertical
+        first joint, so there are more base parameters.
         """
         anywhere = replace(chain, gravity=tilted(chain.gravity, *GENERIC)) if tilts else chain
         Y = _random_regressor(anywhere, seed)

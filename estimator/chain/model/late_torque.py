@@ -15,7 +15,7 @@ from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 
 MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
-"""What the kinds of parameters that only chains have mean."""
+"""Meanings of the kinds of parameters that only chains have."""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia by which a lagging back-EMF makes it move like a lighter one."""
 _ARMATURE = 10  # of a link's parameters
@@ -29,7 +29,7 @@ def lags_of(parameters: Mapping[str, float], joints: int) -> Array:
 
 
 def as_moving(base: BaseParameters, parameters: Mapping[str, float]) -> dict[str, float]:
-    """Return the parameters of the arm that moves under lagging voltages as this one does."""
+    """Return the parameters of the equivalent arm, with lighter rotors, whose back-EMF does not lag."""
     moving = dict(parameters)
     generating = _generating(base.chain.joints, parameters)
     possible = _possible(base, parameters, generating)
@@ -53,10 +53,10 @@ def rotor(base: BaseParameters, joint: int) -> Array:
 
 
 def complete(base: BaseParameters, parameters: Mapping[str, float], names: tuple[str, ...], derivative: Array) -> None:
-    """Turn derivatives (samples, joints, causes) of the simulation into those by `names`, in place.
+    """Convert the simulation's derivatives (samples, joints, causes) to those with respect to `names`, in place.
 
-    The simulation is that of the arm of `as_moving`, with derivatives by each joint's own lag. names: the base
-    parameters are the first.
+    The simulated arm is that of `as_moving`, and its derivatives are with respect to each joint's own lag. names: the
+    base parameters come first.
     """
     at = {name: index for index, name in enumerate(names)}
     ratios = [parameters.get(f"lag_ratio_{joint + 1}", 1.0) for joint in range(base.chain.joints)]
@@ -81,7 +81,9 @@ def complete(base: BaseParameters, parameters: Mapping[str, float], names: tuple
 
 
 def _generating(joints: int, parameters: Mapping[str, float]) -> list[tuple[int, float, float, float]]:
-    """Voltage-driven joints with the share of their viscous friction, that friction, and the delay of their torque."""
+    """Return each voltage-driven joint, the fraction of its viscous friction due to back-EMF, that friction, and its
+    delay.
+    """
     late = lags_of(parameters, joints) + max(parameters.get("delay", 0.0), 0.0)
     return [
         (joint, parameters[f"back_emf_{joint + 1}"], parameters[f"viscous_{joint + 1}"], float(late[joint]))

@@ -38,7 +38,7 @@ class Prior:
         """Create the prior from described link parameters.
 
         Args:
-            base: the combinations of them that affect the torque.
+            base: the parameter combinations that affect the torque.
             links: (joints, 10) [SI].
             armature: rotor inertias (joints,) [kg m^2], if known.
             scale_std: relative standard deviations of the joints' torque constants (joints,), if known.

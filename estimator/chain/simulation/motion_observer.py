@@ -68,7 +68,7 @@ class ChainObserver:
         self._first = np.array((FIRST_NOISE_SHARE * largest) ** 2)
         self._memory[NOISE, :n] = self._first
         drift = LEAST_DRIFT**2 * np.diag(covariance)
-        # A joint that has moved one way only does not tell dry friction from an offset, so what may hold it at rest is
+        # Motion in one direction only cannot separate dry friction from an offset, so what may hold a joint at rest is
         # never taken as less than the friction that was expected.
         expected = np.maximum(mean[base.count + n : base.count + 2 * n], 0.0)
         self._constants = FLOOR_SHARE * largest, (0.01 * largest) ** 2, drift, interval, expected
@@ -88,7 +88,7 @@ class ChainObserver:
             velocity: velocities [rad/s].
             torque: torques commanded since the previous sample [N m].
             seconds: time since the previous sample [s].
-            is_free: whether only its motor holds each joint; one value for all or one per joint.
+            is_free: whether each joint is held by its motor alone; one value for all joints or one per joint.
         """
         return _observe(
             *(self._memory, self._theta, self._covariance, self._constants, self._chain, self._work),

@@ -57,7 +57,7 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
         compared = (
             "the simplest model"
             if choice.chosen == choice.plainest
-            else f"with an error {_times(_inverse(choice.error_divided_by))} compared with the simplest model's"
+            else f"whose error is {_times(_inverse(choice.error_divided_by))} compared with the simplest model's"
         )
         print(f"Chosen on held-out segments: {choice.chosen}, {compared}.")
     if result.physical is not None:
@@ -132,7 +132,7 @@ def _constant_std(result: SettledResult, name: str) -> float:
 
 
 def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
-    """counted: standard error with which an error is compared, including that of the torque constant."""
+    """Return the cells of a parameter. counted: its standard error, including that of the torque constant."""
     value, std = entry.value, entry.std
     cells = [f"{value:.5g}", f"{std:.1e}"]
     if truth is not None:
@@ -224,6 +224,6 @@ def _is_useless(result: Result) -> bool:
 
 
 def _usual_format(result: Result) -> str:
-    """A format that can hold this arm: MJCF needs the length of link 1, which only gravity determines."""
+    """A format that can hold this arm: MJCF needs the length of link 1, which can only be determined with gravity."""
     flat = result.chain is None and result.arm is not None and not result.arm.gravity
     return "toml" if flat else "mjcf"

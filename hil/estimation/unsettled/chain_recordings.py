@@ -1,4 +1,4 @@
-"""Spatial arms from other tools' recordings: what the estimator found, checked on the last part, as a result."""
+"""Spatial arms estimated from other tools' recordings, and checked on the last part of each, as a result."""
 
 import time
 from collections.abc import Sequence
@@ -36,8 +36,9 @@ UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "ca
 
 @dataclass(frozen=True)
 class ChainEstimated:
-    """result: complete except for what the caller adds. predicted: positions per recording (joints, samples) [rad];
-    NaN: no prediction.
+    """An estimate from recordings. result: complete except for what the caller adds. predicted: positions per recording
+    (joints, samples) [rad]; NaN: no
+    prediction.
     """
 
     result: ShootingResult
