@@ -46,8 +46,13 @@ TESTS = {
     "hil/experiment/stream.py": [
         *(f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py", f"{_EXPERIMENT}/test_lowering.py"),
     ],
-    "hil/drivers/exchange.py": ["tests/drivers/test_exchange.py", "tests/drivers/test_read_back.py"],
+    "hil/drivers/exchange.py": [
+        *("tests/drivers/test_exchange.py", "tests/drivers/test_read_back.py", "tests/drivers/test_heard_instead.py"),
+    ],
+    "hil/drivers/read_back.py": ["tests/drivers/test_read_back.py", "tests/drivers/test_exchange.py"],
     "hil/drivers/torque_off.py": ["tests/drivers/test_torque_off.py"],
+    "hil/estimator/models/standstill.py": ["tests/estimator/models/test_standstill.py"],
+    "hil/experiment/chain_watch.py": [f"{_EXPERIMENT}/test_chain_watch.py"],
     "hil/runs/recording.py": ["tests/hil/runs/test_recording.py"],
 }
 """Modules, and the tests that should detect mutations."""
