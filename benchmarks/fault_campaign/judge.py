@@ -146,6 +146,7 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -
     told = _Told(config, story.traffic, drawn.start)
     interval = 1.0 / config.experiment.rate
     joints = range(len(config.joints))
+    holds = np.asarray(record["torque"].any(axis=1))  # while servos are set up, nobody needs to be heard regularly
     found: list[Reason | None] = []
     for joint in joints:
         own = record[:, joint]
@@ -159,7 +160,7 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -
                     GAP_MS,
                 ),
                 ("is not as fast as told", told.lies(joint, time, own, "velocity", interval), LASTING_MS, GAP_MS),
-                ("was not heard", told.silent(joint, time, interval, story.ended), LASTING_MS, 1),
+                ("was not heard", told.silent(joint, time, interval, story.ended) & holds, LASTING_MS, 1),
                 ("does not do as told", told.disobeys(joint, time, own, interval), LASTING_MS, GAP_MS),
                 ("is beyond a limit", _beyond(config, joint, own), 1, GAP_MS),
                 (
