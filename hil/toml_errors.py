@@ -1,5 +1,6 @@
 """Error messages for TOML files, and for the same tables written in Python: key, value, and what is allowed."""
 
+import codecs
 import difflib
 import re
 from collections.abc import Sequence
@@ -192,6 +193,14 @@ def _in_thousands(expected: str, value: object) -> str:
     return ""
 
 
+def encoding_of(path: Path) -> str:
+    """What a file that is not UTF-8 text is, and how to save it as such."""
+    data = path.read_bytes()
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and (b"=\0" in data or b"\0=" in data):
+        return "UTF-16 text, as some Windows programs write it: save it with the encoding UTF-8"
+    return "not UTF-8 text"
+
+
 def not_toml(path: Path, error: Exception, text: str) -> str:
     """The error message for a file with this text, which the TOML parser rejects: the line, and the likely cause."""
     other = {".yaml": "YAML", ".yml": "YAML", ".json": "JSON", ".xml": "XML", ".urdf": "XML", ".csv": "CSV"}
@@ -212,6 +221,7 @@ _NUMBER = r"[-+]?\d[\d_.]*(?:[eE][-+]?\d+)?"
 _SYNTAX = (
     (rf"{_NUMBER}\s*(?:°|º|deg)", "Angles are numbers in rad, without a sign or unit: 90 degrees are 1.5708."),
     (rf"=\s*{_NUMBER.replace('.', '', 1)},\d+\s*$", "The decimal sign is a point, not a comma: 4.0, not 4,0."),
+    (r"[\[,]\s*[-+]?\d+,0\d", "The decimal sign is a point, not a comma: 1.06, not 1,06."),
     (r"[=\[,]\s*(?:True|False|TRUE|FALSE)\b", "Write true or false in lower case."),
     (r"[=\[,]\s*(?:yes|no|on|off|None|null|nil)\b", "Write true or false; leave out a key that has no value."),
     (rf"[=\[,]\s*{_NUMBER}\s*[%A-Za-zµμΩ]", "Write the number without its unit; each key has one fixed unit."),

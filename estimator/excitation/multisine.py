@@ -64,6 +64,11 @@ class Multisine:
         return peak
 
 
+def counted(count: int, noun: str) -> str:
+    """The number and the noun, in the plural unless there is one."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tuple[tuple[int, ...], ...]:
     """Assign the harmonics of 1/`period` [s] within `band` [Hz] to the joints in turn.
 
@@ -73,7 +78,7 @@ def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tup
     last = math.floor(band[1] * period + 1e-9)
     if last - first + 1 < joints:
         raise ExcitationError(
-            f"the band {band[0]:g} to {band[1]:g} Hz contains {max(0, last - first + 1)} harmonics of a "
+            f"the band {band[0]:g} to {band[1]:g} Hz contains {counted(max(0, last - first + 1), 'harmonic')} of a "
             f"period of {period:g} s, but {joints} joints need one each: widen the band or lengthen the period"
         )
     return tuple(tuple(range(first + joint, last + 1, joints)) for joint in range(joints))
@@ -93,7 +98,7 @@ def detecting_lines(period: float, band: tuple[float, float], joints: int, seed:
     kept = [line for line in every if line not in silent]
     if len(kept) < joints:
         raise ExcitationError(
-            f"the band {band[0]:g} to {band[1]:g} Hz contains {len(kept)} usable odd harmonics of a "
+            f"the band {band[0]:g} to {band[1]:g} Hz contains {counted(len(kept), 'usable odd harmonic')} of a "
             f"period of {period:g} s, but {joints} joints need one each: widen the band or lengthen the period"
         )
     return tuple(tuple(kept[joint::joints]) for joint in range(joints))

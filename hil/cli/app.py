@@ -14,7 +14,7 @@ import typer
 
 from hil import __version__
 from hil.cli import bus, data, dry_run, experiment, fake_command, init, results, runs, schema, study
-from hil.cli.errors import exit_code, message
+from hil.cli.errors import exit_code, message, stop_behind
 from hil.cli.stopped import same_again
 from hil.cli.verbosity import with_verbosity
 from hil.errors import StopRequested
@@ -112,13 +112,16 @@ def main() -> NoReturn:
     try:
         with _code_as_asked():
             app()
-    except Exception as error:
+    except Exception as raised:
+        error = stop_behind(raised) or raised
         code = exit_code(error)
         if code is None:
             raise
-        print(message(error), file=sys.stderr)
-        if isinstance(error, StopRequested):
-            for line in same_again(error):
-                print(line, file=sys.stderr)
+        said = [message(error), *(same_again(error) if isinstance(error, StopRequested) else [])]
+        try:
+            print("\n".join(said), file=sys.stderr)
+            sys.stdout.flush()
+        except OSError:  # the terminal is closed: nobody reads this, and Python would fail again when it ends
+            os._exit(code)
         sys.exit(code)
     sys.exit(0)

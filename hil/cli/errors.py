@@ -27,3 +27,16 @@ def message(error: Exception) -> str:
     if cause is not None and error.__cause__ is None and isinstance(cause, Exception) and exit_code(cause) is not None:
         lines.append(f"Preceded by: {cause}")
     return "\n".join([*lines, *getattr(error, "__notes__", [])])
+
+
+def stop_behind(error: BaseException) -> Exception | None:
+    """The stop request during whose handling `error` occurred because the terminal was closed; None if there is none.
+
+    A closed terminal sends SIGHUP, and then refuses what is printed about it.
+    """
+    from hil.errors import StopRequested
+
+    seen: BaseException | None = error if isinstance(error, OSError) else None
+    while seen is not None and not isinstance(seen, StopRequested):
+        seen = seen.__context__
+    return seen

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
@@ -34,7 +34,8 @@ def stopped_by_signals() -> Iterator[None]:
     except KeyboardInterrupt as stopped:
         number = stopped.number if isinstance(stopped, Terminated) else signal.SIGINT
         name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
-        print("\n".join([f"hil: Stopped by {name}.", *how_to_go_on(stopped)]), file=sys.stderr)
+        with suppress(OSError):  # a closed terminal
+            print("\n".join([f"hil: Stopped by {name}.", *how_to_go_on(stopped)]), file=sys.stderr)
         raise typer.Exit(128 + number) from None
     finally:
         for each, handler in former.items():

@@ -19,7 +19,11 @@ def find_config(path: Path) -> Path:
 
 
 def meant(path: Path) -> str:
-    """The hint for a bare name that is not a bundled configuration; empty for paths and files that exist."""
+    """The hint for a name without ".toml", or one that is not a bundled configuration; empty for others and for files
+    that exist.
+    """
+    if path.suffix == "" and not path.exists() and path.with_suffix(".toml").is_file():
+        return f" Did you mean {path.with_suffix('.toml')}?"
     if not _is_name(path) or path.exists():
         return ""
     names = list(bundled_configs())

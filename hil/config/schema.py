@@ -25,7 +25,7 @@ from hil import fakes
 from hil.config.bundled import bundled_configs, find_config, meant
 from hil.config.chain import MOST_JOINTS, chain_slips, describes_planar
 from hil.config.clearance import ClearanceConfig
-from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
+from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig, lines_within
 from hil.config.fake_url import FAKE_URL, url_from
 from hil.config.joint import JointConfig
 from hil.config.known_quantities import KnownConfig
@@ -37,7 +37,7 @@ from hil.errors import ConfigError
 from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import arm_names, find_arm
 from hil.next_step import command
-from hil.toml_errors import describe, not_toml
+from hil.toml_errors import describe, encoding_of, not_toml
 from hil.unit_hints import in_other_units
 
 __all__ = [
@@ -218,6 +218,7 @@ class Config(Table):
             excited = [line for lines in self.experiment.lines for line in lines]
             if len(set(excited)) != len(excited):
                 raise ValueError("experiment.lines: two joints share a line; each line may belong to one joint only")
+        self._check_band()
         _all_different("id", [servo_id for joint in self.joints for servo_id in joint.ids])
         _all_different("name", [joint.name for joint in self.joints])
         for joint, rest in zip(self.joints, self.arm.rest_pose, strict=True):
@@ -243,6 +244,20 @@ class Config(Table):
             guessed = self.arm.prior.model_dump(exclude={"spread", "rough_spread"})
             lists |= {f"arm.prior.{key}": value for key, value in guessed.items()}
         return [(key, value) for key, value in lists.items() if value is not None]
+
+    def _check_band(self) -> None:
+        """Each joint needs a multiple of 1 / period within the band; on a spatial arm, its path defines the motion."""
+        experiment, count = self.experiment, len(self.joints)
+        if experiment.band is None or self.is_chain:
+            return
+        low, high = experiment.band
+        lines = lines_within(experiment.period, low, high)
+        if lines < count:
+            found = "no multiple" if lines == 0 else "only 1 multiple" if lines == 1 else f"only {lines} multiples"
+            raise ValueError(
+                f"experiment.band = [{low:g}, {high:g}] Hz contains {found} of 1 / period = {1 / experiment.period:g} "
+                f"Hz; each of [[joints]] needs one of its own: lengthen period, or widen band"
+            )
 
     def _check_pilot(self) -> None:
         experiment = self.experiment
@@ -301,9 +316,9 @@ def load_config(path: str | PathLike[str]) -> Config:
     """Read and check a TOML file, or the bundled one of that bare name. Raises ConfigError."""
     path = find_config(Path(path))
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+        reason = getattr(error, "strerror", None) or f"it is {encoding_of(path)}"
         if path.is_dir():
             within = next(iter(sorted(path.glob("*.toml"))), None)
             reason = "it is a folder" + ("" if within is None else f"; did you mean {within}?")

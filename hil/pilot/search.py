@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.config.experiment import lines_within
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude, largest_amplitude, most_torque, with_peaks
 from hil.dry_run.prediction import GUARDED, predict
@@ -29,6 +30,9 @@ from hil.runs.run_folder import RunFolder
 Array = NDArray[np.float64]
 
 DEFAULTS = PilotOptions()
+
+_LINES_FOR_DETECTION = 4
+"""Lines of the band per joint of which enough are excited with experiment.detection."""
 
 
 @dataclass
@@ -370,7 +374,9 @@ def pilot_config(config: Config, options: PilotOptions = DEFAULTS) -> Config:
         samples = round(experiment.samples * options.pilot_period_share)
         period = samples / experiment.rate
         low, high = experiment.band
-        update |= {"period": period, "band": [max(low, 1 / period), high]}
+        each = _LINES_FOR_DETECTION if experiment.detection else 1
+        if lines_within(period, low, high) >= each * len(config.joints):
+            update |= {"period": period, "band": [max(low, 1 / period), high]}
     return config.model_copy(update={"experiment": experiment.model_copy(update=update)})
 
 

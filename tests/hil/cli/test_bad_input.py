@@ -4,11 +4,16 @@ import hashlib
 import json
 import os
 import shutil
+import signal
 import sys
 from pathlib import Path
 
 import pytest
 
+from hil.cli.errors import stop_behind
+from hil.config.schema import load_config
+from hil.errors import ConfigError, StopRequested
+from hil.pilot.search import pilot_config
 from tests.support.command_line import hil
 from tests.support.paths import CONFIGS
 
@@ -333,3 +338,43 @@ def test_bad_input_is_named(line: str, code: int, said: str, folder: Path, capsy
 
 def test_there_are_at_least_a_hundred_and_twenty() -> None:
     assert len(CASES) >= 190 and len({case[0] for case in CASES}) == len(CASES)
+
+
+def test_a_byte_order_mark_is_no_mistake_and_other_encodings_are_named(tmp_path: Path) -> None:
+    text = (CONFIGS / "first_time.toml").read_text(encoding="utf-8")
+    marked = tmp_path / "marked.toml"
+    marked.write_text(text, encoding="utf-8-sig")
+    assert load_config(marked).joints == load_config(CONFIGS / "first_time.toml").joints
+    marked.write_text(text, encoding="utf-16")
+    with pytest.raises(ConfigError, match=r"UTF-16.*encoding UTF-8"):
+        load_config(marked)
+    marked.write_text(text.replace("[-4.2, 1.06]", "[-4.2, 1,06]"), encoding="utf-8")
+    with pytest.raises(ConfigError, match="The decimal sign is a point"):
+        load_config(marked)
+
+
+def test_a_band_with_too_few_lines_is_a_mistake_in_the_file(tmp_path: Path) -> None:
+    text = (CONFIGS / "first_time.toml").read_text(encoding="utf-8")
+    file = tmp_path / "short.toml"
+    file.write_text(text.replace("period = 10.0", "period = 0.2"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"short\.toml: experiment\.band = \[0\.1, 5\] Hz contains only 1 multiple"):
+        load_config(file)
+    file.write_text(text.replace("period = 10.0", "period = 0.5"), encoding="utf-8")
+    config = load_config(file)
+    assert pilot_config(config).experiment.period == config.experiment.period, "half of it has one line for two joints"
+
+
+def test_a_file_without_its_ending_is_suggested(tmp_path: Path) -> None:
+    (tmp_path / "my_arm.toml").write_text("", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"Did you mean .*my_arm\.toml\?"):
+        load_config(tmp_path / "my_arm")
+
+
+def test_a_closed_terminal_does_not_hide_the_stop() -> None:
+    stop = StopRequested("stopped", number=signal.SIGHUP)
+    closed = OSError(5, "Input/output error")
+    closed.__context__ = BrokenPipeError()
+    closed.__context__.__context__ = stop
+    assert stop_behind(closed) is stop
+    assert stop_behind(OSError()) is None
+    assert stop_behind(ValueError()) is None

@@ -97,6 +97,8 @@ EXCEPTIONS: dict[str, dict[str, str]] = {
         "joints.current_limit /1000": OTHER,
         "arm.link_lengths /1000": REFUSED,
         "arm.prior.viscous x57.3": ACCEPTED,
+        "experiment.period /1000": REFUSED,
+        "experiment.band /1000": REFUSED,
         "safety.watchdog /1000": REFUSED,
         "safety.rest_velocity x1000": OTHER,
         "safety.limit_chance x100": ACCEPTED,
