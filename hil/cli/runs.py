@@ -109,9 +109,9 @@ def _print_difference(difference: "Difference") -> None:
 
     from hil.printing import print_fitting, result_console, say
 
-    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
     table.add_column("parameter", no_wrap=True)
-    for heading in ("before", "after", "change %", "in std."):
+    for heading in ("before", "after", "change [%]", "in std."):
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("")
     for change in difference.changes:
@@ -125,7 +125,11 @@ def _print_difference(difference: "Difference") -> None:
             say(console, f"Not in the model {lacking}: {', '.join(names)}.")
     for line in (*difference.doubts, *_would_show(difference.detectable)):
         say(console, line)
-    found = ", ".join(change.name for change in difference.changed)
+    if any(": " in change.name for change in difference.changes):
+        say(console, "friction_i: TERM gives the values of the term if nothing else in the joint's friction changed.")
+    # Such a row already names the term that changed.
+    whole = {change.name.partition(": ")[2] for change in difference.changed if ": " in change.name}
+    found = ", ".join(change.name for change in difference.changed if change.name not in whole)
     say(console, f"Significant changes: {found}." if found else "No significant changes.")
 
 

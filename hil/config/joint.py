@@ -78,7 +78,7 @@ class JointConfig(Table):
     def _driven(self) -> Self:
         pwm = self.drive_mode is Mode.PWM
         if not pwm and servo_model(self.model).current_unit is None:
-            raise ValueError(f'mode = "current": a {self.model} has no current mode; use "pwm"')
+            raise ValueError(f'mode = "current": an {self.model} has no current mode; use "pwm"')
         values = (self.torque_constant, self.current_limit), (self.torque_per_volt, self.voltage_limit)
         names = ("torque_constant", "current_limit"), ("torque_per_volt", "voltage_limit")
         mode = self.drive_mode.name.lower()

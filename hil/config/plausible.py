@@ -62,7 +62,7 @@ def _joint(joint: "JointConfig") -> Iterator[str]:
     if not 1 / _GEAR < ratio < _GEAR:
         yield (
             f"{name} of {where} = {joint.torque_per_goal:g} {unit} is {ratio:.3g} times the published {published:.3g} "
-            f"{unit} of a {joint.model}. Use N m at the output shaft, not mN m, kgf cm or the torque of the bare motor"
+            f"{unit} of an {joint.model}. Use N m at the output shaft, not mN m, kgf cm or the torque of the bare motor"
             + _meant(joint.torque_per_goal, unit, _GEAR * published, published / _GEAR)
         )
     std = joint.torque_per_goal_std
@@ -76,14 +76,14 @@ def _joint(joint: "JointConfig") -> Iterator[str]:
     fastest = max(stall.voltage for stall in model.stalls) / model.torque_per_ampere.low
     if joint.velocity_limit > _SPEED * fastest:
         yield (
-            f"velocity_limit of {where} = {joint.velocity_limit:g} rad/s: a {joint.model} cannot exceed {fastest:.2g} "
+            f"velocity_limit of {where} = {joint.velocity_limit:g} rad/s: an {joint.model} cannot exceed {fastest:.2g} "
             f"rad/s{_meant(joint.velocity_limit, 'rad/s', _SPEED * fastest)}"
         )
     stall = max(stall.voltage if pwm else stall.current for stall in model.stalls)
     if joint.goal_limit > _CURRENT * stall:
         name, unit, kind = ("voltage_limit", "V", "supply") if pwm else ("current_limit", "A", "stall current")
         yield (
-            f"{name} of {where} = {joint.goal_limit:g} {unit}: the {kind} of a {joint.model} is {stall:g} {unit}"
+            f"{name} of {where} = {joint.goal_limit:g} {unit}: the {kind} of an {joint.model} is {stall:g} {unit}"
             + _meant(joint.goal_limit, unit, _CURRENT * stall)
         )
 
@@ -171,7 +171,7 @@ def _heaviest(stall_torque: float) -> float:
 def _too_much(key: str, value: float, most: float, unit: str, joint: "JointConfig") -> Iterator[str]:
     if value > most:
         yield (
-            f"{key} = {value:g} {unit}: far more than a {joint.model} can move ({most:.3g} {unit})"
+            f"{key} = {value:g} {unit}: far more than an {joint.model} can move ({most:.3g} {unit})"
             + (_meant(value, unit, most) or ". Use SI units for all quantities: kg, m, N m, rad, s")
         )
 

@@ -178,9 +178,9 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
         settling_text(config, shown),
         f"If stopped at any moment, they overshoot their limits by up to {_each(config, stopped)}; if the program is "
         f"killed or the cable unplugged, by up to {_each(config, planned[Way.SILENT])}.",
-        "If something drives them past a limit at these speeds, they overshoot it by up to "
-        f"{_each(config, passed[Way.BRAKED])} when braked and {_each(config, passed[Way.CUT])} when torque is cut. "
-        "Keep that much space clear.",
+        "If something drives them past a limit at these speeds, they overshoot it by up to the following. Braked: "
+        f"{_each(config, passed[Way.BRAKED])}. With torque cut: {_each(config, passed[Way.CUT])}. Keep that much space "
+        "clear.",
         *(
             []
             if run.largest is None
@@ -218,9 +218,9 @@ def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> 
     if largest is None:
         return [
             *lines,
-            "No torque is known yet that is safe for every arm; the pilot will find it.",
-            f"SAFE: {starts}{closer}. The guard stops the arm, braked, in {chance} of the simulated arms; "
-            "the pilot learns from such a stop too.",
+            "For the whole experiment, no torque is known yet that is safe for every arm; the pilot will find it.",
+            f"SAFE: {starts}{closer}. The guard would stop and brake {chance} of the simulated arms at these limits, "
+            "and the pilot learns from such a stop too.",
         ]
     return [
         *lines,
@@ -234,8 +234,10 @@ def _list(values: NDArray[np.float64], digits: int = 2) -> str:
 
 
 def _percent(chance: float) -> str:
-    """A percentage; below a millionth of a percent, the tail of a few hundred arms is meaningless."""
-    return "0 %" if chance < 1e-8 else f"{100 * chance:.2g} %"
+    """A percentage; the far tail of a few hundred arms has no digits."""
+    if chance < 1e-8:
+        return "0 %"
+    return "below 0.01 %" if chance < 1e-4 else f"{100 * chance:.2g} %"
 
 
 def _each(config: Config, beyond: NDArray[np.float64]) -> str:
