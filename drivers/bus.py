@@ -19,6 +19,7 @@ from hil.drivers.preparation.prepare import (
     overruled,
     prepare_servo,
     shared,
+    shuts_down,
 )
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
@@ -319,9 +320,33 @@ class ServoBus:
         exchange, since = self.prepared, self.port.clock.now() - _RECENT_S
         if exchange.late_at > since:
             return "Replies did arrive, but too late or twice: suspect the adapter or this computer's load first."
+        if exchange.damaged_at > since and (strange := [each for each in exchange.senders if each not in exchange.ids]):
+            return (
+                f"Intact replies came with ID {', '.join(map(str, dict.fromkeys(strange)))}, which was not asked: "
+                "a servo's ID has changed, or its reply is another servo's."
+            )
+        if exchange.damaged_at > since and len(set(exchange.senders)) < len(exchange.senders):
+            return (
+                f"Intact replies came with the IDs {', '.join(map(str, exchange.senders))}, although each servo was "
+                "asked once: replies are repeated or mixed up, or two servos have the same ID."
+            )
         if exchange.damaged_at > since:
-            return "Bytes arrived, but damaged, incomplete or late."
+            return "Bytes arrived, but damaged or incomplete."
         return ""
+
+    @property
+    def commanded_by_another(self) -> str:
+        """Which servo held a value that this program did not write, read back a moment ago; "" for none.
+
+        One such value does not prove another master: a servo that misses writes holds an older goal.
+        """
+        seen = self.prepared.sighted
+        if seen is None:
+            return ""
+        return (
+            f"Just before, {seen.register} of {self._drives[seen.place].title} was {seen.value} although "
+            f"{seen.written} had been written: another program commands it, or writes are lost."
+        )
 
     def read_status_next(self) -> None:
         """Read the servos' status in the next exchange, if they report one at all."""
@@ -347,9 +372,10 @@ class ServoBus:
         try:
             error = self._servos[drive].hardware_error()
             cause = describe_error(error)
+            cuts = not error or shuts_down(self._servos[drive], error)
         except DriverError as problem:
             return fault_text(drive, f"unknown; it could not be read ({problem})")
-        return fault_text(drive, cause) if alone or error else ""
+        return fault_text(drive, cause, shuts_down=cuts) if alone or error else ""
 
     @contextmanager
     def torque(self, watchdog: float) -> Iterator[None]:

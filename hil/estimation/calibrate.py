@@ -9,7 +9,6 @@ from hil.config.schema import Config
 from hil.errors import ConfigError
 from hil.estimation.chain_calibrate import calibrate_chain_runs, link_of
 from hil.estimation.model_from_config import voltage_driven, wanted_model
-from hil.estimation.result import QUANTISATION_FLOOR_TICKS
 from hil.estimation.settled_period import settled_period
 from hil.estimator.calibration import Calibration, KnownMass, calibrate
 from hil.estimator.chain.calibration import ChainCalibration, MassOnLink
@@ -151,7 +150,7 @@ def _described_chain(config: Config, found: ChainCalibration) -> CalibrationResu
         },
         fit=CalibrationFit(
             residual_rms_ticks=tuple(map(tuple, steps.tolist())),
-            misfit=float(np.mean((steps / QUANTISATION_FLOOR_TICKS) ** 2)),
+            misfit=float(np.mean((steps / found.estimate.noise_steps) ** 2)),
             joints=len(config.joints),
             reached=found.estimate.reached,
         ),

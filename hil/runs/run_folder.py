@@ -172,6 +172,13 @@ class RunFolder:
     def config_path(self) -> Path:
         return self.path / "config.toml"
 
+    def own_files(self) -> frozenset[str]:
+        """Names of the files that make up the run: those written by a run, and the descriptions of its arm.
+
+        Raises RunFolderError, ConfigError.
+        """
+        return _OF_A_START | {"result.json", "lateness.json"} | {urdf.name for urdf in _urdfs(self.load_config())}
+
     @property
     def run_path(self) -> Path:
         return self.path / "run.json"

@@ -121,14 +121,17 @@ def _may_be_absent(name: str, entry: Quantity) -> bool:
 
 def _constant_std(result: SettledResult, name: str) -> float:
     """Relative standard error of the joint's torque constant, with which the parameter scales; 0 where it does not."""
+    known = [
+        each.torque_per_goal_std / each.torque_per_goal if each.torque_per_goal else 0.0 for each in result.arm.joints
+    ]
+    # Where the ratios of the torque constants were identified, every value scales with that of the first joint.
+    has_ratios = any(kind_of(each) == RATIO for each in result.extra)
     if kind_of(name) not in TERMS:  # a base parameter of a spatial arm, to which several joints' torques contribute
-        return 0.0
+        return known[0] if has_ratios else max(known, default=0.0)
     joint = joint_of(name) or 1
-    if not term_of(name).of_torque or joint > len(result.arm.joints):
+    if not term_of(name).of_torque or joint > len(known):
         return 0.0
-    # Where the ratio of the torque constants was identified, every value scales with that of the first joint.
-    facts = result.arm.joints[0 if f"{RATIO}_{joint}" in result.extra else joint - 1]
-    return facts.torque_per_goal_std / facts.torque_per_goal if facts.torque_per_goal else 0.0
+    return known[0 if f"{RATIO}_{joint}" in result.extra else joint - 1]
 
 
 def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
@@ -169,10 +172,9 @@ def _choice(result: SettledResult) -> list[str]:
     cost = choice.standard_errors_times
     if choice.chosen == choice.plainest:
         return [f"Model chosen from {among}: {choice.chosen}, which has the fewest parameters of them."]
-    return [
-        f"Model chosen from {among}: {choice.chosen}. Compared with {choice.plainest}, its prediction error is "
-        f"{_times(_inverse(choice.error_divided_by))} and its standard errors are {_times(cost)}."
-    ]
+    smaller = f"its prediction error is {_times(_inverse(choice.error_divided_by))}"
+    wider = "" if cost is None else f" and its standard errors are {_times(cost)}"
+    return [f"Model chosen from {among}: {choice.chosen}. Compared with {choice.plainest}, {smaller}{wider}."]
 
 
 def _inverse(ratio: float) -> float | None:

@@ -94,9 +94,11 @@ def worst_chain_error(parameters: Mapping[str, float], truth: Mapping[str, float
 
 def _methods(config: Config, period: SettledPeriod, judge: Judge) -> Iterator[Peer]:
     model, prior = judge.model, known_chain(config).prior
-    fit = choose_chain if config.model.friction == "auto" else identify_chain
     began = time.perf_counter()
-    ours = fit(period, model, prior)
+    if config.model.friction == "auto":
+        ours = choose_chain(period, model, prior).estimate
+    else:
+        ours = identify_chain(period, model, prior)
     seconds = time.perf_counter() - began
     yield Peer("hil", ours.parameters, _by_name(ours.names, ours.std), seconds, ours.model.description, 1)
     began = time.perf_counter()
