@@ -251,7 +251,7 @@ def measure(joints: int, seed: int) -> dict[str, Any]:
     bench, setup = BENCHES[joints], set_up(BENCHES[joints], seed)
     played, other = path_of(bench, setup, 100 + seed), path_of(bench, setup, 200 + seed)
     period, held_out = record(bench, setup, played), record(bench, setup, other)
-    model = ChainModel(setup.base)
+    model = ChainModel(setup.base, lags=True)
     started, worked = time.perf_counter(), time.process_time()
     estimate = identify_chain(period, model, setup.prior)
     seconds, processor = time.perf_counter() - started, time.process_time() - worked
@@ -273,7 +273,7 @@ def peer(joints: int) -> dict[str, Any]:
     """The figures of mujoco.sysid on the first seed's recording; raises MissingExtra without it."""
     bench, setup = BENCHES[joints], set_up(BENCHES[joints], 1)
     period = record(bench, setup, path_of(bench, setup, 101))
-    model = ChainModel(setup.base)
+    model = ChainModel(setup.base, lags=True)
     worked = time.process_time()
     identify_chain(period, model, setup.prior)
     ours = time.process_time() - worked

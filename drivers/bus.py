@@ -19,6 +19,7 @@ from hil.drivers.preparation.prepare import (
     overruled,
     prepare_servo,
     shared,
+    shuts_down,
 )
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
@@ -323,6 +324,20 @@ class ServoBus:
             return "Bytes arrived, but damaged, incomplete or late."
         return ""
 
+    @property
+    def commanded_by_another(self) -> str:
+        """Which servo held a value that this program did not write, read back a moment ago; "" for none.
+
+        One such value does not prove another master: a servo that misses writes holds an older goal.
+        """
+        seen = self.prepared.sighted
+        if seen is None:
+            return ""
+        return (
+            f"Just before, {seen.register} of {self._drives[seen.place].title} was {seen.value} although "
+            f"{seen.written} had been written: another program commands it, or writes are lost."
+        )
+
     def read_status_next(self) -> None:
         """Read the servos' status in the next exchange, if they report one at all."""
         self.prepared.read_status_next()
@@ -347,9 +362,10 @@ class ServoBus:
         try:
             error = self._servos[drive].hardware_error()
             cause = describe_error(error)
+            cuts = not error or shuts_down(self._servos[drive], error)
         except DriverError as problem:
             return fault_text(drive, f"unknown; it could not be read ({problem})")
-        return fault_text(drive, cause) if alone or error else ""
+        return fault_text(drive, cause, shuts_down=cuts) if alone or error else ""
 
     @contextmanager
     def torque(self, watchdog: float) -> Iterator[None]:

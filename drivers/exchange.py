@@ -126,6 +126,8 @@ class Exchange:
         self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
         self._lasted = math.inf
         self._read_back: ReadBack | None = None
+        self._shorter: dict[GroupRead, float] = {}
+        """By how much the wire time of each read-back is shorter than that of a usual cycle [s]."""
         self.read_back_at = math.inf
         """When `overruled` should be called again, before the next cycle [s on the port's clock]."""
 
@@ -156,14 +158,21 @@ class Exchange:
         """Prepare `overruled`. goal, mode: spans that end with the goal and with Operating Mode. modes: the operating
         modes that were set.
         """
-        self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
-        self._expected = self._expected.union(*(read.expected for read in self._read_back.reads))
+        back = self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
+        usual = self._bytes(self._reads[0])
+        self._shorter = {read: self._port.wire_time(usual - self._bytes(read)) for read in back.reads}
+        self._expected = self._expected.union(*(read.expected for read in back.reads))
         self.read_back_at = -math.inf
 
     @property
     def is_in_doubt(self) -> bool:
         """Whether a read-back has just found a value that this program did not write."""
         return self._read_back is not None and self._now() < self._read_back.doubts_until
+
+    @property
+    def sighted(self) -> Overruled | None:
+        """A value that a servo held a moment ago although this program did not write it; None if there was none."""
+        return self._read_back.sighted if self._read_back is not None and self.is_in_doubt else None
 
     def overruled(self, due: float) -> Overruled | None:
         """Read goals or operating modes back if there is time before the next cycle, which is due at `due` [s].
@@ -179,7 +188,7 @@ class Exchange:
             return None
         now, read = self._now(), back.read
         asked = read.reply_size + (len(read.request) if self._echoes else 0)
-        takes = max(self._lasted - port.wire_time(self._bytes(self._reads[0]) - self._bytes(read)), back.longest)
+        takes = max(self._lasted - self._shorter[read], back.longest)
         if now + takes > due or self._late_possible:
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
             self.read_back_at = now + TRY_AGAIN_S

@@ -75,6 +75,8 @@ class ReadBack:
         self._goals_sighted: list[deque[float]] = [deque() for _ in ids]
         self._modes_sighted: list[deque[float]] = [deque() for _ in ids]
         self.doubts_until = -math.inf
+        self.sighted: Overruled | None = None
+        """The latest value read back that this program did not write; it is recent until `doubts_until`."""
 
     @property
     def read(self) -> GroupRead:
@@ -93,11 +95,13 @@ class ReadBack:
             while times and now - times[0] > _SIGHTED_S:
                 times.popleft()
             times.append(now)
+            if of_modes:
+                self.sighted = Overruled(place, "Operating Mode", value, self._modes[place])
+            else:
+                self.sighted = Overruled(place, self._goals[place], value, sent[-1][place])
             most = _MODE_SIGHTINGS if of_modes else _GOAL_SIGHTINGS
             if len(times) >= most:
-                if of_modes:
-                    return Overruled(place, "Operating Mode", value, self._modes[place])
-                return Overruled(place, self._goals[place], value, sent[-1][place])
+                return self.sighted
             self.doubts_until = now + _IN_DOUBT_S
             is_nearly_sure |= len(times) == most - 1
         is_in_doubt = now < self.doubts_until

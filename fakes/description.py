@@ -10,7 +10,8 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from hil.drivers.clock import Clock
 from hil.drivers.packet import MAX_ID
 from hil.fakes.bus.bus import FakeBus
-from hil.fakes.bus.faults import Fault
+from hil.fakes.bus.fault_effects import jam
+from hil.fakes.bus.faults import Fault, FaultKind
 from hil.fakes.bus.hand import Move
 from hil.fakes.bus.supply import Supply
 from hil.fakes.names import arm_names, find_arm
@@ -225,7 +226,7 @@ def load_fake(path: Path | str) -> FakeArm:
 def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
     """Return the described bus: servos switched on at the clock's current time, the arm at rest in its initial pose.
 
-    Raises PlantError if a custom plant is described and cannot be created.
+    Raises PlantError if a custom plant is described and cannot be created, or lacks what its faults or moves need.
     """
     servos = [
         EmulatedServo(
@@ -250,9 +251,12 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
         )
         for servo in fake.servos
     ]
+    plant = fake.make_plant()
+    if any(fault.kind is FaultKind.STUCK_JOINT for fault in fake.faults):
+        jam(plant, 0, jammed=False)  # a plant without this is refused now, not in the middle of a run
     bus = FakeBus(
         servos,
-        fake.make_plant(),
+        plant,
         clock,
         joints=fake.joints,
         adapter_latency_us=fake.adapter_latency_us,

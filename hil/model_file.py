@@ -15,7 +15,7 @@ from hil.arm_model import ArmModel
 from hil.chain_model import ChainArmModel, Geometry
 from hil.errors import ResultError
 from hil.estimator.models.terms import RIGID_BODY, base_names, extra_names
-from hil.next_step import command
+from hil.next_step import command, only_steps, steps_of
 from hil.results.json_form import FormError, from_json
 from hil.results.parts import ArmFacts, ChainFacts, Quantity
 from hil.results.result import SCHEMA, Result, SettledResult, result_from_json
@@ -52,6 +52,8 @@ def _no_result(folder: Path) -> str:
             f"{folder} has no result.json: its identification did not finish. Estimate it first: "
             f"{command('estimate', folder)}"
         )
+    if steps := steps_of(folder):
+        return only_steps(folder, steps)
     below = sorted(each.parent for each in folder.glob("*/result.json"))
     if below:
         listed = command("runs", folder)

@@ -116,7 +116,7 @@ def identify_chain(
         outliers=fit.outliers + spikes,
         white_std=np.sqrt(np.diag(fit.white_covariance)),
         correlation_time=fit.correlation_time,
-        systematic=_median_ratio(np.sqrt(np.diag(fit.covariance))[:count], std[:count]),
+        systematic=median_ratio(np.sqrt(np.diag(fit.covariance))[:count], std[:count]),
         softness=fit.softness,
         reached=fit.reached,
         from_prior=tuple(name for name, open_ in zip(model.base.names, wide, strict=True) if open_),
@@ -129,7 +129,7 @@ def identify_chain(
     )
 
 
-def _median_ratio(one: Array, other: Array) -> float:
+def median_ratio(one: Array, other: Array) -> float:
     """Return the median ratio of two vectors of standard errors, over the finite ones; infinite if there are none."""
     known = np.isfinite(one) & np.isfinite(other)
     return float(np.median(one[known] / other[known])) if known.any() else np.inf

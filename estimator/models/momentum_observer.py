@@ -30,6 +30,7 @@ import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import only_version
 
 NAMES = (
     *("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
@@ -94,9 +95,11 @@ class MomentumObserver:
         floor[:joints] = FLOOR_SHARE * largest
         drift = _LEAST_DRIFT**2 * np.diag(covariance)
         self._constants = np.concatenate(([joints, interval, *floor], drift, (_FIRST_NOISE_SHARE * 0.1 * floor) ** 2))
+        self._loop: Callable[..., int] = _observe
         self.observe(
             (0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf
         )  # compiles the loop and initialises the memory
+        self._loop = only_version(_observe)
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:
         """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1.
@@ -105,8 +108,10 @@ class MomentumObserver:
         seconds: time since the previous sample [s].
         """
         if self._joints == 1:
-            return _observe(self._memory, self._constants, position[0], 0.0, velocity[0], 0.0, torque[0], 0.0, seconds)
-        return _observe(self._memory, self._constants, *position, *velocity, *torque, seconds)
+            return self._loop(
+                self._memory, self._constants, position[0], 0.0, velocity[0], 0.0, torque[0], 0.0, seconds
+            )
+        return self._loop(self._memory, self._constants, *position, *velocity, *torque, seconds)
 
     @property
     def lacking(self) -> list[float]:

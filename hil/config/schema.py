@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from difflib import get_close_matches
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -296,9 +297,9 @@ class Config(Table):
         return self.port.url.startswith(FAKE_URL)
 
 
-def load_config(path: Path) -> Config:
+def load_config(path: str | PathLike[str]) -> Config:
     """Read and check a TOML file, or the bundled one of that bare name. Raises ConfigError."""
-    path = find_config(path)
+    path = find_config(Path(path))
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

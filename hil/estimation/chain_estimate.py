@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config.chain import described_arm
+from hil.config.chain import described_arm, doubted_inertias
 from hil.config.schema import Config
 from hil.errors import RecordingCutShort
 from hil.estimation.model_from_config import voltage_driven
@@ -20,6 +20,7 @@ from hil.estimation.truth import back_emf
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import SYSTEMATIC, ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.model.tilt import TILT, tilt_between
 from hil.estimator.chain.simulation.prediction import predict
 from hil.fakes.plants.arm import armature
@@ -91,7 +92,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
             jump_disturbances(config, facts, samples),
         ),
         model_choice=None if choice is None else describe_chain_choice(choice),
-        warnings=tuple(warnings_of(config, facts, samples, period)),
+        warnings=(*warnings_of(config, facts, samples, period), *doubted_inertias(described_arm(config))),
         timing=RunTiming.of(timing(samples, config.experiment.rate), seconds),
         arm=arm_facts(config),
         chain=_facts(config, estimate, known),
@@ -208,6 +209,9 @@ def _verdict(
             f"The recording hardly determines {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
             "wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
         )
+    if said := vague(known.prior, known.base.names, estimate.std, estimate.from_prior):
+        trust = "with care" if trust == "yes" else trust
+        sentences.append(said)
     if not estimate.reached:
         trust = "with care" if trust == "yes" else trust
         sentences.append(
@@ -220,6 +224,17 @@ def _verdict(
             f"assumed to be zero within their standard errors."
         )
     return Verdict(trust, weakest, tuple(sentences))
+
+
+def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_prior: tuple[str, ...]) -> str:
+    """Name base parameters, besides `from_prior`, with standard errors larger than the prior's; empty if none."""
+    found = [name for name in prior.surpassing(names, std) if name not in from_prior]
+    if not found:
+        return ""
+    return (
+        f"The standard errors of {', '.join(found)} are larger than the uncertainty that the URDF's values are assumed "
+        "to have: errors of the model, or a fit that stopped short, outweigh what the recording says about them."
+    )
 
 
 def _unexplained(config: Config, estimate: ChainEstimate) -> str:

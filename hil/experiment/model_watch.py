@@ -20,7 +20,7 @@ from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble, prior_ensemble
 from hil.errors import Cause, SafetyStop
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled
+from hil.estimator.compiled import compiled, only_version
 from hil.estimator.models.momentum_observer import NAMES, MomentumObserver
 from hil.estimator.models.parameters import CONSTANTS
 
@@ -101,13 +101,15 @@ class Jolts:
         self._velocity = np.zeros(count)
         self._pack = Struct(f"{count}d").pack_into
         self._bytes = memoryview(self._velocity.data).cast("B")
+        self._jolting: Callable[..., int] = _jolting
         self.look([0.0] * count, 0.0, 0.0)  # compile
+        self._jolting = only_version(_jolting)
         self.forget()
 
     def look(self, velocity: Sequence[float], seconds: float, now: float) -> tuple[int, float] | None:
         """Process velocities [rad/s], `seconds` after the previous ones [s]; return the joint and change of a jolt."""
         self._pack(self._bytes, 0, *velocity)
-        joint = _jolting(self._joints, self._former, self._velocity, seconds, now, self._least)
+        joint = self._jolting(self._joints, self._former, self._velocity, seconds, now, self._least)
         return None if joint < 0 else (joint, float(self._joints["change"][joint]))
 
     def forget(self) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.estimator.compiled import compiled
+from hil.estimator.compiled import compiled, only_version
 
 _EMPTY = float("nan")
 
@@ -60,6 +60,7 @@ class Repetition:
         self._bytes = memoryview(self._latest.data).cast("B")
         self.begin(samples)
         _add(self._former, self._sums, self._allowed, self._unlike_for, self._latest, 0, False, True)  # compile
+        self._compare = only_version(_add)
 
     def begin(self, samples: int, *, anew: bool = False) -> None:
         """Start a new period of `samples` samples. anew: whether its torque differs from the previous period's.
@@ -79,7 +80,7 @@ class Repetition:
         """Add sample `index` of the period: positions of all joints [rad], NaN where missing."""
         self._pack(self._bytes, 0, *position)
         compared = index >= self._half
-        joint = _add(
+        joint = self._compare(
             self._former, self._sums, self._allowed, self._unlike_for, self._latest, index, compared, self._anew
         )
         self.unlike = joint if self._unlike_for[joint] >= self._lasting else None

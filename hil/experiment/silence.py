@@ -56,7 +56,7 @@ class Silence:
     def ask(self, now: float) -> None:
         """Begin an exchange at `now` [s]."""
         since = 0.0 if self._asked_at is None else now - self._asked_at
-        self._turn = min(since, self._longest_turn)
+        self._turn = since if since < self._longest_turn else self._longest_turn
         self._asked_at = now
 
     def heard(self, joint: int, now: float) -> None:

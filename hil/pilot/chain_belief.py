@@ -66,6 +66,12 @@ class ChainBelief:
         arms = prior_arms(config, known_chain(config), DRAWN)
         return cls(config, arms, inertias(arms.first(SIMULATED), _poses(config))[1].min(axis=0))
 
+    def at_least(self, count: int) -> ChainArms:
+        """Return `count` arms: the first ones of the ensemble and, for a prior that is too small, further ones."""
+        if count <= self.arms.size:
+            return self.arms.first(count)
+        return self.arms.and_more(prior_arms(self.config, known_chain(self.config), count - self.arms.size, seed=1))
+
     @property
     def torque(self) -> ChainTorque:
         """Inverse dynamics with the ensemble's mean parameters, in units of the commanded torque."""

@@ -15,7 +15,7 @@ from hil.estimator.chain.fit.coordinates import ChainCoordinates, kind_of
 from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.fit.resolved_widths import resolved_widths
 from hil.estimator.chain.fit.stage1 import ChainLinear
-from hil.estimator.chain.fit.uncertainty import coloured_covariance
+from hil.estimator.chain.fit.uncertainty import coloured_covariance, neglected_covariance
 from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod
@@ -125,11 +125,15 @@ class ChainFit:
     """Natural frequency of the observer at the end [Hz]."""
     remaining: float
     """Decrease of the sum of squares that is expected from one more step, the one that would reach the minimum."""
+    neglected: Array
+    """Covariance due to what the model of voltage-driven joints neglects (parameters, parameters) [SI]."""
 
     @property
     def total_covariance(self) -> Array:
-        """Covariance of `value` about the truth: that at the minimum, widened by the distance to the minimum."""
-        return np.asarray(self.covariance + np.outer(self.missing, self.missing))
+        """Covariance of `value` about the truth: that at the minimum, widened by the distance to the minimum and by
+        what the model is known to neglect.
+        """
+        return np.asarray(self.covariance + np.outer(self.missing, self.missing) + self.neglected)
 
     @property
     def reached(self) -> bool:
@@ -358,6 +362,7 @@ def _fit(
         iterations,
         problem.softness,
         decrease,
+        neglected_covariance(problem, x),
     )
 
 

@@ -28,11 +28,11 @@ CLEARLY_INDEPENDENT = 0.1
 
 It is relative to the largest column of the same link and kind.
 """
-INDEPENDENT = 1e-4
+INDEPENDENT = 2e-3
 """Norm of that part, on the same scale, above which the column is kept in the end.
 
-Angles such as 1.5708 in a description make every parameter slightly independent, but change no torque by more than this
-fraction.
+Angles such as 1.57 or 1.5708 in a description make every parameter slightly independent, but change no torque by more
+than this fraction of what the parameter contributes where it counts. No recording would determine such a parameter.
 """
 LEAST_FACTOR = 1e-7  # of a group
 NOTHING = 1e-9

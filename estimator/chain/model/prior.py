@@ -27,6 +27,10 @@ class Prior:
     """Inverse covariance of the logarithms of the torque scales of all joints but the first (joints - 1, joints - 1);
     None if nothing is known about them."""
 
+    def surpassing(self, names: tuple[str, ...], std: Array) -> tuple[str, ...]:
+        """Return the base parameters whose standard errors (base parameters or more,) exceed the prior's."""
+        return tuple(name for name, each, own in zip(names, std[: self.std.size], self.std, strict=True) if each > own)
+
     @classmethod
     def of(
         cls, base: BaseParameters, links: Array, armature: Array | None = None, scale_std: Array | None = None

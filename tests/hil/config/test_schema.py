@@ -16,6 +16,12 @@ def change(old: str, new: str) -> str:
     return REALISTIC.replace(old, new, 1)
 
 
+def test_a_path_is_text_or_a_path() -> None:
+    path = CONFIGS / "fake_two_link.toml"
+    assert load_config(str(path)) == load_config(path)
+    assert load_config("fake_two_link").joints == load_config(path).joints
+
+
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.stem)
 def test_every_ready_file_is_right(path: Path) -> None:
     config = load_config(path)

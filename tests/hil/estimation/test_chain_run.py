@@ -319,3 +319,20 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
     hidden = _verdict(config, estimate, known, np.full(4, 1e-3), [])
     assert hidden.trust == "with care"
     assert "part of it repeats with the motion" in hidden.sentences[0]
+
+
+def test_a_value_less_certain_than_the_description_is_trusted_with_care(run: RunFolder) -> None:
+    """Errors of the model may make a standard error exceed the prior's, although white noise would not."""
+    config = run.load_config()
+    known = known_chain(config)
+    std = 0.01 * known.prior.std
+    std[2] = 1.1 * known.prior.std[2]
+    estimate: Any = SimpleNamespace(
+        **{"std": std, "residual_steps": 0.29 * np.ones(4), "systematic": 0.8},
+        **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base)},
+    )
+    verdict = _verdict(config, estimate, known, np.full(4, 1e-3), [])
+    assert verdict.trust == "with care"
+    assert known.base.names[2] in verdict.sentences[-1]
+    estimate.from_prior = (known.base.names[2],)  # named once is enough
+    assert len(_verdict(config, estimate, known, np.full(4, 1e-3), []).sentences) == len(verdict.sentences)
