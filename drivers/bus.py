@@ -320,8 +320,18 @@ class ServoBus:
         exchange, since = self.prepared, self.port.clock.now() - _RECENT_S
         if exchange.late_at > since:
             return "Replies did arrive, but too late or twice: suspect the adapter or this computer's load first."
+        if exchange.damaged_at > since and (strange := [each for each in exchange.senders if each not in exchange.ids]):
+            return (
+                f"Intact replies came with ID {', '.join(map(str, dict.fromkeys(strange)))}, which was not asked: "
+                "a servo's ID has changed, or its reply is another servo's."
+            )
+        if exchange.damaged_at > since and len(set(exchange.senders)) < len(exchange.senders):
+            return (
+                f"Intact replies came with the IDs {', '.join(map(str, exchange.senders))}, although each servo was "
+                "asked once: replies are repeated or mixed up, or two servos have the same ID."
+            )
         if exchange.damaged_at > since:
-            return "Bytes arrived, but damaged, incomplete or late."
+            return "Bytes arrived, but damaged or incomplete."
         return ""
 
     @property

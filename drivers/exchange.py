@@ -102,6 +102,8 @@ class Exchange:
         self.one_write = one_write
         self.damaged_at = self.late_at = -math.inf
         """When incomplete or damaged replies last arrived, and when an unexpected one did [s on the port's clock]."""
+        self.senders: list[int] = []
+        """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.strangers = 0
         """Number of packets received that this program neither sent nor asked for: another master is on the bus."""
         self._write, *self._more_writes = [
@@ -306,7 +308,7 @@ class Exchange:
         self._look_for_strangers(_packets_within(received))
         complete = sum(answer is not None for answer in answers) / len(answers)
         if complete < 1.0 and len(received) > complete * read.reply_size + _PART_OF_A_REPLY:
-            self.damaged_at = self._now()
+            self.damaged_at, self.senders = self._now(), read.senders(received)
         return answers
 
     def _look_for_strangers(self, packets: Sequence[Packet]) -> None:

@@ -105,6 +105,10 @@ class GroupRead(Protocol):
         """
         ...
 
+    def senders(self, received: bytes) -> list[int]:
+        """Return the IDs of the intact answers found in an irregular reply, also IDs that were not asked."""
+        ...
+
 
 class SyncRead:
     """Each servo answers with its own status packet, in the order of `ids`.
@@ -162,6 +166,10 @@ class SyncRead:
                 found[packet.id], latest = answer, turn
         # Servos answer in order, so nothing follows the last one.
         return [found.get(servo_id) for servo_id in self._ids], self._ids[-1] in found
+
+    def senders(self, received: bytes) -> list[int]:
+        packets = Framer(longest=self._longest).feed(received)
+        return [packet.id for packet in packets if packet.is_status and len(packet.data) == self._size]
 
     def _answer(self, packet: Packet) -> Answer:
         if len(packet.data) == self._size:
@@ -223,6 +231,16 @@ class FastSyncRead:
         # After a silent or damaged servo, the rest of the packet cannot be trusted.
         answers += [None] * (len(self._ids) - len(answers))
         return answers, len(packet) >= self.reply_size
+
+    def senders(self, received: bytes) -> list[int]:
+        at = received.find(self._front)
+        packet = received[at:] if at >= 0 else b""
+        found = []
+        for _, start, end in self._parts:
+            if len(packet) < end or _crc(packet[: end - 2]) != int.from_bytes(packet[end - 2 : end], "little"):
+                break
+            found.append(packet[start + 1])
+        return found
 
 
 def _request(instruction: Instruction, ids: Sequence[int], span: Span) -> bytes:

@@ -14,7 +14,7 @@ signals back while torque is cut.
 
 import signal
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from types import FrameType
@@ -79,13 +79,19 @@ class TorqueOff:
                     "connector; a brief voltage dip is enough."
                 )
 
+    def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:
+        """Each reason why servos are unconfirmed, with their joints; reasons that differ only in the name are one."""
+        yield from by_reason(self.unconfirmed).items()
+
     def _outcome(self) -> str:
         if not self.unconfirmed:
             servos = "the servo" if len(self.confirmed) == 1 else f"all {len(self.confirmed)} servos"
             return f"Torque is off on {servos}, read back."
-        names = "; ".join(f"{str(joint).upper()}: {why}" for joint, why in self.unconfirmed)
+        names = "; ".join(
+            f"{and_list(str(joint).upper() for joint in joints)}: {why}" for why, joints in self._reasons()
+        )
         if self.confirmed:
-            names = f"{names} It is off, read back, on {', '.join(map(str, self.confirmed))}."
+            names = f"{names} It is off, read back, on {and_list(map(str, self.confirmed))}."
         alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
         if alone:
             return (
@@ -201,6 +207,24 @@ def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) 
         else:
             return None
     return DriverError("The write was interrupted repeatedly.")
+
+
+def by_reason(failures: Iterable[tuple[Joint, str]]) -> dict[str, list[Joint]]:
+    """The joints for which each reason applies; reasons that differ only in the joint's name are one."""
+    joints: dict[str, list[Joint]] = {}
+    own = {joint: why.replace(joint.title, "It").replace(str(joint), "it") for joint, why in failures}
+    for joint, why in own.items():
+        joints.setdefault(why, []).append(joint)
+    return {
+        why.replace("It ", "Each ", 1) if len(each) > 1 and why.startswith("It ") else why: each
+        for why, each in joints.items()
+    }
+
+
+def and_list(names: Iterable[str]) -> str:
+    """Join names by commas and "and"."""
+    *most, last = names
+    return f"{', '.join(most)} and {last}" if most else last
 
 
 def _text(error: Exception) -> str:

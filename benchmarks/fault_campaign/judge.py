@@ -132,7 +132,7 @@ def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
 
 def causes_in(text: str) -> set[str]:
     """The causes that a message names, ignoring lines about the torque state."""
-    said = [line for line in text.splitlines() if not re.match(r"Torque is off|TORQUE OFF", line.strip())]
+    said = [line for line in text.splitlines() if not re.match(r"(hil: )?(Torque is off|TORQUE OFF)", line.strip())]
     return {cause for cause, words in WORDS.items() if any(re.search(words, line, re.IGNORECASE) for line in said)}
 
 
@@ -146,6 +146,7 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -
     told = _Told(config, story.traffic, drawn.start)
     interval = 1.0 / config.experiment.rate
     joints = range(len(config.joints))
+    holds = np.asarray(record["torque"].any(axis=1))  # while servos are set up, nobody needs to be heard regularly
     found: list[Reason | None] = []
     for joint in joints:
         own = record[:, joint]
@@ -159,7 +160,7 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -
                     GAP_MS,
                 ),
                 ("is not as fast as told", told.lies(joint, time, own, "velocity", interval), LASTING_MS, GAP_MS),
-                ("was not heard", told.silent(joint, time, interval, story.ended), LASTING_MS, 1),
+                ("was not heard", told.silent(joint, time, interval, story.ended) & holds, LASTING_MS, 1),
                 ("does not do as told", told.disobeys(joint, time, own, interval), LASTING_MS, GAP_MS),
                 ("is beyond a limit", _beyond(config, joint, own), 1, GAP_MS),
                 (
@@ -214,10 +215,9 @@ class _Told:
         self._begun = np.inf
         self._largest = [1] * len(config.joints)
         index = {joint.id: number for number, joint in enumerate(config.joints)}
-        events = [(time, 0, data) for time, data in traffic.written] + [(time, 1, data) for time, data in traffic.read]
         request: Request | None = None
         pending = b""
-        for time, is_read, data in sorted(events, key=lambda event: event[0]):
+        for time, is_read, data in traffic.passed:
             if not is_read:
                 if b"\x83" in data[:16]:
                     request = request_in(data) or request

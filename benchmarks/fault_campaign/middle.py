@@ -39,10 +39,12 @@ LOOK_BACK_S = 0.5
 
 @dataclass
 class Traffic:
-    """Bytes that passed the port: (time [s], bytes) of every write and every read."""
+    """Bytes that passed the port, in order: (time [s], whether they were read, bytes) of every write and every read.
 
-    written: list[tuple[float, bytes]] = field(default_factory=list)
-    read: list[tuple[float, bytes]] = field(default_factory=list)
+    A read and the write of the next request may take place at the same moment of the virtual clock.
+    """
+
+    passed: list[tuple[float, bool, bytes]] = field(default_factory=list)
 
 
 class Middle(FakeSerial):
@@ -95,7 +97,7 @@ class Middle(FakeSerial):
     def write(self, data: bytes | bytearray) -> int:  # type: ignore[override]
         now = self.clock.now()
         self._strike(now)
-        self.traffic.written.append((now, bytes(data)))
+        self.traffic.passed.append((now, False, bytes(data)))
         if not self._wakes <= now <= self._sleeps:
             return super().write(data)
         self._request = request_in(bytes(data)) or self._request
@@ -113,7 +115,7 @@ class Middle(FakeSerial):
             taken = self._read_changed(size)
         else:
             taken = super().read(size)
-        self.traffic.read.append((self.clock.now(), taken))
+        self.traffic.passed.append((self.clock.now(), True, taken))
         self._strike(self.clock.now())
         return taken
 

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 from hil.fakes.plants import motor
-from hil.fakes.plants.arm import Arm, Link
+from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.plant import make_plant
 
 Array = NDArray[np.float64]
@@ -171,16 +171,15 @@ def _altered(arm: Arm, parameters: Array) -> Arm:
     for link, drive, (mass, centre, inertia, rotor, viscous, coulomb, torque) in zip(
         arm.links, arm.drives, factors.tolist(), strict=True
     ):
-        links.append(
-            Link(length=link.length, mass=mass * link.mass, centre=centre * link.centre, inertia=inertia * link.inertia)
-        )
+        other = {"mass": mass * link.mass, "centre": centre * link.centre, "inertia": inertia * link.inertia}
+        links.append(link.model_copy(update=other))
         changed = {
             "rotor_inertia": rotor * drive.rotor_inertia,
             "viscous": viscous * drive.viscous,
             "coulomb": coulomb * drive.coulomb,
             "torque_constant": torque * drive.torque_constant,
         }
-        drives.append(drive.model_copy(update=changed))  # not validated: configurations bound what a search may try
+        drives.append(drive.model_copy(update=changed))  # not validated, like links: files bound what a search may try
     start = (arm.start[0] + float(parameters[-1]), *arm.start[1:])
     return arm.model_copy(update={"links": tuple(links), "drives": tuple(drives), "start": start})
 

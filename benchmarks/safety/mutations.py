@@ -46,14 +46,20 @@ TESTS = {
     "hil/experiment/stream.py": [
         *(f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py", f"{_EXPERIMENT}/test_lowering.py"),
     ],
-    "hil/drivers/exchange.py": ["tests/drivers/test_exchange.py", "tests/drivers/test_read_back.py"],
+    "hil/drivers/exchange.py": [
+        *("tests/drivers/test_exchange.py", "tests/drivers/test_read_back.py", "tests/drivers/test_heard_instead.py"),
+    ],
+    "hil/drivers/read_back.py": ["tests/drivers/test_sightings.py", "tests/drivers/test_read_back.py"],
     "hil/drivers/torque_off.py": ["tests/drivers/test_torque_off.py"],
+    "hil/estimator/models/standstill.py": ["tests/estimator/models/test_standstill.py"],
+    "hil/experiment/chain_watch.py": [f"{_EXPERIMENT}/test_chain_watch.py"],
     "hil/runs/recording.py": ["tests/hil/runs/test_recording.py"],
 }
 """Modules, and the tests that should detect mutations."""
 
 EQUIVALENT = {
     ("nogil=True", "True  ->  False"): "compiled code does not hold the interpreter's lock: only other threads notice",
+    ("self.due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: every look sets it before it is read",
     (
         "self._clock = [",
         "0.0  ->  1.0",

@@ -30,7 +30,8 @@ import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import only_version
+from hil.estimator.compiled import compiled, only_version
+from hil.estimator.models import standstill
 
 NAMES = (
     *("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
@@ -49,6 +50,8 @@ FLOOR_SHARE = 0.25
 _COUNT = len(NAMES)
 _STANDING = 0.05  # rad/s below which dry friction may hold a joint
 _STATIC = 1.5  # ratio of static to Coulomb friction
+_CERTAIN = 2.0  # standard deviations within which a torque that friction has held is known
+_VISIBLE = 2.0  # velocity that shows in the register, in standard deviations of its rounding
 _VELOCITY_STD = 0.0135  # rad/s: rounding of the register, with steps of 0.024, and some noise
 _FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned torque
 _NOISE_S = 1.0  # time constant of the noise estimate
@@ -93,6 +96,7 @@ class MomentumObserver:
         self._memory[_SINGLE, _NOISE : _NOISE + joints] = (_FIRST_NOISE_SHARE * largest) ** 2
         floor = np.zeros(2)
         floor[:joints] = FLOOR_SHARE * largest
+        self._rests = standstill.memory(joints, _COUNT)
         drift = _LEAST_DRIFT**2 * np.diag(covariance)
         self._constants = np.concatenate(([joints, interval, *floor], drift, (_FIRST_NOISE_SHARE * 0.1 * floor) ** 2))
         self._loop: Callable[..., int] = _observe
@@ -108,10 +112,8 @@ class MomentumObserver:
         seconds: time since the previous sample [s].
         """
         if self._joints == 1:
-            return self._loop(
-                self._memory, self._constants, position[0], 0.0, velocity[0], 0.0, torque[0], 0.0, seconds
-            )
-        return self._loop(self._memory, self._constants, *position, *velocity, *torque, seconds)
+            position, velocity, torque = (position[0], 0.0), (velocity[0], 0.0), (torque[0], 0.0)
+        return self._loop(self._memory, self._rests, self._constants, *position, *velocity, *torque, seconds)
 
     @property
     def lacking(self) -> list[float]:
@@ -193,10 +195,36 @@ def _learn(m: Any, gain: Any, lacking: float, spread: float) -> None:
             m[_COVARIANCE + i, n] -= gain[i] * gain[n] / spread
 
 
-def _held_by_friction(m: Any, j: int) -> float:
-    """Return the torque that dry friction may hold, given the fraction of the past at standstill [N m]."""
+def _static_friction(m: Any, rest: Any, j: int) -> float:
+    """Return the torque that dry friction may hold at standstill [N m]."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
-    return float(_STATIC * max(dry, 0.0) * min(max(m[_SINGLE, _STANDS + j], 0.0), 1.0))
+    return float(max(_STATIC * dry, _withstood(rest)))
+
+
+def _is_blocked(
+    m: Any,
+    rest: Any,
+    j: int,
+    distance: float,
+    row: Any,
+    held: float,
+    floor: float,
+    noise: float,
+    rounding: float,
+    dt: float,
+) -> bool:
+    """Return whether joint j stands still under a range of torques that friction cannot hold.
+
+    distance: result of `standstill.look`. held: torque that certainly acts on it now. floor: smallest tolerance.
+    noise, rounding: variances of one sample's missing torque at standstill. All in SI units.
+    """
+    if distance == 0.0:
+        return False
+    variance = _variance(rest, distance, row, m[_COVARIANCE:_PENDING]) + 2.0 * noise
+    tolerance = max(TIMES * math.sqrt(variance), floor)
+    momentum = _VISIBLE * math.sqrt(rounding) * FILTER_S
+    friction = _static_friction(m, rest, j)
+    return bool(_blocked(rest, distance, held, friction, tolerance, momentum, FILTER_S, dt))
 
 
 def _second_moment(m: Any, weight_1: float, coupling: float, weight_2: float, armature: float) -> float:
@@ -244,16 +272,22 @@ def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> Non
         for_later[_TEACHES + j] += dt
         return
     seconds = dt + for_later[_TEACHES + j]
+    if seconds <= 0.0:
+        return
     mean = (taught * dt + for_later[_TAUGHT + j]) / seconds
     m[_SINGLE, _NOISE + j] += min(seconds / _NOISE_S, 1.0) * (mean - m[_SINGLE, _NOISE + j])
     for_later[_TAUGHT + j] = for_later[_TEACHES + j] = 0.0
 
 
-def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, dt: float) -> int:
+def _observe_loop(
+    m: Any, rests: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, dt: float
+) -> int:
     momentum, rest = np.zeros((2, _COUNT)), np.zeros((2, _COUNT))
     _regressors(momentum, rest, q1, q2, v1, v2)
     if dt > _LONGEST_GAP * k[1]:
         _begin_anew(m, momentum, rest, t1, t2)
+        for j in range(int(k[0])):
+            _forget(rests[j])
         return -1
     single = m[_SINGLE]
     fallen = 1.0 - math.exp(-dt / FILTER_S)
@@ -275,16 +309,22 @@ def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1
             continue
         lacking, left_open = _lacks(m, j, row, gain)
         single[_LACKING + j] = lacking
-        holds, rounding = _held_by_friction(m, j), _of_rounding(m, j, slope, math.cos(q2))
-        quiet = 1.0 - (1.0 - _STANDING_NOISE) * min(max(single[_STANDS + j], 0.0), 1.0)
-        spread = left_open + rounding + quiet * quiet * single[_NOISE + j]
+        stands = min(max(single[_STANDS + j], 0.0), 1.0)
+        holds, rounding = stands * _static_friction(m, rests[j], j), _of_rounding(m, j, slope, math.cos(q2))
+        quiet = 1.0 - (1.0 - _STANDING_NOISE) * stands
+        noise = quiet * quiet * single[_NOISE + j]
+        spread = left_open + rounding + noise
         beyond = max(abs(lacking) - holds, 0.0)
         is_beyond = beyond > TIMES * math.sqrt(spread)
         if _alarms(single, j, beyond / max(TIMES * math.sqrt(spread), quiet * k[2 + j]), dt):
             alarm = j
+        distance = _look_at_rest(rests[j], q1 if j == 0 else q2, stands, single[_TORQUE + j], row, m[_THETA])
+        held = abs(lacking) - _CERTAIN * math.sqrt(left_open)
+        if _is_blocked(m, rests[j], j, distance, row, held, quiet * k[2 + j], noise, rounding, dt):
+            alarm = j
         taught = min(beyond * beyond - left_open - rounding, _CLIPPED * single[_NOISE + j])
-        _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), dt, single[_SAMPLES + j] > 0.0)
-        if lesson and not is_beyond:
+        _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), dt * (1.0 - stands), single[_SAMPLES + j] > 0.0)
+        if lesson and not is_beyond and not _is_suspect(rests[j]):
             taught_by = _LESSONS * (spread - left_open) + _STANDING_LESSONS * (1.0 - quiet) * rounding
             _learn(m, gain, lacking, left_open + taught_by + holds * holds)
     return alarm
@@ -292,6 +332,9 @@ def _observe_loop(m: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1
 
 _inner: Any = numba.njit(nogil=True, error_model="numpy")
 _regressors, _begin_anew, _filter, _lacks, _learn = map(_inner, (_regressors, _begin_anew, _filter, _lacks, _learn))
-_held_by_friction, _second_moment, _of_rounding = map(_inner, (_held_by_friction, _second_moment, _of_rounding))
+_withstood, _forget, _look_at_rest = standstill.withstood, standstill.forget, standstill.look
+_variance, _blocked, _is_suspect = standstill.variance, standstill.blocked, standstill.is_suspect
+_static_friction, _is_blocked = map(_inner, (_static_friction, _is_blocked))
+_second_moment, _of_rounding = map(_inner, (_second_moment, _of_rounding))
 _alarms, _teach_noise = map(_inner, (_alarms, _teach_noise))
-_observe: Callable[..., int] = numba.njit(cache=True, nogil=True, error_model="numpy")(_observe_loop)
+_observe: Callable[..., int] = compiled(_observe_loop)

@@ -2,10 +2,13 @@
 
 Prior knowledge is the ensemble's mean and inflated covariance. The ensemble is drawn around the description, and
 updated after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
-Nor is a joint that stands still at its rest angle: on the way home it may reach the end stop on which it rests before
-the others do.
+A joint that stands at its rest angle is only judged by torques that would move it to where it has been: on the way home
+it may reach the stop on which it rests before the others. One that has been on both sides of that angle has no stop
+there.
 """
 
+import math
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -32,6 +35,8 @@ alarm.
 """
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
+WINDOW_S = 0.3
+"""Time over which a message about a stationary joint gives the range of its torque [s]."""
 
 
 class ChainWatch:
@@ -54,7 +59,8 @@ class ChainWatch:
         self._observer = ChainObserver(arms.base, mean, covariance, largest, interval)
         self._names = [joint.joint.title for joint in config.joints]
         self._rest = np.array(config.arm.rest_pose)
-        self._has_left = np.zeros(n, dtype=np.bool_)
+        self._lowest, self._highest = np.zeros(n), np.zeros(n)
+        self._commanded: deque[tuple[float, Array]] = deque(maxlen=math.ceil(WINDOW_S / interval))
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
 
@@ -67,23 +73,33 @@ class ChainWatch:
         if goal is None:
             goal, seconds = state.goal_current, float("inf")
         position = np.array(state.position)
-        away, velocity = np.abs(position - self._rest), np.array(state.velocity)
-        self._has_left |= away > LYING_RAD
-        # A joint that has come home may stand on the stop on which it rests. One that never left is expected to move.
-        is_home = self._has_left & (away <= LYING_RAD) & (np.abs(velocity) <= _STILL_RAD_S)
-        is_free = (away.max() > LYING_RAD) & ~is_home
+        away, velocity = position - self._rest, np.array(state.velocity)
+        self._lowest, self._highest = np.minimum(self._lowest, away), np.maximum(self._highest, away)
+        is_free = np.abs(away).max() > LYING_RAD
         torque = self._constants * goal
-        joint = self._observer.observe(position, velocity, torque, seconds, is_free)
+        self._commanded.append((self._seen_at, torque))
+        joint = self._observer.observe(position, velocity, torque, seconds, is_free, self._support(away, velocity))
         if joint >= 0:
             self._raise(joint, state)
+
+    def _support(self, away: Array, velocity: Array) -> Array:
+        """The direction in which a stop may prevent motion of each joint (joints,): 1, -1, or 0.
+
+        away: angles relative to the rest pose [rad].
+        """
+        is_home = (np.abs(away) <= LYING_RAD) & (np.abs(velocity) <= _STILL_RAD_S)
+        was_below, was_above = self._lowest < -LYING_RAD, self._highest > LYING_RAD
+        return np.asarray(is_home * (was_below * 1.0 - was_above * 1.0))
 
     def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]
         name = self._names[joint]
         if abs(state.velocity[joint]) < _STILL_RAD_S:
+            recent = [torque[joint] for at, torque in self._commanded if self._seen_at - at <= WINDOW_S]
             said = (
-                f"{name} stands still although a torque of {abs(lacking):.3f} N m drives it, which would move any arm "
-                "consistent with the prior and the data so far. Something blocks it, or its encoder is frozen."
+                f"{name} stands still, with {min(recent):+.3f} to {max(recent):+.3f} N m commanded in the last "
+                f"{WINDOW_S:g} s: any arm consistent with the prior and the data so far would move. Something blocks "
+                "it, or its encoder is frozen."
             )
         else:
             said = (

@@ -6,7 +6,7 @@ program left saved settings behind, these count as the servos' own and are resto
 """
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import put_back, read_settings
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
-from hil.drivers.torque_off import signals_held_back
+from hil.drivers.torque_off import and_list, by_reason, signals_held_back
 from hil.errors import RunFolderError, StopRequested
 from hil.setup import settings_file
 from hil.setup.current_limit import current_limit_ticks
@@ -121,17 +121,25 @@ class ServoSession:
         clock.wait_until(clock.now() + COUNT_DOWN_S)
 
     def end(self) -> list[str]:
-        """Restore every servo's settings; return a message for each that cannot be. Never raises DriverError."""
+        """Restore every servo's settings; return a message for each reason why some cannot be.
+
+        Never raises DriverError.
+        """
         failed = self._put_back(self._kept)
         if failed:
             clock = self.bus.port.clock
             clock.wait_until(clock.now() + REBOOT_S)
             failed = self._put_back(failed)
         return [
-            f"{joint.title}: its settings could not be restored ({error}) The next hil identify, record, check "
-            f"or setup on this port restores them from {self._kept[joint].path}."
-            for joint, error in failed.items()
+            f"The settings of {and_list(map(str, joints))} could not be restored ({why}) The next hil identify, "
+            f"record, check or setup on this port restores them from {self._where(joints)}."
+            for why, joints in by_reason((joint, str(error)) for joint, error in failed.items()).items()
         ]
+
+    def _where(self, joints: Sequence[Joint]) -> str:
+        """The file that holds the settings of a servo; for several servos, their folder."""
+        paths = [self._kept[joint].path for joint in joints]
+        return str(paths[0]) if len(paths) == 1 else f"{len(paths)} files in {paths[0].parent}"
 
     def _put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
         """Restore the settings of these joints; return the error of each joint that failed."""

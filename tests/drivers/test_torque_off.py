@@ -12,7 +12,14 @@ from hil.drivers.errors import DriverError, NoReply, PortLost
 from hil.drivers.joint import Joint
 from hil.drivers.packet import BROADCAST_ID, Instruction, encode
 from hil.drivers.servo_model import Mode, servo_model
-from hil.drivers.torque_off import TorqueOff, cut_torque, disarm_watchdogs, signals_held_back
+from hil.drivers.torque_off import (
+    TorqueOff,
+    and_list,
+    by_reason,
+    cut_torque,
+    disarm_watchdogs,
+    signals_held_back,
+)
 from hil.fakes.bus.clock import VirtualClock
 
 WATCHDOG_S = 0.1
@@ -120,6 +127,20 @@ def test_what_is_said_of_one_servo_of_two_and_of_those_without_a_watchdog() -> N
     )
     unwatched = str(TorqueOff((first,), ((second, "It is silent."),), frozenset((second,))))
     assert "NOTHING STOPS JOINT 'B' (ID 2, XM430-W350), which has no Bus Watchdog" in unwatched
+
+
+def test_a_reason_that_concerns_several_servos_is_given_once() -> None:
+    first, second = JOINTS
+    reasons = [(joint, f"{joint.title} does not answer. Check {joint}.") for joint in JOINTS]
+    said = str(TorqueOff((), tuple(reasons)))
+    both = f"{str(first).upper()} and {str(second).upper()}: Each does not answer. Check it."
+    assert both in said and said.count("does not answer") == 1
+    assert by_reason(reasons[1:]) == {"It does not answer. Check it.": [second]}
+    assert by_reason([(first, "It is hot."), (second, "It is silent.")]) == {
+        "It is hot.": [first],
+        "It is silent.": [second],
+    }
+    assert and_list("abc") == "a, b and c" and and_list("a") == "a"
 
 
 def test_the_result_cannot_be_changed() -> None:

@@ -7,6 +7,11 @@ Kalman filter for slowly drifting constants), so the tolerance narrows over time
 `hil.estimator.models.momentum_observer`, which planar arms use, an alarm requires a residual that, after subtraction of
 the friction that can hold a joint at rest, exceeds `TIMES` standard deviations and a fraction of the largest planned
 torque for `HOLD_S`; large residuals raise it sooner.
+
+The noise estimate describes motion, so it only learns from motion: what a joint at rest lacks is held by friction, or
+by something that blocks it, and would otherwise widen the tolerance until nothing exceeded it. A joint at rest is also
+judged by the range of torques on it (`hil.estimator.models.standstill`). A residual that may become an alarm enters the
+noise estimate only once it has ended without one.
 """
 
 import math
@@ -20,6 +25,7 @@ from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import places
 from hil.estimator.chain.model.kernels import accelerate, move, place, regress, room
 from hil.estimator.compiled import compiled
+from hil.estimator.models import standstill
 
 FILTER_S = 0.02
 HOLD_S = 0.02
@@ -31,6 +37,9 @@ FIRST_NOISE_SHARE = 0.1
 STANDING = 0.05  # rad/s: below this, dry friction may hold a joint
 STATIC = 1.5  # ratio of static to Coulomb friction
 MOSTLY = 0.5  # filtered indicator of standstill, above which a joint counts as standing
+STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
+VISIBLE_RAD_S = 0.027  # velocity that shows in the register
+CERTAIN = 2.0  # standard deviations within which a torque that friction has held is known
 VELOCITY_STD = 0.0135  # rad/s: resolution of the register and some noise
 NOISE_S = 1.0
 CLIPPED = 9.0
@@ -39,9 +48,10 @@ MOST_WEIGHT = 4.0
 WARM_S = 3 * FILTER_S
 LONGEST_GAP = 3.0
 # Rows of the observer's memory. Per joint: filtered angle, velocity and torque, acceleration, noise variance, filtered
-# indicator of standstill (0 to 1), time and number of samples above the limit, residual torque. The last row applies to
-# the whole arm: time since the last update of the parameters, time since the start.
-ANGLE, VELOCITY, TORQUE, SLOPE, NOISE, STANDS, HELD, SAMPLES, LACKING, TIMES_OF_ALL = range(10)
+# indicator of standstill (0 to 1), time and number of samples above the limit, residual torque, contribution of a
+# possible alarm to the noise estimate and its duration. The last row applies to the whole arm: time since the last
+# update of the parameters, time since the start.
+ANGLE, VELOCITY, TORQUE, SLOPE, NOISE, STANDS, HELD, SAMPLES, LACKING, TAUGHT, TEACHES, TIMES_OF_ALL = range(12)
 
 
 class ChainObserver:
@@ -64,7 +74,8 @@ class ChainObserver:
                 f"{(count,)}, {(count, count)} and {(n,)}"
             )
         self._theta, self._covariance = np.array(mean), np.array(covariance)
-        self._memory = np.zeros((10, max(n, 2)))
+        self._memory = np.zeros((TIMES_OF_ALL + 1, max(n, 2)))
+        self._rests = standstill.memory(n, count)
         self._first = np.array((FIRST_NOISE_SHARE * largest) ** 2)
         self._memory[NOISE, :n] = self._first
         drift = LEAST_DRIFT**2 * np.diag(covariance)
@@ -80,7 +91,9 @@ class ChainObserver:
         self.observe(nothing, nothing, nothing, interval, False)
         self.observe(nothing, nothing, nothing, math.inf, False)
 
-    def observe(self, position: Any, velocity: Any, torque: Any, seconds: float, is_free: Any) -> int:
+    def observe(
+        self, position: Any, velocity: Any, torque: Any, seconds: float, is_free: Any, support: Any = 0.0
+    ) -> int:
         """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1 if there is none.
 
         Args:
@@ -88,12 +101,14 @@ class ChainObserver:
             velocity: velocities [rad/s].
             torque: torques commanded since the previous sample [N m].
             seconds: time since the previous sample [s].
-            is_free: whether each joint is held by its motor alone; one value for all joints or one per joint.
+            is_free: whether the motion of each joint can be judged; one value for all or one per joint.
+            support: 1 or -1 for a joint that may lie on a stop, which prevents motion in this direction; otherwise 0.
         """
         return _observe(
-            *(self._memory, self._theta, self._covariance, self._constants, self._chain, self._work),
+            *(self._memory, self._rests, self._theta, self._covariance, self._constants, self._chain, self._work),
             *(np.asarray(each, dtype=np.float64) for each in (position, velocity, torque)),
             *(seconds, np.broadcast_to(is_free, (self._joints,)).astype(np.bool_)),
+            np.broadcast_to(support, (self._joints,)).astype(np.float64),
         )
 
     @property
@@ -109,6 +124,7 @@ class ChainObserver:
 
 def _observe_loop(  # noqa: PLR0912, PLR0915
     memory: Any,
+    rests: Any,
     theta: Any,
     covariance: Any,
     constants: Any,
@@ -119,6 +135,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
     torque: Any,
     dt: float,
     is_free: Any,
+    support: Any,
 ) -> int:
     floor, least_noise, drift, interval, expected = constants
     arrays, column, base = chain
@@ -128,6 +145,8 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         for j in range(n):
             memory[ANGLE, j], memory[VELOCITY, j], memory[TORQUE, j] = q[j], v[j], torque[j]
             memory[SLOPE, j] = memory[HELD, j] = memory[SAMPLES, j] = 0.0
+            memory[TAUGHT, j] = memory[TEACHES, j] = 0.0
+            _forget(rests[j])
             memory[STANDS, j] = 1.0
         memory[TIMES_OF_ALL, 0] = memory[TIMES_OF_ALL, 1] = 0.0
         return -1
@@ -146,6 +165,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
     for j in range(n):
         if not is_free[j]:
             memory[HELD, j] = memory[SAMPLES, j] = memory[LACKING, j] = 0.0
+            _forget(rests[j])
             supported += 1
     if supported == n:
         return -1
@@ -185,16 +205,21 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         memory[LACKING, j] = lacking
         friction = base + n + j
         dry = max(theta[friction] + math.sqrt(max(covariance[friction, friction], 0.0)), expected[j])
-        holds = STATIC * dry * min(max(memory[STANDS, j], 0.0), 1.0)
+        static = max(STATIC * dry, _withstood(rests[j]))
+        stands = min(max(memory[STANDS, j], 0.0), 1.0)
+        holds = static * stands
         # Error of the acceleration due to the velocity's rounding, times the joint's own inertia.
         inertia = 0.0
         if memory[SLOPE, j] != 0.0:
             inertia = abs(_own_inertia(rooms, column, theta, base, j))
         rounding = (slope * VELOCITY_STD * inertia) ** 2
-        spread = left_open + rounding + memory[NOISE, j]
+        quiet = 1.0 - (1.0 - STANDING_NOISE) * stands
+        spread = left_open + rounding + quiet * quiet * memory[NOISE, j]
         beyond = max(abs(lacking) - holds, 0.0)
+        if lacking * support[j] > 0.0:
+            beyond = 0.0
         limit = TIMES * math.sqrt(spread)
-        share = beyond / max(limit, floor[j])
+        share = beyond / max(limit, quiet * floor[j])
         if share <= 1.0:
             memory[HELD, j] = memory[SAMPLES, j] = 0.0
         else:
@@ -202,17 +227,39 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
             memory[SAMPLES, j] += 1.0
             if memory[HELD, j] >= HOLD_S and memory[SAMPLES, j] >= 2.0:
                 alarm = j
+        if support[j] != 0.0:
+            _forget(rests[j])
+            continue
+        distance = _look_at_rest(rests[j], q[j], stands, memory[TORQUE, j], row, theta)
+        if distance != 0.0:
+            variance = _variance(rests[j], distance, row, covariance) + 2.0 * quiet * quiet * memory[NOISE, j]
+            tolerance = max(TIMES * math.sqrt(variance), quiet * floor[j])
+            momentum = VISIBLE_RAD_S * abs(_own_inertia(rooms, column, theta, base, j))
+            held = abs(lacking) - CERTAIN * math.sqrt(left_open)
+            if _blocked(rests[j], distance, held, static, tolerance, momentum, FILTER_S, dt):
+                alarm = j
         taught = min(beyond * beyond, CLIPPED * spread) - left_open - rounding
-        memory[NOISE, j] += min(dt / NOISE_S, 1.0) * (max(taught, least_noise[j]) - memory[NOISE, j])
+        _teach_noise(memory, j, max(taught, least_noise[j]), dt * (1.0 - stands))
         # Static friction takes up any torque within its bounds, for as long as a joint stands: nothing can be learned
         # from it.
-        if lesson and beyond <= limit and memory[STANDS, j] < MOSTLY:
+        if lesson and beyond <= limit and memory[STANDS, j] < MOSTLY and not _is_suspect(rests[j]):
             total = spread + holds * holds
             for i in range(count):
                 theta[i] += gain[i] * lacking / total
                 for k in range(count):
                     covariance[i, k] -= gain[i] * gain[k] / total
     return alarm
+
+
+def _teach_noise_of(memory: Any, j: int, taught: float, dt: float) -> None:
+    """Update the noise variance; the contribution of a possible alarm waits until the alarm has ended."""
+    memory[TAUGHT, j] += taught * dt
+    memory[TEACHES, j] += dt
+    if memory[SAMPLES, j] > 0.0 or memory[TEACHES, j] <= 0.0:
+        return
+    mean = memory[TAUGHT, j] / memory[TEACHES, j]
+    memory[NOISE, j] += min(memory[TEACHES, j] / NOISE_S, 1.0) * (mean - memory[NOISE, j])
+    memory[TAUGHT, j] = memory[TEACHES, j] = 0.0
 
 
 def _own_inertia_of(rooms: Any, column: Any, theta: Any, base: int, j: int) -> float:
@@ -252,4 +299,7 @@ def _of_column(theta: Any, at: int, base: int) -> float:
 
 _of: Any = compiled(_of_column)
 _own_inertia: Any = compiled(_own_inertia_of)
+_teach_noise: Any = compiled(_teach_noise_of)
+_withstood, _forget, _look_at_rest = standstill.withstood, standstill.forget, standstill.look
+_variance, _blocked, _is_suspect = standstill.variance, standstill.blocked, standstill.is_suspect
 _observe: Callable[..., int] = compiled(_observe_loop)

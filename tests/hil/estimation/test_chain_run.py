@@ -328,7 +328,7 @@ def test_a_value_less_certain_than_the_description_is_trusted_with_care(run: Run
     std = 0.01 * known.prior.std
     std[2] = 1.1 * known.prior.std[2]
     estimate: Any = SimpleNamespace(
-        **{"std": std, "residual_steps": 0.29 * np.ones(4), "systematic": 0.8},
+        **{"std": std, "over_noise": np.ones(4), "noise_steps": 0.29 * np.ones(4), "systematic": 0.8},
         **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base)},
     )
     verdict = _verdict(config, estimate, known, np.full(4, 1e-3), [])

@@ -26,12 +26,14 @@ def look(config: Config, watch: ChainWatch, position: tuple[float, ...], goal: t
     watch.look(state)
 
 
-def stands(config: Config, knee: float, current: float, *, was_away: bool = True) -> None:
+def stands(config: Config, knee: float, current: float, *, was_away: bool = True, was_below: bool = False) -> None:
     """The knee stands still under this current for half a second, while the hip is away from the rest pose."""
     watch = ChainWatch(config, [1.0, 1.0, 1.0])
     rest = np.array(config.arm.rest_pose)
     if was_away:
         look(config, watch, (rest[0] + 0.3, rest[1], rest[2] + 0.5), (0.0, 0.0, 0.0), -100)
+    if was_below:
+        look(config, watch, (rest[0] + 0.3, rest[1], rest[2] - 0.2), (0.0, 0.0, 0.0), -50)
     for number in range(200):
         look(config, watch, (rest[0] + 0.3, rest[1], rest[2] + knee), (0.0, 0.0, current), number)
 
@@ -41,14 +43,24 @@ def test_a_joint_on_the_stop_on_which_it_rests_is_not_blocked(config: Config) ->
     stands(config, 0.02, -0.9)
 
 
+def test_but_it_is_if_a_torque_away_from_that_stop_does_not_move_it(config: Config) -> None:
+    with pytest.raises(SafetyStop, match="stands still, with "):
+        stands(config, 0.02, 2.0)
+
+
+def test_a_joint_that_has_been_on_both_sides_of_its_rest_angle_has_no_stop_there(config: Config) -> None:
+    with pytest.raises(SafetyStop, match="stands still, with "):
+        stands(config, 0.02, -0.9, was_below=True)
+
+
 def test_one_that_never_left_it_is(config: Config) -> None:
     """It is blocked from the start, or its encoder is frozen."""
-    with pytest.raises(SafetyStop, match="stands still although a torque"):
+    with pytest.raises(SafetyStop, match="stands still, with "):
         stands(config, 0.02, -2.0, was_away=False)
 
 
 def test_the_same_joint_elsewhere_is(config: Config) -> None:
-    with pytest.raises(SafetyStop, match="stands still although a torque"):
+    with pytest.raises(SafetyStop, match="stands still, with "):
         stands(config, 0.5, -0.9)
 
 

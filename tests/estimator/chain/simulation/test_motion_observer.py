@@ -1,6 +1,7 @@
 """What the observer of a spatial arm learns, and must not learn, from a joint at standstill."""
 
 import numpy as np
+import pytest
 
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.geometry import Chain
@@ -54,6 +55,10 @@ def test_a_joint_that_has_moved_one_way_only_is_not_believed_to_be_without_frict
         torque = 0.008 * np.cos(4.0 * k * INTERVAL) + 0.03 * velocity
         assert looks.observe([angle], [velocity], [torque], INTERVAL, True) == -1
     assert looks.parameters[dry] < 0.5 * DRY
+    for _ in range(60):  # it comes to rest no faster than its inertia and friction allow
+        velocity *= 0.9
+        angle += velocity * INTERVAL
+        assert looks.observe([angle], [velocity], [0.0], INTERVAL, True) == -1
     for _ in range(400):
         assert looks.observe([angle], [0.0], [1.3 * DRY], INTERVAL, True) == -1
 
@@ -62,3 +67,42 @@ def test_a_blocked_joint_is_still_noticed() -> None:
     looks, _ = observer(0.1)
     alarms = [looks.observe([0.5], [0.0], [0.6], INTERVAL, True) for _ in range(400)]
     assert 0 in alarms
+
+
+def swings(looks: ChainObserver, seconds: float, angle: float = 0.0) -> float:
+    """Move the joint of `observer(DRY)` as its parameters say; return its angle [rad]."""
+    for k in range(round(seconds / INTERVAL)):
+        velocity, acceleration = np.sin(4.0 * k * INTERVAL), 4.0 * np.cos(4.0 * k * INTERVAL)
+        angle += velocity * INTERVAL
+        torque = 0.01 * acceleration + 0.03 * velocity + DRY * np.tanh(velocity / 0.05)
+        assert looks.observe([angle], [velocity], [torque], INTERVAL, True) == -1
+    return angle
+
+
+def alarm_after(looks: ChainObserver, angle: float, slope: float, seconds: float) -> float:
+    """Time until the alarm while a joint stands still and its torque increases from 0 by `slope` [N m/s]; or inf."""
+    for k in range(round(seconds / INTERVAL)):
+        if looks.observe([angle], [0.0], [slope * k * INTERVAL], INTERVAL, True) == 0:
+            return k * INTERVAL
+    return np.inf
+
+
+@pytest.mark.parametrize("slope", [0.05, 0.1, 0.3, 1.0])
+def test_a_joint_that_jams_is_noticed_as_soon_as_friction_cannot_hold_it_however_slowly_the_torque_grows(
+    slope: float,
+) -> None:
+    """A residual that grows slowly must not pass for noise."""
+    looks, _ = observer(DRY)
+    angle = swings(looks, 6.4)
+    assert slope * alarm_after(looks, angle, slope, 1.0 / slope) < 2.4 * DRY
+
+
+def test_friction_that_a_joint_has_overcome_before_is_no_alarm_the_next_time() -> None:
+    """The joint breaks away at 1.9 times its Coulomb friction, and then stands under nearly as much."""
+    looks, _ = observer(DRY)
+    angle = swings(looks, 6.4)
+    for _ in range(3):
+        assert alarm_after(looks, angle, 2.0, 0.19) == np.inf
+        angle = swings(looks, 1.6, angle)
+    for slope in (0.5, 0.1):
+        assert alarm_after(looks, angle, slope, 0.36 / slope) == np.inf

@@ -1,0 +1,132 @@
+"""Detects a joint that is blocked, by the range of torque that it withstands without moving.
+
+Dry friction holds a joint at rest while the torque on it stays within a band as wide as twice the static friction.
+Where the band lies depends on gravity and offsets, which may be poorly known; its width does not. Therefore the torque
+is compared with the largest and the smallest one since the joint came to rest: at an unchanged angle, gravity and
+offset cancel in their difference, and so do their errors. Only what other joints' motion changes has to be modelled.
+
+A torque outside the band accelerates a free joint. The joint is blocked once it would have gained a momentum that shows
+in the velocity register, wherever the band lies: half of the excess may be on its other side. A joint that does move
+again was held by friction: what it withstood until then is never an alarm again.
+
+These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from hil.estimator.arrays import Array
+
+WITHIN_RAD = 0.004
+"""Largest change of the angle of a joint that is at rest [rad]: noise of the encoder and the play of a gear."""
+
+AT_REST = 0.95
+"""Filtered indicator of standstill above which a joint counts as at rest: deceleration has left the filters."""
+
+HOLD_S = 0.03
+"""Shortest time for which the torque must lie outside the band [s]: a gear crosses its play."""
+
+_SINGLES = 9
+# Scalars of a joint, before its two equations: angle at which it came to rest, whether an equation is stored, half of
+# the range that it withstood before it moved again, torque of the equations with the least and largest residual,
+# largest range so far beyond the velocity's rounding, excess momentum to either side, and its duration.
+_ANGLE, _SEEN, _WITHSTOOD, _LEAST, _MOST, _RANGE, _UP, _DOWN, _LASTS = range(_SINGLES)
+
+
+def memory(joints: int, count: int) -> Array:
+    """Memory of `joints` joints with `count` parameters: nothing is known yet."""
+    return np.zeros((joints, _SINGLES + 2 * count))
+
+
+def withstood(rest: Any) -> float:
+    """Return the torque that friction has held, to either side, before the joint moved again [N m]."""
+    return float(rest[_WITHSTOOD])
+
+
+def is_suspect(rest: Any) -> bool:
+    """Return whether the torque is, or was just before, outside the band that friction can hold."""
+    return bool(rest[_UP] > 0.0 or rest[_DOWN] > 0.0)
+
+
+def forget(rest: Any) -> None:
+    """Discard the present standstill: what happened since the previous sample is unknown."""
+    rest[_SEEN] = rest[_RANGE] = rest[_UP] = rest[_DOWN] = rest[_LASTS] = 0.0
+
+
+def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta: Any) -> float:
+    """Process a sample; return its distance from the farthest residual since the joint came to rest [N m].
+
+    It is positive if the smallest residual is the farthest, negative if the largest is, and 0 while the joint moves.
+
+    rest: one joint's row of `memory`. stands: filtered indicator of standstill, 0 to 1. torque, row: equation of the
+    joint at this sample [N m]. theta: parameters.
+    """
+    count = row.size
+    if rest[_SEEN] > 0.0 and (stands < AT_REST or abs(angle - rest[_ANGLE]) > WITHIN_RAD):
+        rest[_WITHSTOOD] = max(rest[_WITHSTOOD], 0.5 * rest[_RANGE])
+        _forget(rest)
+    if stands < AT_REST:
+        return 0.0
+    residual, least, most = torque, rest[_LEAST], rest[_MOST]
+    for i in range(count):
+        residual -= row[i] * theta[i]
+        least -= rest[_SINGLES + i] * theta[i]
+        most -= rest[_SINGLES + count + i] * theta[i]
+    is_first = rest[_SEEN] <= 0.0
+    if is_first:
+        rest[_ANGLE], rest[_SEEN] = angle, 1.0
+        least = most = residual
+    if is_first or residual < least:
+        rest[_LEAST] = torque
+        rest[_SINGLES : _SINGLES + count] = row
+    if is_first or residual > most:
+        rest[_MOST] = torque
+        rest[_SINGLES + count :] = row
+    return float(residual - least if residual - least >= most - residual else residual - most)
+
+
+def variance(rest: Any, distance: float, row: Any, covariance: Any) -> float:
+    """Return the variance of the distance that `look` returned, due to the parameters' covariance [N^2 m^2]."""
+    count = row.size
+    other = rest[_SINGLES : _SINGLES + count] if distance > 0.0 else rest[_SINGLES + count :]
+    total = 0.0
+    for i in range(count):
+        own = row[i] - other[i]
+        if own != 0.0:
+            for n in range(count):
+                total += own * covariance[i, n] * (row[n] - other[n])
+    return max(total, 0.0)
+
+
+def blocked(
+    rest: Any,
+    distance: float,
+    held: float,
+    friction: float,
+    tolerance: float,
+    momentum: float,
+    filter_s: float,
+    dt: float,
+) -> bool:
+    """Return whether something other than friction holds the joint.
+
+    distance: result of `look` [N m]. held: torque that certainly acts on the joint now, to one side. friction: what dry
+    friction may hold to one side [N m]. tolerance: of the distance [N m]. momentum: that of the joint at the smallest
+    visible velocity [N m s]. filter_s: time constant of the equation's filter [s]. dt: time since the previous sample
+    [s].
+    """
+    width = abs(distance)
+    rest[_RANGE] = max(rest[_RANGE], max(width, 2.0 * held) - momentum / filter_s)
+    beyond = width - 2.0 * friction - tolerance
+    up, down = (beyond, -width) if distance > 0.0 else (-width, beyond)
+    rest[_UP] = max(rest[_UP] + up * dt, 0.0)
+    rest[_DOWN] = max(rest[_DOWN] + down * dt, 0.0)
+    rest[_LASTS] = rest[_LASTS] + dt if beyond > 0.0 else 0.0
+    return bool(max(rest[_UP], rest[_DOWN]) > 2.0 * momentum and rest[_LASTS] >= HOLD_S)
+
+
+_inner: Any = numba.njit(nogil=True, error_model="numpy")
+forget = _forget = _inner(forget)
+withstood, is_suspect, look, variance, blocked = map(_inner, (withstood, is_suspect, look, variance, blocked))

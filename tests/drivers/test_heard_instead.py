@@ -1,0 +1,57 @@
+"""What is said of bytes that arrived instead of complete replies: damaged, late, or intact under another ID."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from hil.drivers.bus import ServoBus
+from tests.drivers.test_exchange import Wire, answer, exchange, fast_answer, state
+
+FINE = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+
+
+def said(*received: bytes, fast: bool = False, waiting: bytes = b"", later_s: float = 0.0) -> str:
+    """What `heard_instead` says after cycles in which these bytes were received."""
+    wire = Wire(received)
+    cycles = exchange(wire, fast=fast)
+    for _ in received:
+        cycles.cycle([0, 0])
+        wire.waiting = waiting
+    if waiting:
+        cycles.cycle([0, 0])
+    wire.time += later_s
+    bus: Any = SimpleNamespace(prepared=cycles, port=wire)
+    return str(cast(Any, ServoBus.heard_instead).fget(bus))
+
+
+def both(first: int, second: int, *, fast: bool) -> bytes:
+    if fast:
+        return fast_answer((first, 0, state(1, 2, 3)), (second, 0, state(4, 5, 6)))
+    return answer(first, 1, 2, 3) + answer(second, 4, 5, 6)
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_intact_replies_with_an_id_that_was_not_asked_are_not_called_damaged(fast: bool) -> None:
+    assert said(both(7, 2, fast=fast), fast=fast).startswith("Intact replies came with ID 7, which was not asked")
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_nor_are_two_replies_with_the_same_id(fast: bool) -> None:
+    assert said(both(2, 2, fast=fast), fast=fast).startswith("Intact replies came with the IDs 2, 2, although")
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_damaged_ones_are(fast: bool) -> None:
+    fine = both(1, 2, fast=fast)
+    assert said(fine[:-3] + b"abc", fast=fast) == "Bytes arrived, but damaged or incomplete."
+    assert said(fine[:9] + b"a" + fine[10:], fast=fast) == "Bytes arrived, but damaged or incomplete."
+
+
+def test_nothing_is_said_of_silence_or_of_what_was_long_ago() -> None:
+    assert said(b"") == said(FINE) == said(answer(1, 1, 2, 3)) == ""
+    assert said(FINE[:-3] + b"abc", later_s=1.0) == said(both(7, 2, fast=False), later_s=1.0) == ""
+
+
+def test_late_replies_are_called_late() -> None:
+    assert said(b"", waiting=FINE).startswith("Replies did arrive, but too late or twice")
