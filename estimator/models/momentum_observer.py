@@ -235,10 +235,12 @@ def _is_blocked(
     """
     if distance == 0.0:
         return False
-    variance = _variance(rest, distance, row, m[_COVARIANCE:_PENDING]) + 2.0 * noise
+    friction = _static_friction(m, rest, j)
+    variance = 2.0 * noise
+    if abs(distance) > 2.0 * friction:  # otherwise it does not matter, and would take time
+        variance += _variance(rest, distance, row, m[_COVARIANCE:_PENDING])
     tolerance = max(TIMES * math.sqrt(variance), floor)
     momentum = _VISIBLE * math.sqrt(rounding) * FILTER_S
-    friction = _static_friction(m, rest, j)
     return bool(_blocked(rest, distance, held, friction, tolerance, momentum, FILTER_S, dt))
 
 

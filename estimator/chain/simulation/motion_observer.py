@@ -97,13 +97,14 @@ class ChainObserver:
         self._chain = base.chain.arrays, places(n, base.columns), base.count
         self._work = room(n), np.zeros((n, base.count + 1)), np.zeros(count), np.zeros(count), np.zeros((n, 10))
         self._joints = n
+        self._unsupported = np.zeros(n)
         nothing = np.zeros(n)
         self.observe(nothing, nothing, nothing, math.inf, False)  # these calls compile the loop; the last one resets it
         self.observe(nothing, nothing, nothing, interval, False)
         self.observe(nothing, nothing, nothing, math.inf, False)
 
     def observe(
-        self, position: Any, velocity: Any, torque: Any, seconds: float, is_free: Any, support: Any = 0.0
+        self, position: Any, velocity: Any, torque: Any, seconds: float, is_free: Any, support: Array | None = None
     ) -> int:
         """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1 if there is none.
 
@@ -113,13 +114,14 @@ class ChainObserver:
             torque: torques commanded since the previous sample [N m].
             seconds: time since the previous sample [s].
             is_free: whether the motion of each joint can be judged; one value for all or one per joint.
-            support: 1 or -1 for a joint that may lie on a stop, which prevents motion in this direction; otherwise 0.
+            support: 1 or -1 for each joint that may lie on a stop, which prevents motion in this direction, otherwise 0
+                (joints,); None if there is none.
         """
         return _observe(
             *(self._memory, self._rests, self._theta, self._covariance, self._constants, self._chain, self._work),
             *(np.asarray(each, dtype=np.float64) for each in (position, velocity, torque)),
             *(seconds, np.broadcast_to(is_free, (self._joints,)).astype(np.bool_)),
-            np.broadcast_to(support, (self._joints,)).astype(np.float64),
+            self._unsupported if support is None else support,
         )
 
     @property
@@ -245,7 +247,9 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
             continue
         distance = _look_at_rest(rests[j], q[j], stands, memory[TORQUE, j], row, theta)
         if distance != 0.0:
-            variance = _variance(rests[j], distance, row, covariance) + 2.0 * quiet * quiet * memory[NOISE, j]
+            variance = 2.0 * quiet * quiet * memory[NOISE, j]
+            if abs(distance) > 2.0 * static:  # otherwise it does not matter, and would take time
+                variance += _variance(rests[j], distance, row, covariance)
             tolerance = max(TIMES * math.sqrt(variance), quiet * floor)
             momentum = VISIBLE_RAD_S * abs(_own_inertia(rooms, column, theta, base, j))
             held = abs(lacking) - CERTAIN * math.sqrt(left_open)
