@@ -165,8 +165,12 @@ def path_of(bench: Bench, setup: Setup, seed: int) -> Motion:
     return design_path(setup.base, setup.prior, RATE, PERIOD, HIGHEST, centre, swing, speed, seed)
 
 
-def record(bench: Bench, setup: Setup, path: Motion) -> SettledPeriod:
-    """Simulate the true arm on `path` and return its second period."""
+def record(bench: Bench, setup: Setup, path: Motion, noise: float | np.ndarray = 0.0) -> SettledPeriod:
+    """Simulate the true arm on `path` and return its second period.
+
+    noise: white noise of the encoders before rounding (joints,) [encoder steps].
+    """
+    shaken = np.random.default_rng(7)
     chain = setup.base.chain
     constant, limit, coulomb = (np.array(each) for each in (bench.torque_constant, bench.limit, bench.coulomb))
     stiffness = np.diag(mass_matrix(chain, setup.described, np.array(bench.centre, dtype=float)))
@@ -183,7 +187,8 @@ def record(bench: Bench, setup: Setup, path: Motion) -> SettledPeriod:
     for k in range(2 * samples):
         wanted = excitation[:, k % samples] + stiffness * (pose - measured) - damping * speed
         current = np.clip(np.round(wanted / constant / CURRENT_TICK) * CURRENT_TICK, -limit, limit)
-        measured = np.round(np.array(plant.position) / TICK) * TICK
+        ticks = np.array(plant.position) / TICK + noise * shaken.standard_normal(joints)
+        measured = np.round(ticks) * TICK
         speed = np.round(np.array(plant.velocity) / 0.024) * 0.024
         position[:, k % samples], torque[:, k % samples] = measured, current * constant
         plant.advance((k + 1) / RATE, current)
@@ -246,7 +251,7 @@ def measure(joints: int, seed: int) -> dict[str, Any]:
     bench, setup = BENCHES[joints], set_up(BENCHES[joints], seed)
     played, other = path_of(bench, setup, 100 + seed), path_of(bench, setup, 200 + seed)
     period, held_out = record(bench, setup, played), record(bench, setup, other)
-    model = ChainModel(setup.base)
+    model = ChainModel(setup.base, lags=True)
     started, worked = time.perf_counter(), time.process_time()
     estimate = identify_chain(period, model, setup.prior)
     seconds, processor = time.perf_counter() - started, time.process_time() - worked
@@ -268,7 +273,7 @@ def peer(joints: int) -> dict[str, Any]:
     """The figures of mujoco.sysid on the first seed's recording; raises MissingExtra without it."""
     bench, setup = BENCHES[joints], set_up(BENCHES[joints], 1)
     period = record(bench, setup, path_of(bench, setup, 101))
-    model = ChainModel(setup.base)
+    model = ChainModel(setup.base, lags=True)
     worked = time.process_time()
     identify_chain(period, model, setup.prior)
     ours = time.process_time() - worked

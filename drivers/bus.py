@@ -19,6 +19,7 @@ from hil.drivers.preparation.prepare import (
     overruled,
     prepare_servo,
     shared,
+    shuts_down,
 )
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
@@ -94,7 +95,7 @@ class ServoBus:
         """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
         self._exchange: Exchange | None = None
         self.exchanges_per_sample = 1
-        """Number of exchanges needed to keep them at most CHECK_S apart, if the bus is fast enough; set by `prepare`.
+        """Number of exchanges per sample, at most CHECK_S apart if the bus is fast enough; set by `prepare`.
         """
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
         self._without_watchdog: set[Joint] = set()
@@ -274,7 +275,9 @@ class ServoBus:
         return self._exchange
 
     def read_positions(self) -> tuple[float, ...]:
-        """Read each joint's angle [rad] outside the control cycle; a joint with several servos has the first's."""
+        """Read each joint's angle [rad] outside the control cycle; for a joint with several servos, that of the first
+        one.
+        """
         first = [self._of.index(index) for index in range(len(self.joints))]
         return tuple(
             self._measured[place].angle(self._servos[self._drives[place]].read("Present Position")) for place in first
@@ -331,6 +334,20 @@ class ServoBus:
             return "Bytes arrived, but damaged or incomplete."
         return ""
 
+    @property
+    def commanded_by_another(self) -> str:
+        """Which servo held a value that this program did not write, read back a moment ago; "" for none.
+
+        One such value does not prove another master: a servo that misses writes holds an older goal.
+        """
+        seen = self.prepared.sighted
+        if seen is None:
+            return ""
+        return (
+            f"Just before, {seen.register} of {self._drives[seen.place].title} was {seen.value} although "
+            f"{seen.written} had been written: another program commands it, or writes are lost."
+        )
+
     def read_status_next(self) -> None:
         """Read the servos' status in the next exchange, if they report one at all."""
         self.prepared.read_status_next()
@@ -355,9 +372,10 @@ class ServoBus:
         try:
             error = self._servos[drive].hardware_error()
             cause = describe_error(error)
+            cuts = not error or shuts_down(self._servos[drive], error)
         except DriverError as problem:
             return fault_text(drive, f"unknown; it could not be read ({problem})")
-        return fault_text(drive, cause) if alone or error else ""
+        return fault_text(drive, cause, shuts_down=cuts) if alone or error else ""
 
     @contextmanager
     def torque(self, watchdog: float) -> Iterator[None]:

@@ -128,6 +128,8 @@ class Exchange:
         self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
         self._lasted = math.inf
         self._read_back: ReadBack | None = None
+        self._shorter: dict[GroupRead, float] = {}
+        """By how much the wire time of each read-back is shorter than that of a usual cycle [s]."""
         self.read_back_at = math.inf
         """When `overruled` should be called again, before the next cycle [s on the port's clock]."""
 
@@ -158,14 +160,21 @@ class Exchange:
         """Prepare `overruled`. goal, mode: spans that end with the goal and with Operating Mode. modes: the operating
         modes that were set.
         """
-        self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
-        self._expected = self._expected.union(*(read.expected for read in self._read_back.reads))
+        back = self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
+        usual = self._bytes(self._reads[0])
+        self._shorter = {read: self._port.wire_time(usual - self._bytes(read)) for read in back.reads}
+        self._expected = self._expected.union(*(read.expected for read in back.reads))
         self.read_back_at = -math.inf
 
     @property
     def is_in_doubt(self) -> bool:
-        """Whether a read-back has just found something that was not written here."""
+        """Whether a read-back has just found a value that this program did not write."""
         return self._read_back is not None and self._now() < self._read_back.doubts_until
+
+    @property
+    def sighted(self) -> Overruled | None:
+        """A value that a servo held a moment ago although this program did not write it; None if there was none."""
+        return self._read_back.sighted if self._read_back is not None and self.is_in_doubt else None
 
     def overruled(self, due: float) -> Overruled | None:
         """Read goals or operating modes back if there is time before the next cycle, which is due at `due` [s].
@@ -181,7 +190,7 @@ class Exchange:
             return None
         now, read = self._now(), back.read
         asked = read.reply_size + (len(read.request) if self._echoes else 0)
-        takes = max(self._lasted - port.wire_time(self._bytes(self._reads[0]) - self._bytes(read)), back.longest)
+        takes = max(self._lasted - self._shorter[read], back.longest)
         if now + takes > due or self._late_possible:
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
             self.read_back_at = now + TRY_AGAIN_S
@@ -264,8 +273,8 @@ class Exchange:
         return read.unpack(received) or self._search(read, received, deadline)
 
     def _other_span(self, between: bool) -> int:
-        """Choose the span for a cycle that does not read the usual one: another after a loss, a slow one, or the
-        status.
+        """Choose the span for a cycle that does not read the usual one: another one after a lost reply, a slow one, or
+        the status.
         """
         if self._late_possible:
             self._late_possible = False
@@ -357,7 +366,9 @@ class _GoalWrite:
         self.size = packet.size + 2
 
     def pack(self, goal_ticks: Sequence[int]) -> bytes:
-        """Return the packet for these goals, one per servo of the exchange; raises struct.error for one too big."""
+        """Return the packet for these goals, one per servo of the exchange; raises struct.error for one that is too
+        large.
+        """
         fields, places = self._fields, self._places
         if places is not None:
             if len(goal_ticks) != self._count:

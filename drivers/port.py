@@ -26,7 +26,7 @@ _REASONS = {
     "Permission denied": "permission denied",
     "Is a directory": "it is a folder, not a serial port",
 }
-"""Reasons as text, by the operating system's error."""
+"""Explanations of the operating system's error messages."""
 
 _MOST_OVERHEARD = 4096
 """Largest number of pending bytes that are examined; the others are discarded."""
@@ -281,7 +281,7 @@ def _advice(error: BaseException, url: str) -> str:
     if "exclusively lock" in text:
         return "Another program has it open; close that program first."
     if "No such file" in text and "://" in url:
-        return "The file in this URL does not exist; a relative path starts at the file or folder that names it."
+        return "The file in this URL does not exist; a relative path is resolved from the file or folder that names it."
     if "No such file" in text:
         return "Is the adapter plugged in? `hil scan` lists the ports that exist."
     if "ioctl" in text:

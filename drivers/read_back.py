@@ -16,23 +16,25 @@ _READ_BACK_S = 0.015
 _GOALS_PER_MODE = 2
 """Largest number of goal read-backs between two mode read-backs.
 
-Number and times are random, because a regular pattern might never see a program that overwrites every other goal.
+This number and the times are random, because regular checks might never detect a program that overwrites every other
+goal.
 """
 
 _GOALS_PER_MODE_IN_DOUBT = 4
-"""The same after a sighting, while every cycle is followed by a read-back."""
+"""The same while a foreign value is suspected, and every cycle is followed by a read-back."""
 
 REMEMBERED = 4
 """Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
 
 _GOAL_SIGHTINGS, _MODE_SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
-"""Read-backs of a foreign goal, or mode, that prove another writer, and the time within which they must occur [s].
+"""Numbers of read-backs of a foreign goal, or mode, that prove another writer, and the time in which they must occur
+[s].
 
 Three for goals, so that the status detects lost writes first.
 """
 
 TRY_AGAIN_S = 0.005
-"""Delay before a read-back that did not fit in before a cycle is tried again [s]."""
+"""Delay after which a read-back for which a cycle left no time is tried again [s]."""
 
 _FADES = 0.98
 _IN_DOUBT_S = 0.3
@@ -73,6 +75,8 @@ class ReadBack:
         self._goals_sighted: list[deque[float]] = [deque() for _ in ids]
         self._modes_sighted: list[deque[float]] = [deque() for _ in ids]
         self.doubts_until = -math.inf
+        self.sighted: Overruled | None = None
+        """The latest value read back that this program did not write; it is recent until `doubts_until`."""
 
     @property
     def read(self) -> GroupRead:
@@ -91,11 +95,13 @@ class ReadBack:
             while times and now - times[0] > _SIGHTED_S:
                 times.popleft()
             times.append(now)
+            if of_modes:
+                self.sighted = Overruled(place, "Operating Mode", value, self._modes[place])
+            else:
+                self.sighted = Overruled(place, self._goals[place], value, sent[-1][place])
             most = _MODE_SIGHTINGS if of_modes else _GOAL_SIGHTINGS
             if len(times) >= most:
-                if of_modes:
-                    return Overruled(place, "Operating Mode", value, self._modes[place])
-                return Overruled(place, self._goals[place], value, sent[-1][place])
+                return self.sighted
             self.doubts_until = now + _IN_DOUBT_S
             is_nearly_sure |= len(times) == most - 1
         is_in_doubt = now < self.doubts_until

@@ -64,6 +64,6 @@ def servo_prior(model: ServoModel) -> ServoPrior:
 
 
 def stall_torque(model: ServoModel) -> float:
-    """Return the stall torque [N m] at the middle one of the published voltages."""
+    """Return the stall torque [N m] at the median of the published voltages."""
     torques = sorted(stall.torque for stall in model.stalls)
     return torques[len(torques) // 2]

@@ -35,7 +35,7 @@ _TRIP_S = WATCHDOG_UNIT + 5e-3
 """Delay with which a watchdog may act after its timeout, since it counts in steps [s]."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
-"""Further torque-off packets and the time between them [s]: one that meets a reply on the wire is lost."""
+"""Further torque-off packets and the time between them [s]: one that collides with a reply is lost."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class TorqueOff:
     rebooted: frozenset[Joint] = frozenset()
 
     def with_later(self, joint: Joint, *, rebooted: bool) -> "TorqueOff":
-        """The report once the servo of an unconfirmed joint has answered again and was read back as off."""
+        """The report after the servo of an unconfirmed joint has answered again and been read back as off."""
         return replace(
             self,
             confirmed=(*self.confirmed, joint),
@@ -76,7 +76,7 @@ class TorqueOff:
             if joint in self.rebooted:
                 yield (
                     f"{joint.title} was rebooted: its Bus Watchdog is no longer armed. Check its supply and its "
-                    "connector; a dip of the voltage is enough."
+                    "connector; a brief voltage dip is enough."
                 )
 
     def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:
@@ -167,7 +167,7 @@ def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseExcepti
 def cut_again(servo: Servo, *, armed: bool) -> bool:
     """Cut the torque of a servo that did not answer before; return whether it was rebooted. Raises as `Servo.write`.
 
-    armed: its Bus Watchdog was armed before torque came on; it is switched off.
+    armed: whether its Bus Watchdog was armed before torque was switched on; if so, it is switched off.
     """
     if servo.read("Torque Enable"):
         servo.write("Torque Enable", 0)

@@ -111,8 +111,8 @@ class LikelihoodOptions:
     """Tolerance of the fit of the initial state alone."""
 
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=1e-4)
-    """The lower bound of 1e-4 rad/s on widths cannot be distinguished from stiction; 3e-4 could be, by half a standard
-    error.
+    """A width at its lower bound of 1e-4 rad/s cannot be distinguished from stiction; one of 3e-4 could be, by half a
+    standard error.
     """
     minimiser: MinimiserOptions = MinimiserOptions()
     integration: IntegrationOptions = IntegrationOptions()
@@ -155,7 +155,9 @@ class LikelihoodOptions:
     """Maximum relative decrease of a Coulomb width per iteration with coarse steps, far from the minimum."""
 
     same_motion: float = 0.02
-    """Relative difference of two sums of squares, in coarse and in fine steps, up to which coarse ones may continue."""
+    """Relative difference between the sums of squares with coarse and with fine steps up to which coarse ones may
+    continue.
+    """
     same_cost: float = 1.0
     """Minima whose sums of squares differ by less than this count as the same."""
     close_cost: float = 25.0
@@ -188,7 +190,7 @@ class ShootingOptions:
     start_segments: int = 80
     """Maximum number of segments, evenly spread, in the fits that only need to come close to a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-3)
-    """The lower bound on widths is 3e-3 rad/s: narrower ones are slow to simulate, without a visible effect in a
+    """The lower bound on widths is 3e-3 rad/s: narrower ones are slow to simulate and have no visible effect within a
     second.
     """
     minimiser: SegmentedMinimiserOptions = SegmentedMinimiserOptions()

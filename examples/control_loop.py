@@ -19,6 +19,9 @@ from hil.runs.run_folder import RunFolder
 from hil.setup.servo_session import servo_session
 
 Array = NDArray[np.float64]
+MOST_JOINTS = 2
+"""The examples move an arm that hangs from its base; a spatial arm needs a path that keeps clear of itself."""
+
 Controller = Callable[[int, Array, Array], Array]
 """Takes the sample number, angles [rad] and velocities [rad/s] (joints,); returns torques [N m] (joints,)."""
 
@@ -27,7 +30,10 @@ def identified_arm() -> tuple[Config, ArmModel]:
     """Load the run folder given on the command line, or identify the realistic fake arm."""
     if len(sys.argv) > 1:
         run = RunFolder.open(Path(sys.argv[1]))
-        return run.load_config(), load_model(run.path)
+        config = run.load_config()
+        if len(config.joints) > MOST_JOINTS:
+            sys.exit(f"{run.path} is of an arm of {len(config.joints)} joints; this example moves one or two joints.")
+        return config, load_model(run.path)
     config = load_config(Path("fake_two_link"))
     with tempfile.TemporaryDirectory() as folder:
         run = RunFolder.create(Path(folder) / "run", config)

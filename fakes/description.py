@@ -10,7 +10,8 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from hil.drivers.clock import Clock
 from hil.drivers.packet import MAX_ID
 from hil.fakes.bus.bus import FakeBus
-from hil.fakes.bus.faults import Fault
+from hil.fakes.bus.fault_effects import jam
+from hil.fakes.bus.faults import Fault, FaultKind
 from hil.fakes.bus.hand import Move
 from hil.fakes.bus.supply import Supply
 from hil.fakes.names import arm_names, find_arm
@@ -192,7 +193,7 @@ def found_beside(folder: Path, name: str) -> Path:
 
 
 def _known_names(name: str) -> str:
-    """The hint for a bare name that is not an arm's."""
+    """The hint for a bare name that is not that of an arm."""
     if "." in name or "/" in name:
         return ""
     close = get_close_matches(name, arm_names(), 1, 0.75)
@@ -208,14 +209,14 @@ def load_fake(path: Path | str) -> FakeArm:
         text = find_arm(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise DescriptionError(f"{path}: cannot be read: {reason}{_known_names(str(path))}") from error
+        raise DescriptionError(f"{path} cannot be read: {reason}{_known_names(str(path))}") from error
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise DescriptionError(f"{path}: is not TOML: {error}") from error
+        raise DescriptionError(f"{path} is not TOML: {error}") from error
     table = document.get("fake")
     if not isinstance(table, dict):
-        raise DescriptionError(f"{path}: has no [fake] table, so there is no fake arm to open")
+        raise DescriptionError(f"{path} has no [fake] table, so there is no fake arm to open")
     try:
         return FakeArm.model_validate(beside(table, Path(path).parent))
     except ValidationError as error:
@@ -225,7 +226,7 @@ def load_fake(path: Path | str) -> FakeArm:
 def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
     """Return the described bus: servos switched on at the clock's current time, the arm at rest in its initial pose.
 
-    Raises PlantError if a custom plant is described and cannot be created.
+    Raises PlantError if a custom plant is described and cannot be created, or lacks what its faults or moves need.
     """
     servos = [
         EmulatedServo(
@@ -250,9 +251,12 @@ def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
         )
         for servo in fake.servos
     ]
+    plant = fake.make_plant()
+    if any(fault.kind is FaultKind.STUCK_JOINT for fault in fake.faults):
+        jam(plant, 0, jammed=False)  # a plant without this is refused now, not in the middle of a run
     bus = FakeBus(
         servos,
-        fake.make_plant(),
+        plant,
         clock,
         joints=fake.joints,
         adapter_latency_us=fake.adapter_latency_us,

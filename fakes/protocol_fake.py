@@ -92,6 +92,22 @@ class FakeSerial(SerialBase):
         except (DescriptionError, PlantError, OSError) as error:
             raise serial.SerialException(str(error)) from error
 
+    @property
+    def timeout(self) -> float | None:
+        """Longest wait of `read` on `clock` [s]; None waits forever."""
+        return self._timeout
+
+    @timeout.setter
+    def timeout(self, timeout: float | None) -> None:
+        # pyserial's own setter also configures the port again, which costs as much as a short read.
+        try:
+            is_valid = timeout is None or timeout >= 0
+        except TypeError:
+            is_valid = False
+        if not is_valid:
+            raise ValueError(f"Not a valid timeout: {timeout!r}")
+        self._timeout = timeout
+
     def close(self) -> None:
         self.is_open = False
 
@@ -157,7 +173,7 @@ class FakeSerial(SerialBase):
         return bus
 
     def _unplugged(self, bus: FakeBus) -> _Unplugged:
-        """Return the error for an unplugged cable, at the time of unplugging, of which the bus may know in advance."""
+        """Wait until the cable is unplugged, of which the bus may know in advance, and return the error."""
         self.clock.wait_until(bus.pulled_at)
         return _Unplugged()
 

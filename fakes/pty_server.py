@@ -213,7 +213,7 @@ class PtyServer:
                 ) from None
             except OSError as error:
                 self.close()
-                raise LinkError(f"{self._link}: cannot be created: {error.strerror}") from error
+                raise LinkError(f"{self._link} cannot be created: {error.strerror}") from error
 
     def _unplug(self) -> None:
         for descriptor in (self._master, self._slave):

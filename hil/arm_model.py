@@ -41,7 +41,7 @@ class JointFacts:
         return "V" if self.mode == "pwm" else "A"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ArmModel:
     """The dynamics of an identified arm of one or two joints.
 
@@ -54,6 +54,11 @@ class ArmModel:
     gravity: float
     rest_pose: tuple[float, ...]
     joints: tuple[JointFacts, ...]
+
+    def __repr__(self) -> str:
+        """One line; the numbers are in `values` and `stds`."""
+        names = ", ".join(joint.name for joint in self.joints)
+        return f"<{type(self).__name__} of {len(self.joints)} joints ({names}), {len(self.values)} parameters>"
 
     def inverse_dynamics(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
         """Motor torques (..., joints) [N m] for a motion: inertia, Coriolis, gravity, friction, offset, cable, cogging.

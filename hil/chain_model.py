@@ -30,7 +30,7 @@ class Geometry:
     gravity: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ChainArmModel(ArmModel):
     """The dynamics of an identified spatial arm.
 

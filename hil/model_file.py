@@ -15,7 +15,7 @@ from hil.arm_model import ArmModel
 from hil.chain_model import ChainArmModel, Geometry
 from hil.errors import ResultError
 from hil.estimator.models.terms import RIGID_BODY, base_names, extra_names
-from hil.next_step import command
+from hil.next_step import command, only_steps, steps_of
 from hil.results.json_form import FormError, from_json
 from hil.results.parts import ArmFacts, ChainFacts, Quantity
 from hil.results.result import SCHEMA, Result, SettledResult, result_from_json
@@ -30,13 +30,13 @@ def _read(path: Path) -> dict[str, Any]:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise ResultError(f"{file}: cannot be read: {reason}.") from error
+        raise ResultError(f"{file} cannot be read: {reason}.") from error
     try:
         result = tomllib.loads(text) if file.suffix == ".toml" else json.loads(text)
     except ValueError as error:
-        raise ResultError(f"{file}: is incomplete or damaged: {error}. Recreate it with hil estimate RUN.") from error
+        raise ResultError(f"{file} is incomplete or damaged: {error}. Recreate it with hil estimate RUN.") from error
     if not isinstance(result, dict) or "schema" not in result:
-        raise ResultError(f"{file}: is not a result file of hil: it has no schema.")
+        raise ResultError(f"{file} is not a result file of hil: it has no schema.")
     if result["schema"] != SCHEMA:
         raise ResultError(
             f"{file}: schema is {result['schema']!r}, but this version of hil reads {SCHEMA}; it was written by "
@@ -52,6 +52,8 @@ def _no_result(folder: Path) -> str:
             f"{folder} has no result.json: its identification did not finish. Estimate it first: "
             f"{command('estimate', folder)}"
         )
+    if steps := steps_of(folder):
+        return only_steps(folder, steps)
     below = sorted(each.parent for each in folder.glob("*/result.json"))
     if below:
         listed = command("runs", folder)
@@ -102,7 +104,7 @@ def read_usable_result(path: Path) -> Result:
 def model_of(result: Result, path: Path) -> ArmModel:
     """The model in a result that was read from `path`; raises ResultError."""
     if result.arm is None:
-        raise ResultError(f"{path}: holds no data about the arm's joints. Run hil estimate again.")
+        raise ResultError(f"{path} holds no data about the arm's joints. Run hil estimate again.")
     return _model(result.arm, result.quantities, result.chain, path)
 
 
@@ -131,18 +133,18 @@ def _check_chain(values: dict[str, float], geometry: Geometry, chain: ChainFacts
     """Check that the geometry has the right number of joints and that no base parameter or friction term is missing."""
     shapes = tuple(each.shape for each in (geometry.rotation, geometry.translation, geometry.axis, geometry.gravity))
     if shapes != ((joints, 3, 3), (joints, 3), (joints, 3), (3,)):
-        raise ResultError(f"{path}: is damaged: the geometry of its {joints} joints has the shapes {shapes}.")
+        raise ResultError(f"{path} is damaged: the geometry of its {joints} joints has the shapes {shapes}.")
     friction = {f"{term}_{joint}" for term in ("viscous", "coulomb", "offset") for joint in range(1, joints + 1)}
     missing = sorted(({*chain.groups} | friction) - values.keys())
     if missing:
-        raise ResultError(f"{path}: is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
+        raise ResultError(f"{path} is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
     bad = [name for name, value in values.items() if not math.isfinite(value)]
     if bad:
-        raise ResultError(f"{path}: {', '.join(bad)} is not a finite number. Run hil estimate again.")
+        raise ResultError(f"{path}: not a finite number: {', '.join(bad)}. Run hil estimate again.")
 
 
 def _damaged(path: Path, error: FormError) -> ResultError:
-    return ResultError(f"{_file(path)}: is damaged or from an older hil: it {error}. Run hil estimate again.")
+    return ResultError(f"{_file(path)} is damaged or from an older hil: it {error}. Run hil estimate again.")
 
 
 def _file(path: Path) -> Path:
@@ -157,14 +159,14 @@ def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
     possible = {*needed, *extra_names(joints)}
     missing, unknown = sorted(needed - values.keys()), sorted(values.keys() - possible)
     if missing:
-        raise ResultError(f"{path}: is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
+        raise ResultError(f"{path} is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
     if unknown:
         raise ResultError(
-            f"{path}: has {', '.join(unknown)}, which this version of hil does not know; it was written by a newer one."
+            f"{path} has {', '.join(unknown)}, which this version of hil does not know; it was written by a newer one."
         )
     bad = [name for name, value in values.items() if not math.isfinite(value)]
     if bad:
-        raise ResultError(f"{path}: {', '.join(bad)} is not a finite number. Run hil estimate again.")
+        raise ResultError(f"{path}: not a finite number: {', '.join(bad)}. Run hil estimate again.")
 
 
 def _newer(schema: object) -> bool:

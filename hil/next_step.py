@@ -1,6 +1,8 @@
 """The command to type next: from `hil scan` to `hil export`, each command names its successor in its last line."""
 
 import shlex
+from collections.abc import Sequence
+from pathlib import Path
 
 NEXT = "Next: "
 """Beginning of the line that names the next command."""
@@ -14,3 +16,19 @@ def next_step(*words: object) -> str:
 def command(*words: object) -> str:
     """A `hil` command as typed in a shell, with every word quoted that the shell would split or expand."""
     return shlex.join(["hil", *map(str, words)])
+
+
+def steps_of(path: Path) -> list[Path]:
+    """Folders of the pilot and further steps recorded in a folder whose identification never got to its full run."""
+    if (path / "samples.npy").is_file() or not (path / "config.toml").is_file():
+        return []
+    return sorted((each.parent for each in path.glob("*/samples.npy")), key=lambda each: each.stat().st_mtime)
+
+
+def only_steps(path: Path, steps: Sequence[Path]) -> str:
+    """Explain that an identification ended before its full run, and how to look at what was recorded."""
+    names = ", ".join(each.name for each in steps)
+    return (
+        f"{path}: its identification ended before the full run, so there is no result; recorded: {names}. Identify "
+        f"again, or look at what the arm did: {command('export', steps[-1], '--format', 'csv')}"
+    )

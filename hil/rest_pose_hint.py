@@ -10,10 +10,10 @@ def rest_pose_hint(position: float, rest: float, tolerance: float, zero_ticks: i
         position: measured angle [rad].
         rest: the joint's angle in arm.rest_pose [rad].
         tolerance: deviation that is allowed [rad].
-        zero_ticks: the value with which the present position would be the rest pose.
+        zero_ticks: the value that would make the present position the rest pose.
     """
     mirrored = (
-        "With the other sign of direction it would be at rest: check direction first. "
+        "With the opposite direction it would be at rest: check direction first. "
         if abs(-position - rest) <= tolerance
         else "If direction or id belong to another joint, correct them first. "
     )

@@ -2,47 +2,32 @@
 
     python benchmarks/spatial/chain_arms.py [--arm koch] [--json]
 
-For each: trust, residual in encoder steps, held-out error, coverage of the 95 % intervals, arm time and
-processor time, least clearance and largest overshoot of a position limit over all recordings, and the ratio of the
-worst relative standard error of the designed path to that of random paths.
+For each: trust, residual in encoder steps, held-out error, torque error and coverage of the 95 % intervals (see
+chain_population.py; both in units of joint 1's torque), arm time and processor time, least clearance and largest
+overshoot of a position limit over all recordings, and the ratio of the worst relative standard error of the designed
+path to that of random paths.
 """
 
 import argparse
 import json
 import resource
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
 import numpy as np
 
 import hil
-from hil.clearance.space import Space
+from benchmarks.spatial.judgement import judged, measured
 from hil.config.schema import Config, load_config
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
-from hil.runs.recording import Phase, load_samples
 
 ARMS = ("leg", "open_manipulator_x", "koch", "wx250s", "viperx_300")
 PLAIN = 5
-
-
-def measured(config: Config, run: Path) -> dict[str, float]:
-    """Over all recordings in a run folder: duration [s], least clearance outside the rest pose [m], and largest
-    overshoot of a position limit [rad]."""
-    space = Space.of(config)
-    low, high = np.array([joint.position_limit for joint in config.joints]).T
-    seconds, nearest, excess = 0.0, np.inf, -np.inf
-    for path in run.rglob("samples.npy"):
-        samples = load_samples(path, len(config.joints))
-        q = samples["position"][np.isfinite(samples["position"]).all(axis=1)].T
-        seconds += float(samples["deadline"][-1] - samples["deadline"][0])
-        away = q[:, ~space.lies(q)][:, ::4]
-        if away.shape[1]:
-            nearest = min(nearest, space.nearest(away, on_the_way=True).distance)
-        excess = max(excess, float(np.maximum(low - q.min(axis=1), q.max(axis=1) - high).max()))
-        assert (samples["phase"] != Phase.NOT_RECORDED).all()
-    return {"arm_seconds": round(seconds, 1), "least_m": round(float(nearest), 4), "excess_rad": round(excess, 4)}
 
 
 def over_plain(config: Config) -> float:
@@ -63,14 +48,12 @@ def identified(name: str) -> dict[str, Any]:
         found = hil.identify(config, out=Path(folder) / "run")
         after = resource.getrusage(resource.RUSAGE_SELF)
         recorded = measured(config, found.run)
-    truth = found.truth or {}
-    away = np.array([abs(each.value - truth[key]) / each.std for key, each in found.parameters.items()])
     return {
         "trust": found.verdict.trust,
         "steps": len(found.steps or ()),
         "residual_ticks": round(max(found.fit.residual_rms_ticks), 3),
         "held_out_percent": round(100 * max(found.validation.held_out_rms or (np.nan,)), 3),
-        "coverage_95": round(float((away < 1.96).mean()), 3),
+        **judged(config, found),
         "cpu_seconds": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
         **recorded,
         "optimised_over_plain": round(over_plain(config), 3),

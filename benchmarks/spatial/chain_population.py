@@ -28,9 +28,9 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 import numpy as np
 
 import hil
-from benchmarks.spatial.chain_arms import measured
+from benchmarks.spatial.judgement import WRONG_SHARE, WRONG_STDS, WRONG_TORQUE, judged, measured
 from hil.clearance.space import Space
-from hil.config.schema import Config, load_config
+from hil.config.schema import load_config
 from hil.drivers.errors import DriverError
 from hil.drivers.servo_model import servo_model
 from hil.drivers.servo_prior import servo_prior
@@ -43,7 +43,6 @@ SPREAD = 0.3
 STOP_ROOM = 0.06  # rad between the rest pose and the limit next to it
 TRIES = 200
 HEADROOM = 2.5  # times a joint's own largest weight
-WRONG_TORQUE, WRONG_STDS, WRONG_SHARE = 2.0, 3.0, 0.1  # percent of the torque; standard errors; share of parameters
 SERVOS = (("XM430-W350", 1.8, 1.4), ("XM540-W270", 2.41, 3.5))
 """Model, torque constant [N m/A], largest current [A]."""
 
@@ -231,38 +230,6 @@ def _weights(known: KnownChain, rest: Any, random: np.random.Generator) -> tuple
     arm = ChainArms(known.base, known.base.of_all(known.described)[None], np.zeros((1, 6, n)))
     poses = random.uniform(-2.5, 2.5, (60, n))
     return weights(arm, rest)[0], np.max([np.abs(weights(arm, pose)[0]) for pose in poses], axis=0)
-
-
-def judged(config: Config, found: hil.Identification) -> dict[str, float]:
-    """Compare a result with the truth: worst joint's torque error on random motions, share of wrong error bars."""
-    assert config.fake is not None and config.fake.chain is not None
-    known, n = known_chain(config), len(config.joints)
-    unit = 1.0
-    if "torque_scale_2" in found.extra:
-        unit = config.fake.chain.drives[0].torque_constant / config.joints[0].torque_per_goal
-    random = np.random.default_rng(5)
-    q, v, a = (size * random.standard_normal((n, 300)) for size in (1.0, 1.5, 4.0))
-    Y = known.base.regressor(q, v, a)
-    truth = {name: value / unit for name, value in (found.truth or {}).items()}
-    right = Y @ np.array([truth[name] for name in known.base.names])
-    wrong = Y @ np.array([found.parameters[name].value for name in known.base.names]) - right
-    error = wrong.std(axis=1) / right.std(axis=1)
-    within = [found.covariance.names.index(name) for name in known.base.names]
-    covariance = found.covariance.array()[np.ix_(within, within)]
-    known_ones = np.isfinite(np.diag(covariance))
-    covariance = np.where(np.outer(known_ones, known_ones), covariance, 0.0)
-    about = Y - Y.mean(axis=1, keepdims=True)
-    expected = np.sqrt(np.einsum("jsp,pq,jsq->js", about, covariance, about).mean(axis=1)) / right.std(axis=1)
-    # The worst joint is the one that is farthest beyond both criteria.
-    beyond = np.minimum(100 * error / WRONG_TORQUE, error / np.maximum(expected, 1e-12) / WRONG_STDS)
-    worst = int(np.argmax(beyond))
-    away = np.array([abs(each.value - truth[name]) / each.std for name, each in found.parameters.items()])
-    return {
-        "torque_error_percent": round(100 * float(error[worst]), 2),
-        "torque_error_stds": round(float(error[worst] / expected[worst]), 2),
-        "coverage_95": round(float((away < 1.96).mean()), 3),
-        "beyond_4": round(float((away > 4.0).mean()), 3),
-    }
 
 
 def identified(seed: int, plain: bool = False) -> dict[str, Any]:

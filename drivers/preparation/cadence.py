@@ -11,7 +11,7 @@ from hil.drivers.state import Spans, status_span
 from hil.drivers.sync_read import one_each
 
 CHECK_S = 0.01
-"""Longest time between two exchanges [s], if the bus allows: faults must not go unnoticed because samples are rare."""
+"""Longest time between two exchanges [s], if the bus allows: faults must not go unnoticed at low sample rates."""
 
 STATUS_S = 0.035
 """Time between two status reads [s]."""
@@ -26,7 +26,7 @@ def cadence(
     """Return the exchanges per sample, the status registers to read, and the exchanges between two status reads.
 
     The registers are None if there is no time to read them. sample: time between two samples [s], 0 if unknown. drives:
-    one entry per servo. return_delay: the longest of the servos [s].
+    one entry per servo. return_delay: the servos' longest Return Delay Time [s].
     """
     if not sample:
         return 1, None, 0

@@ -89,7 +89,7 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     servo.write("Torque Enable", 0)
     fault = servo.hardware_error()
     if fault != HardwareError(0):
-        raise ServoFault(fault_text(joint, describe_error(fault)))
+        raise ServoFault(fault_text(joint, describe_error(fault), shuts_down=shuts_down(servo, fault)))
     drive_mode = servo.read("Drive Mode")
     if drive_mode & ~TIME_BASED_PROFILE:
         raise WrongSetting(
@@ -116,14 +116,22 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
         servo.write("Goal PWM", servo.read("PWM Limit"))
 
 
-def fault_text(joint: Joint, cause: str) -> str:
-    """Return the message for a servo that has raised its alert."""
+def shuts_down(servo: Servo, error: HardwareError) -> bool:
+    """Whether the servo's Shutdown register makes it cut its torque for one of these errors."""
+    return bool(HardwareError(servo.read("Shutdown")) & error)
+
+
+def fault_text(joint: Joint, cause: str, *, shuts_down: bool = True) -> str:
+    """Return the message for a servo that has raised its alert.
+
+    shuts_down: whether its Shutdown register makes it cut its torque for this cause.
+    """
     if cause == NO_ERROR:
         return (
             f"{joint.title} raised its alert, but reports no hardware error now. Check its supply and its plug, then "
             "power-cycle it."
         )
-    return (
-        f"{joint.title} raised its alert, hardware error: {cause}. It stays without torque until it is rebooted: "
-        "find the cause, then power-cycle it."
-    )
+    raised = f"{joint.title} raised its alert, hardware error: {cause}."
+    if not shuts_down:
+        return f"{raised} Its Shutdown setting lets it keep its torque. Find the cause, then power-cycle it."
+    return f"{raised} It stays without torque until it is rebooted: find the cause, then power-cycle it."

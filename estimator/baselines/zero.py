@@ -20,7 +20,8 @@ SURE = 0.05  # fraction of the largest torque: weaker gravity does not reveal an
 def turned_zeros(recordings: Sequence[Recording]) -> Array | None:
     """Return the angles (joints,) [rad] to add to the recordings' so that joint 1 is measured from the horizontal.
 
-    None if there is no evidence that it is not. The torque of gravity is regressed on cosine and sine of the angle.
+    None if the recordings give no evidence of a different zero. The torque of gravity is regressed on cosine and sine
+    of the angle.
     """
     joints = recordings[0].joints
     names = base_names(joints)

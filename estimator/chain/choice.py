@@ -3,6 +3,7 @@
 Torque scales are not chosen in this way: they belong to the model wherever the torque constants are uncertain.
 """
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -27,25 +28,56 @@ class ChoiceOptions:
 OPTIONS = ChoiceOptions()
 
 
+@dataclass(frozen=True)
+class ChainTrial:
+    """One model that was tried."""
+
+    model: ChainModel
+    estimate: ChainEstimate | None
+    """None if the fit did not converge."""
+    seconds: float
+    """Duration of the fit [s]."""
+
+    @property
+    def error(self) -> float:
+        """RMS error of the one-step-ahead prediction in units of the noise, all joints; infinite without a fit."""
+        return np.inf if self.estimate is None else float(np.sqrt(np.mean(np.square(self.estimate.over_noise))))
+
+
+@dataclass(frozen=True)
+class ChainChoice:
+    """The best supported estimate, and the models that were tried, in order; the first is the simplest."""
+
+    estimate: ChainEstimate
+    trials: tuple[ChainTrial, ...]
+
+    @property
+    def gained(self) -> float:
+        """Ratio of the simplest model's error to the chosen one's."""
+        return self.trials[0].error / ChainTrial(self.estimate.model, self.estimate, 0.0).error
+
+
 def choose_chain(
     periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior, options: ChoiceOptions = OPTIONS
-) -> ChainEstimate:
-    """Estimate under `model`, and under richer ones if its residual is more than encoder rounding; return the best
-    supported.
+) -> ChainChoice:
+    """Estimate under `model`, and under richer ones if its residual is more than noise; choose the best supported.
 
     Raises what `identify_chain` raises for `model` itself.
     """
+    started = time.perf_counter()
     best = identify_chain(periods, model, prior)
+    trials = [ChainTrial(model, best, time.perf_counter() - started)]
     while not best.explained:
         found = [_tried(periods, richer, prior) for richer in _richer(best.model)]
-        gains = [(_gain(best, each, options), each) for each in found if each is not None]
+        trials += found
+        gains = [(_gain(best, each.estimate, options), each.estimate) for each in found if each.estimate is not None]
         if not gains:
             break
         gain, better = max(gains, key=lambda pair: pair[0])
         if gain <= 0.0:
             break
         best = better
-    return best
+    return ChainChoice(best, tuple(trials))
 
 
 def _richer(model: ChainModel) -> list[ChainModel]:
@@ -58,11 +90,13 @@ def _richer(model: ChainModel) -> list[ChainModel]:
     return more
 
 
-def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainEstimate | None:
+def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainTrial:
+    started = time.perf_counter()
     try:
-        return identify_chain(periods, model, prior)
+        estimate = identify_chain(periods, model, prior)
     except ConvergenceError:
-        return None
+        estimate = None
+    return ChainTrial(model, estimate, time.perf_counter() - started)
 
 
 def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) -> float:

@@ -17,15 +17,16 @@ from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ConvergenceError, ModelError
 from hil.estimator.fit.fitted_parameters import FittedParameters
 
-ROUNDING = 1.0 / np.sqrt(12.0)  # standard deviation of a rounded angle [encoder steps]
 EXPLAINED_RESIDUAL = 1.06
-"""RMS residual of the worst joint, in units of encoder rounding, below which a motion counts as explained."""
+"""RMS residual of the worst joint, relative to the noise of its angle, below which a motion counts as explained."""
 
 SYSTEMATIC = 1.5
-"""Ratio of standard errors to those under white noise, above which the residual holds a model error rather than noise.
+"""Ratio of standard errors to those under white noise, above which the residual contains a model error rather than
+noise.
 
-It is 0.6 to 0.9 for encoder rounding. Torque ripple of 0.2 %, or 0.3 % of the torque as friction, increase it to 2 or
-3, while the residual is still within a tenth of rounding."""
+It is 0.6 to 0.9 for encoder rounding. Torque ripple of 0.2 %, or load-dependent friction of 0.3 % of the torque, raises
+it to 2 or 3, while the residual still exceeds rounding by less than a tenth.
+"""
 
 BELIEVED = 0.5  # standard errors under white noise above this fraction of the prior's: values come from the prior
 
@@ -48,8 +49,9 @@ class ChainEstimate(FittedParameters):
     white_std: Array
     correlation_time: float
     systematic: float
-    """Median ratio of the base parameters' standard errors to those under white noise: how far errors of the model
-    exceed noise at the frequencies that determine the parameters."""
+    """Median ratio of the base parameters' standard errors to those under white noise: how far model errors exceed
+    noise at the frequencies that determine the parameters.
+    """
     softness: float
     """Natural frequency of the observer that couples the simulation to the measurements [Hz]."""
     reached: bool
@@ -58,11 +60,19 @@ class ChainEstimate(FittedParameters):
     """Base parameters that the data hardly determine, so that their values come from the prior."""
     unseen: tuple[str, ...]
     """Zero errors and tilts that the data hardly determine, so that they are taken as zero."""
+    noise_steps: Array
+    """Noise of one sample of each angle, encoder rounding included (joints,) [encoder steps]; rounding alone is 0.2887.
+    """
+
+    @property
+    def over_noise(self) -> Array:
+        """RMS residual relative to the noise of the angles (joints,)."""
+        return np.asarray(self.residual_steps / self.noise_steps)
 
     @property
     def explained(self) -> bool:
-        """Whether the residual is encoder rounding alone, so that no further term needs to be tried."""
-        return float(self.residual_steps.max()) <= EXPLAINED_RESIDUAL * ROUNDING and self.systematic <= SYSTEMATIC
+        """Whether the residual is noise alone, so that no further term needs to be tried."""
+        return float(self.over_noise.max()) <= EXPLAINED_RESIDUAL and self.systematic <= SYSTEMATIC
 
 
 @one_blas_thread
@@ -106,7 +116,7 @@ def identify_chain(
         outliers=fit.outliers + spikes,
         white_std=np.sqrt(np.diag(fit.white_covariance)),
         correlation_time=fit.correlation_time,
-        systematic=_median_ratio(np.sqrt(np.diag(fit.covariance))[:count], std[:count]),
+        systematic=median_ratio(np.sqrt(np.diag(fit.covariance))[:count], std[:count]),
         softness=fit.softness,
         reached=fit.reached,
         from_prior=tuple(name for name, open_ in zip(model.base.names, wide, strict=True) if open_),
@@ -115,11 +125,12 @@ def identify_chain(
             for name, each in zip(model.names, std, strict=True)
             if each > BELIEVED * ANGLES.get(kind_of(name), np.inf)
         ),
+        noise_steps=used[0].noise / used[0].position_step,
     )
 
 
-def _median_ratio(one: Array, other: Array) -> float:
-    """Return the median ratio of two vectors of standard errors, of those that are finite; infinite without any."""
+def median_ratio(one: Array, other: Array) -> float:
+    """Return the median ratio of two vectors of standard errors, over the finite ones; infinite if there are none."""
     known = np.isfinite(one) & np.isfinite(other)
     return float(np.median(one[known] / other[known])) if known.any() else np.inf
 
@@ -140,7 +151,7 @@ def _best_fit(
     widths = np.array([kind_of(name) == "coulomb_width" for name in model.names])
     for width in options.other_initial_widths:
         before = _worst_residual(periods, best)
-        if before <= EXPLAINED_RESIDUAL * ROUNDING:
+        if before <= EXPLAINED_RESIDUAL:
             break
         if np.all(best.value[widths] <= width):
             continue  # it would start from the minimum itself
@@ -152,12 +163,12 @@ def _best_fit(
 
 
 def _worst_residual(periods: Sequence[SettledPeriod], fit: ChainFit) -> float:
-    """RMS residual of the worst joint in any period [encoder steps]."""
+    """RMS residual of the worst joint in any period, relative to the noise of its angle."""
     return max(
         float(
             np.sqrt(
                 np.nanmean(np.square(np.where(period.valid, period.position - position, np.nan)), axis=1)
-                / period.position_step**2
+                / period.noise**2
             ).max()
         )
         for period, position in zip(periods, fit.positions, strict=True)

@@ -2,7 +2,7 @@
 
 Stage 1 is filtered inverse dynamics. Stage 2 is the same likelihood as for settled periods: its observer needs no
 periodic motion, only torque that was commanded. A measured torque already responds to the motion, so a simulation
-driven by it gains nothing (docs/theory.md); in that case the regression is the result, which says so.
+driven by it gains nothing (docs/theory.md); in that case the result is that of the regression, and is marked as such.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.fit.regression import filtered_torque, fit_filtered
 from hil.estimator.chain.fit.stage1 import ChainLinear
 from hil.estimator.chain.fit.stage2 import fit_periods
-from hil.estimator.chain.identify import BELIEVED
+from hil.estimator.chain.identify import BELIEVED, median_ratio
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.fourier import PeriodicMotion
@@ -86,6 +86,8 @@ class RecordedChain:
     """Base parameters that the data hardly determine."""
     reached: bool = True
     """Whether the fit has reached its minimum; always so for a regression."""
+    systematic: float = 1.0
+    """See `ChainEstimate.systematic`; 1 for a regression."""
 
     @property
     def std(self) -> Array:
@@ -148,6 +150,7 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
         cutoff,
         _from_prior(model, spread, prior),
         fit.reached,
+        median_ratio(np.sqrt(np.diag(fit.covariance))[:count], spread),
     )
 
 

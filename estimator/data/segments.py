@@ -121,7 +121,7 @@ def grid_torque(recording: Recording, grid: Grid, delay: float, lag: float) -> A
 
 
 def grid_torque_slopes(recording: Recording, grid: Grid, delay: float, lag: float) -> Array:
-    """Return the derivatives of `grid_torque` by delay and lag (2, joints, steps) [N m/s], by central differences."""
+    """Differentiate `grid_torque` with respect to delay and lag (2, joints, steps) [N m/s], by central differences."""
 
     def at(delay: float, lag: float) -> Array:
         return grid_torque(recording, grid, delay, lag)
@@ -134,7 +134,7 @@ def grid_torque_slopes(recording: Recording, grid: Grid, delay: float, lag: floa
 
 
 def _cubic(place: Array, steps: int) -> tuple[Indices, Array]:
-    """Return the grid points around each place (samples, 4) and the weights of the cubic through them."""
+    """Return the grid points around each position (samples, 4) and the weights of the cubic through them."""
     first = np.clip(np.floor(place).astype(np.int64) - 1, 0, steps - 3)
     index = first[:, None] + np.arange(4)
     u = place - first

@@ -3,12 +3,16 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 from scipy.ndimage import median_filter
 
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.fourier import white_noise
+from hil.estimator.data.repeated_noise import agreed_noise
 from hil.estimator.errors import RecordingError, ShapeError, StandstillError
 from hil.estimator.simulation.closed_loop import Stabilised
+
+Indices = npt.NDArray[np.intp]
 
 FEWEST_SAMPLES = 32
 SPIKE = 8.0  # deviation from the local median, in typical deviations, above which a reading is a spike
@@ -45,6 +49,10 @@ class SettledPeriod:
     """Number of settled periods that were averaged."""
     position_std: Array | None = None
     """Standard deviation of the mean angles from the scatter between periods (joints,) [rad], if known."""
+    repeated_noise: Array | None = None
+    """Standard deviation of one sample's error from the difference between successive periods (joints,) [rad], if known
+    (`hil.estimator.data.repeated_noise`).
+    """
     stabiliser: Stabilised | None = None
     """The software stabiliser, if one produced part of `torque`.
 
@@ -59,7 +67,10 @@ class SettledPeriod:
     valid: Mask = field(init=False)
     """Whether each sample was received (joints, samples)."""
     noise: Array = field(init=False)
-    """Standard deviation of one sample's error (joints,) [rad]: the measured white noise, at least that of rounding."""
+    """Standard deviation of one sample's error (joints,) [rad]: the measured white noise, at least that of rounding.
+
+    The fastest lines of a motion sampled slowly are no noise: what repeats from period to period does not count.
+    """
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "valid", np.isfinite(self.position))
@@ -67,7 +78,8 @@ class SettledPeriod:
         _check_values(self)
         _check_motion(self)
         rounding = self.position_step / np.sqrt(12.0)
-        object.__setattr__(self, "noise", np.maximum(white_noise(self.filled()), rounding))
+        white = agreed_noise(white_noise(self.filled()), self.repeated_noise, self.samples)
+        object.__setattr__(self, "noise", np.maximum(white, rounding))
 
     @property
     def joints(self) -> int:
@@ -97,18 +109,40 @@ class SettledPeriod:
 def without_spikes(period: SettledPeriod) -> SettledPeriod:
     """Return the period with single outliers (such as a bit error on the bus) marked as missing.
 
-    A reading is an outlier if its distance from the median of itself and two neighbours on either side exceeds SPIKE
-    encoder steps and SPIKE times the typical distance. If the fraction of such readings exceeds MOST_SPIKES, they are
-    not outliers: the joint moves that fast, compared with the sample rate.
+    A reading is an outlier if its distance from the median of itself and two neighbours on either side, and that from
+    a cubic through its neighbours, exceed SPIKE encoder steps and SPIKE times the typical distance from the median. The
+    median alone would take every fast reversal at a low rate for an outlier, as most readings are the median of a joint
+    that moves on. If the fraction of such readings exceeds MOST_SPIKES, they are not outliers: the joint moves fast
+    compared with the sample rate.
     """
     position = period.filled()
     away = np.abs(position - median_filter(position, size=(1, 5), mode="wrap"))
     usual = np.maximum(1.5 * np.median(away, axis=1), np.maximum(period.position_step, period.noise))
     wild = (away > SPIKE * usual[:, None]) & period.valid
     wild &= wild.mean(axis=1, keepdims=True) <= MOST_SPIKES
+    for row, far, valid, most in zip(position, wild, period.valid, SPIKE * usual, strict=True):
+        bridged = _bridged(row, np.flatnonzero(far), np.flatnonzero(valid & ~far))
+        far[far] = np.abs(row[far] - bridged) > most
     if not wild.any():
         return period
     return replace(period, position=np.where(wild, np.nan, period.position))
+
+
+def _bridged(row: Array, places: Indices, kept: Indices) -> Array:
+    """Return the value at each of `places` of the cubic through the two nearest of the `kept` samples on either side.
+
+    The row (samples,) is periodic.
+    """
+    if not places.size:
+        return np.empty(0)
+    after = np.searchsorted(kept, places)[:, None] + np.arange(-2, 2)
+    turns, index = np.divmod(after, kept.size)
+    at = kept[index] + turns * row.size - places[:, None]
+    value = np.zeros(places.size)
+    for i in range(4):
+        others = np.delete(at, i, axis=1)
+        value += row[kept[index[:, i]]] * np.prod(others / (others - at[:, i : i + 1]), axis=1)
+    return value
 
 
 def _check_shapes(period: SettledPeriod) -> None:
@@ -117,8 +151,10 @@ def _check_shapes(period: SettledPeriod) -> None:
     per_joint = (period.position.shape[0],)
     if period.position_step.shape != per_joint:
         raise ShapeError(f"position_step has shape {period.position_step.shape}; it must be {per_joint}: one per joint")
-    if period.position_std is not None and period.position_std.shape != per_joint:
-        raise ShapeError(f"position_std has shape {period.position_std.shape}; it must be {per_joint}: one per joint")
+    for name in ("position_std", "repeated_noise"):
+        std = getattr(period, name)
+        if std is not None and std.shape != per_joint:
+            raise ShapeError(f"{name} has shape {std.shape}; it must be {per_joint}: one per joint")
 
 
 def _check_values(period: SettledPeriod) -> None:

@@ -80,7 +80,7 @@ def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tup
 
 
 def detecting_lines(period: float, band: tuple[float, float], joints: int, seed: int) -> tuple[tuple[int, ...], ...]:
-    """Assign odd harmonics to the joints in turn, leaving one of every DETECTION unexcited, drawn by `seed`.
+    """Assign odd harmonics to the joints in turn, leaving one of every DETECTION unexcited, at random (`seed`).
 
     On the unexcited lines, odd or even, the arm's nonlinear distortion becomes visible: see
     `hil.estimator.selection.distortion`. Raises ExcitationError if fewer lines than joints are left.
@@ -203,19 +203,19 @@ def _low_crest_phases(harmonics: tuple[int, ...], seed: int, joint: int) -> Arra
 
 
 def _flattened(order: Harmonics, phase: Array, samples: int, norms: tuple[int, ...]) -> Array:
-    """Return phases that lower the wave's peak, by minimising one L2p norm after the other."""
+    """Return phases that lower the wave's peak, by minimising successive L2p norms."""
     for p in norms:
         phase = descend(partial(_norm, order=order, samples=samples, p=p), phase, ITERATIONS)
     return phase
 
 
 def _norm(phase: Array, order: Harmonics, samples: int, p: int) -> tuple[float, Array]:
-    """Return the logarithm of the wave's L2p norm, and its gradient by the phases (lines,)."""
+    """Return the logarithm of the wave's L2p norm, and its gradient with respect to the phases (lines,)."""
     wave = _wave(order, phase, samples)
     peak = float(np.abs(wave).max())
     steep = (wave / peak) ** (2 * p - 1)
     total = float(np.sum(steep * wave)) / peak
-    # The derivative of the wave by a phase is -sin; its sum over time with `steep` is a Fourier line of `steep`.
+    # The derivative with respect to a phase is -sin; its sum over time with `steep` is a Fourier line of `steep`.
     lines = np.fft.rfft(steep)[order]
     gradient = np.imag(np.exp(-1j * phase) * lines) / (peak * total)
     return math.log(total) / (2 * p) + math.log(peak), gradient

@@ -148,8 +148,8 @@ class DesignProblem:
         return respond(physics, start, wave.torque, wave.rate, self.feedback).position
 
     def _columns(self, wave: Multisine, start: Array, nominal: Array) -> Array:
-        """Return the derivatives of all positions, in units of rounding, by parameters, nuisance parameters and initial
-        state.
+        """Return the derivatives of all positions, in units of rounding, with respect to parameters, nuisance
+        parameters and initial state.
         """
         noise = (self.position_step / np.sqrt(12.0))[:, None]
 

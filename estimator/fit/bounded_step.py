@@ -1,9 +1,9 @@
 """The step that minimises a convex quadratic function within bounds: a primal active-set method.
 
-Clipping the unconstrained step instead, and solving again for the coordinates that are still free, holds coordinates at
-bounds that the constrained minimum does not touch. In a narrow valley such a step can even lead uphill, and an
-iteration that stops where no decrease is predicted then ends far from the minimum (Nocedal and Wright, Numerical
-Optimization, section 16.5).
+The alternative, to clip the unconstrained step and solve again for the coordinates that are still free, would hold some
+coordinates at bounds that are not active at the constrained minimum. In a narrow valley such a step can even lead
+uphill, and an iteration that stops where no decrease is predicted then ends far from the minimum (Nocedal and Wright,
+Numerical Optimization, section 16.5).
 """
 
 import numpy as np
@@ -40,7 +40,7 @@ def bounded_step(matrix: Array, slope: Array, least: Array, most: Array) -> Arra
         share, blocking = _share_until_bound(step, direction, least, most)
         step = np.clip(step + share * direction, least, most)
         if blocking is not None:
-            # Exactly: a rounding error below the upper bound would count as the lower one when it is to be released.
+            # Set exactly: with a rounding error, the upper bound would be mistaken for the lower one on release.
             step[blocking] = most[blocking] if direction[blocking] > 0.0 else least[blocking]
             free[blocking] = False
             continue
@@ -61,7 +61,7 @@ def _share_until_bound(step: Array, direction: Array, least: Array, most: Array)
 
 
 def _wrongly_held(slope: Array, step: Array, most: Array, held: Mask, tolerance: float) -> int | None:
-    """Return the coordinate held at a bound from which the function falls fastest inwards, or None."""
+    """Return the coordinate held at a bound along which the function decreases fastest inwards, or None."""
     inwards = np.where(step >= most, slope, -slope)
     inwards = np.where(held, inwards, -np.inf)
     best = int(np.argmax(inwards))

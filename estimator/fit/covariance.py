@@ -132,10 +132,10 @@ def robust_covariance(
 
 
 def is_unpredictable(at: Quadratic, samples: int) -> bool:
-    """Return whether the motion is so sensitive that its derivatives are meaningless for all but the smallest changes.
+    """Return whether the motion is so sensitive that its derivatives are only valid for the smallest changes.
 
-    Coordinates are of order 1. If a change of one in a million alters a sample by ten times the noise, the simulation
-    diverges; its standard errors would be tiny and meaningless.
+    Coordinates are of order 1. If a change of 1e-6 alters a sample by ten times the noise, the simulation diverges; its
+    standard errors would be tiny and meaningless.
     """
     return bool(np.max(np.diag(at.normal), initial=0.0) > (samples * SENSITIVE**2))
 
@@ -157,7 +157,7 @@ def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: fl
 def _measured(
     at: Quadratic, scatter: Array | None, samples: int, structured: float, prior: Array
 ) -> tuple[Mask, Array, Array, Array]:
-    """Return two covariances from the data alone: for independent errors, and robust ones.
+    """Return two covariances from the data alone: one for independent errors, and a robust one.
 
     The mask that is returned first shows which coordinates they cover: those that influence the residual. Both are
     relative to the scale that is returned next.

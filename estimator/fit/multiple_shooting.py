@@ -152,7 +152,9 @@ class Shooting:
         return self._rows(number, position)
 
     def derivative(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> tuple[Array, Array]:
-        """Return the residual and its derivatives by the shared coordinates, then by the segment's own (rows, all)."""
+        """Return the residual and its derivatives with respect to the shared, then the segment's own coordinates (rows,
+        all).
+        """
         count = len(coordinates.names)
         values = dict(zip(coordinates.names, coordinates.values(shared[:count]).tolist(), strict=True))
         rows, columns = self.derivative_by_values(number, values, shared[count:], own, coordinates.names)
@@ -166,8 +168,8 @@ class Shooting:
     ) -> tuple[Array, Array]:
         """Return the residual at the parameters `values` [SI], and its derivatives (rows, all).
 
-        The derivatives are by the parameters `names`, then by the `offsets` of the zeros, then by the segment's own
-        coordinates.
+        The derivatives are with respect to the parameters `names`, then the `offsets` of the zeros, then the segment's
+        own coordinates.
         """
         segment = self.segments[number]
         physics = self._with_zeros(values, segment, offsets)
@@ -240,7 +242,7 @@ class Shooting:
         return np.stack([(segment.state / self.state_scale).reshape(-1) for segment in self.segments])
 
     def _zeros_of(self, segment: RecordingSegment) -> slice:
-        """Return the places of a segment's encoder zeros among those of all recordings; none if they are known."""
+        """Return the indices of a segment's encoder zeros among those of all recordings; empty if they are known."""
         if not self.zeros:
             return slice(0, 0)
         first = segment.recording * self._model.joints

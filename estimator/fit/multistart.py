@@ -114,7 +114,7 @@ class Search:
         return starts
 
     def _from_guess(self, x: Array, springs: Array) -> Start:
-        """Fit the open-loop motion from a guess, after fitting motion that springs keep close to the measured one."""
+        """Fit the open-loop motion from a guess, after a fit in which springs keep it close to the measured motion."""
         options, rough = self.options, self.rough
         ftol = options.ftol_coarse if self.coarse else options.ftol_start
         tracking = replace(rough, tracking_stiffness=springs).minimise(x, options.ftol_coarse)

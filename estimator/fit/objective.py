@@ -170,7 +170,9 @@ class Objective:
         return total
 
     def _transform(self, x: Array, run: int) -> Array:
-        """Return the derivatives of a run's parameters and initial state by all coordinates (those, coordinates)."""
+        """Return the derivatives of a run's parameters and initial state (rows) with respect to all coordinates
+        (columns).
+        """
         size = self.state_scale.size
         transform = np.zeros((self.count + size, x.size))
         transform[: self.count, : self.count] = self.coordinates.slopes(x[: self.count])

@@ -79,7 +79,7 @@ class Coordinates:
         most[widths] = self.options.max_relative_increase * share
 
     def slopes(self, x: Array) -> Array:
-        """Return the derivatives of the parameters by the coordinates (parameters, parameters) at `x`."""
+        """Return the derivatives of the parameters with respect to the coordinates (parameters, parameters) at `x`."""
         value = self.values(x)
         slope = np.diag(np.where(self._either_sign, self.scales, value - self._floors))
         for share, first, second in self._shares:

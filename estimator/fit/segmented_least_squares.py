@@ -21,8 +21,8 @@ Residual = Callable[[int, Array, Array], Array]
 """Returns the residuals (rows,) of one segment at the shared coordinates (shared,) and its own (own,)."""
 
 Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
-"""Returns the residuals of one segment as `Residual` does, and their derivatives by its shared, then its own
-coordinates (rows, shared + own).
+"""Returns the residuals of one segment as `Residual` does, and their derivatives with respect to the shared, then its
+own coordinates (rows, shared + own).
 """
 
 DEFAULTS = SegmentedMinimiserOptions()
@@ -69,7 +69,7 @@ class Segmented:
     information: Array
     """Information about the shared coordinates, with the segments' own eliminated (shared, shared)."""
     scores: Array
-    """Gradient of each segment by the shared coordinates, with its own eliminated (segments, shared)."""
+    """Gradient of each segment with respect to the shared coordinates, with its own eliminated (segments, shared)."""
     iterations: int
     expected: Expected | None = None
     """The prior's contribution to `information` (shared, shared)."""

@@ -39,8 +39,9 @@ class SimulatedRun:
     max_substeps: int
     """Maximum number of substeps into which a step is divided near standstill."""
     pulled_to: Array | None = None
-    """Readings of the encoders at the angles to which springs pull the arm, held between samples (joints, samples)
-    [rad]. By default springs pull to the angles `measured`, whatever the errors of the encoders.
+    """Encoder readings at the angles to which springs pull the arm, held between samples (joints, samples) [rad].
+
+    By default, springs pull towards `measured`, regardless of encoder errors.
     """
 
     @classmethod
@@ -84,7 +85,7 @@ class SimulatedRun:
         Args:
             physics: physical constants.
             start: state at the first sample (2, joints) [rad, rad/s].
-            names: parameters by which to differentiate, followed by the initial state.
+            names: parameters with respect to which to differentiate, followed by the initial state.
             tracking_stiffness: stiffness of springs that pull the simulated arm to the measured angles (joints,) [N
                 m/rad].
             horizon: fraction of the samples to simulate.

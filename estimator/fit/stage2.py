@@ -263,9 +263,7 @@ def _fit(
     options: LikelihoodOptions,
     ftol: float | None = None,
 ) -> Fit:
-    """Return the fit at `minimum`; if `ftol` is given and reweighted priors move the minimum, at the one found with
-    them.
-    """
+    """Return the fit at `minimum` or, if `ftol` is given and reweighted priors move it, at the new minimum."""
     objective, x, count = refined.weighted, minimum.x, refined.weighted.count
     positions = objective.positions(x)
     errors = _errors(periods, objective, x, positions, options)

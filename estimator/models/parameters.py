@@ -106,7 +106,9 @@ class Physics:
         return times[0], times[1]
 
     def free_inertias(self) -> tuple[float, float]:
-        """Return the inertia of each joint about its own axis while the other moves freely, arm straight [kg m^2]."""
+        """Return the inertia of each joint about its own axis while the other moves freely, with the arm straight [kg
+        m^2].
+        """
         constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))
         outer = constant["inertia_2"] + constant["armature_2"]
         shared = constant["inertia_2"] ** 2 / outer if outer else 0.0

@@ -160,7 +160,7 @@ def _guess(name: str, base: Mapping[str, float], known: Mapping[str, Known], gra
 
 
 def _slope(function: object, x: Array, size: Array) -> Array:
-    """Return derivatives by x / size, by central differences."""
+    """Return derivatives with respect to x / size, by central differences."""
     assert callable(function)
     columns = []
     for i in range(x.size):

@@ -113,7 +113,7 @@ class Term:
     simulated: bool = True
     """Whether it is a constant of the equations of motion, rather than of the drive or of the encoders."""
     spread: Scale | float | None = None
-    """Standard deviation from its `absent` value among typical arms, as a scale or a number [unit]; None if unknown."""
+    """Typical deviation from its `absent` value among real arms, as a scale or a number [unit]; None if unknown."""
     log_spread: float | None = None
     """Standard deviation of a positive term's logarithm from the logarithm of `initial`; None if unknown."""
 

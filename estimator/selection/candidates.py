@@ -1,11 +1,11 @@
 """Missing model terms, judged without fitting them: score tests, and the effect of omission on standard errors.
 
 Near an estimate the motion is linear in small changes of any parameter, including those of terms that the model lacks.
-One simulation with the derivatives by all of them yields the decrease of the sum of squares if a term were added (C. R.
-Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the fitted parameters. Terms
-that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the standard errors even if
-the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3 (1966) 293), with
-their typical size as the prior and the information from the motion in addition.
+One simulation with the derivatives with respect to all of them yields the decrease of the sum of squares if a term were
+added (C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the fitted
+parameters. Terms that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the standard
+errors even if the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3
+(1966) 293), with their typical size as the prior and the information from the motion in addition.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ from hil.estimator.options import IntegrationOptions
 MAX_LAG_SHARE = 0.05  # fraction of the samples over which a residual's autocorrelation is summed
 INTEGRATION = IntegrationOptions()
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
-"""Terms that vanish smoothly, so that including them costs a fit little."""
+"""Terms that vanish smoothly, so that including them adds little cost to a fit."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, fl
 def ranked(
     about: Linearised, fitted: Sequence[str], richer: Mapping[str, Model], known: Mapping[str, float]
 ) -> list[Candidate]:
-    """Return the score tests of the models `richer`, given by the part that each adds to the parameters `fitted`."""
+    """Return the score tests of the models `richer`, keyed by the part that each adds to the parameters `fitted`."""
     new = {part: tuple(n for n in more.names if n not in fitted) for part, more in richer.items()}
     base, _ = about.fall(fitted)
     found = []
@@ -285,7 +285,8 @@ def _sizes(period: SettledPeriod, estimate: Estimate) -> Sizes:
 
 
 def by_parameters(period: SettledPeriod, estimate: Estimate) -> Array:
-    """Return derivatives of the positions of `period` by all causes (joints, samples, causes), over the residual's RMS.
+    """Return the derivatives of positions with respect to all causes (joints, samples, causes), over the residual's
+    RMS.
 
     The causes are the estimate's parameters, followed by the initial state, as in `Linearised`.
     """

@@ -38,7 +38,7 @@ class Distortion:
     """RMS per line for each group of lines, in encoder steps (joints,)."""
 
     noise: Array
-    """Noise per line: from the scatter between periods or the upper half of the lines, whichever is larger."""
+    """Noise per line: from the scatter between periods or the fastest lines, whichever is larger."""
     excited: LineGroup
     """Lines on which some joint was excited."""
     odd: LineGroup | None
@@ -78,7 +78,9 @@ def distortion(period: SettledPeriod, estimate: Estimate) -> Distortion:
     driven = group(excited)
     assert driven is not None  # a torque without any line was rejected before
     scatter = np.zeros(period.joints) if period.position_std is None else period.position_std
-    noise = np.sqrt(2.0 * np.maximum(noise_power(lines), scatter**2 / period.samples)) / step
+    # At low rates the motion reaches into the upper half of the lines.
+    white = np.minimum(noise_power(lines), np.square(period.noise) / period.samples)
+    noise = np.sqrt(2.0 * np.maximum(white, scatter**2 / period.samples)) / step
     return Distortion(
         noise, driven, group(detecting & (order % 2 == 1)), group(detecting & (order % 2 == 0)), group(other)
     )

@@ -2,14 +2,16 @@
 
 A fit of one period, or of the mean of several, is valid for the middle of their time span. Other periods then show
 whether friction was larger or smaller: the difference is nearly linear in one factor per joint, for viscous and dry
-friction, and in the period's initial state.
+friction, and in the period's initial state. It may also come from a constant torque that only acts in one of them; the
+cause that explains more is reported.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hil.estimator.arrays import Array
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.fourier import cut_off, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.objective import Run
@@ -21,6 +23,8 @@ ITERATIONS = 3
 LEAST = 0.005  # minimum relative change of friction that matters
 MOST = 0.3  # maximum relative change of friction in one iteration
 SHARES = (1.0, 0.5, 0.2, 0.05)  # of a step, tried until the prediction improves
+TELLS = 0.5  # part of what a change of friction leaves, below which a constant torque is the better explanation
+NOTICED = 0.01  # constant torque, relative to the joint's RMS torque, below which it does not matter
 UNEVEN = 0.25  # relative part of a change that is not linear in time, or not the same for all friction
 SCALED = ("viscous", "coulomb", "load", "viscous_asymmetry")
 
@@ -35,6 +39,8 @@ class Drift:
     """Standard error of the change (joints,)."""
     seconds: float
     """Time between the middles of the periods that are compared [s]."""
+    left: float = np.inf
+    """Sum of squares of what the change does not explain, in units of the noise."""
 
     @property
     def is_seen(self) -> bool:
@@ -59,10 +65,10 @@ class Drift:
 def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
     """Return the covariance (parameters, parameters) including the effect of friction that changed during `period`.
 
-    The fit assumes constant friction. Where friction changes at the rate of `drift`, other parameters follow the slow
-    change of torque, above all those that also act slowly, such as gravity on an arm that is hardly affected by it. The
-    motion is assumed to follow the instantaneous friction, which holds if transients decay within a small part of the
-    period.
+    The fit assumes constant friction. Where friction changes at the rate of `drift`, other parameters absorb part of
+    this slow change of torque, above all those whose effect is also slow, such as gravity on an arm that it hardly
+    affects. The motion is assumed to follow the instantaneous friction, which holds if transients decay within a small
+    part of the period.
     """
     about = linearised(period, estimate, (), {})
     derivative = by_parameters(period, estimate)
@@ -92,16 +98,54 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
     fixed. A step that does not improve the prediction is shortened. If no simulation from the period's start stays
     finite, nothing is known about a change: its standard error is infinite.
     """
+    change, std, left = _fitted(_Later.of(period, estimate, SCALED), period, MOST)
+    return Drift(change, std, seconds, left)
+
+
+@dataclass(frozen=True)
+class TorqueChange:
+    """Constant torque of each joint that acts in the later periods only."""
+
+    change: Array
+    """Torque (joints,) [N m]."""
+    std: Array
+    """Standard error of the torque (joints,) [N m]."""
+    left: float
+    """As in `Drift`."""
+    noticed: Array
+    """Torque of each joint above which it matters (joints,) [N m]."""
+
+    @property
+    def is_seen(self) -> Mask:
+        """Whether each joint's torque changed significantly and noticeably (joints,)."""
+        seen: Mask = (np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > self.noticed)
+        return seen
+
+    def explains_better_than(self, drift: Drift) -> bool:
+        """Whether a constant torque was seen that explains much more than a change of friction does."""
+        return bool(self.is_seen.any()) and self.left < TELLS * drift.left
+
+
+def torque_change(period: SettledPeriod, estimate: Estimate) -> TorqueChange:
+    """Return the constant torque in `period` that `estimate` lacks, found as in `friction_change`."""
+    size = np.sqrt(np.mean(period.torque**2, axis=1))
+    return TorqueChange(*_fitted(_Later.of(period, estimate, ("offset",)), period, size), NOTICED * size)
+
+
+def _fitted(later: "_Later", period: SettledPeriod, most: float | Array) -> tuple[Array, Array, float]:
+    """Return the change (joints,), its standard error and the sum of squares that it leaves.
+
+    most: largest change in one iteration.
+    """
     joints = period.joints
-    later = _Later.of(period, estimate)
     change, state = np.zeros(joints), _first_state(period)
     A, r = later.linear(change, state)
     if not _is_finite(A, r):
-        return Drift(change, np.full(joints, np.inf), seconds)
+        return change, np.full(joints, np.inf), np.inf
     for _ in range(ITERATIONS):
         step = np.linalg.lstsq(A, r, rcond=None)[0]
         for share in SHARES:
-            further = change + np.clip(share * step[:joints], -MOST, MOST)
+            further = change + np.clip(share * step[:joints], -most, most)
             start = state + share * step[joints:].reshape(2, -1)
             trial = later.linear(further, start)
             if _is_finite(*trial) and trial[1] @ trial[1] <= r @ r:
@@ -114,12 +158,12 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
     std = np.sqrt(
         np.diag(inverse)[:joints] * float(rest @ rest) / max(1, r.size - A.shape[1]) * colour(rest.reshape(joints, -1))
     )
-    return Drift(change, std, seconds)
+    return change, std, float(r @ r)
 
 
 @dataclass(frozen=True)
 class _Later:
-    """The later period as predicted by an estimate; names: the friction parameters that change."""
+    """The later period as predicted by an estimate; names: the parameters that change."""
 
     estimate: Estimate
     run: Run
@@ -127,16 +171,16 @@ class _Later:
     names: tuple[str, ...]
 
     @classmethod
-    def of(cls, period: SettledPeriod, estimate: Estimate) -> "_Later":
-        names = (f"{name}_{joint}" for joint in range(1, period.joints + 1) for name in SCALED)
+    def of(cls, period: SettledPeriod, estimate: Estimate, kinds: Sequence[str]) -> "_Later":
+        names = (f"{name}_{joint}" for joint in range(1, period.joints + 1) for name in kinds)
         weight = np.where(period.valid, 1.0 / period.noise[:, None], 0.0)
         return cls(estimate, simulated_run(period), weight, tuple(name for name in names if name in estimate.names))
 
     def linear(self, change: Array, state: Array) -> tuple[Array, Array]:
         """Return the derivatives (samples of all joints, joints + 2 joints) and the weighted residual (samples of all
-        joints,), with friction changed by `change` (joints,) and from the initial state `state` (2, joints).
+        joints,), with the parameters changed by `change` (joints,) and from the initial state `state` (2, joints).
         """
-        physics = Physics.of(Drift(change, change, 0.0).at_the_later(self.estimate).parameters)
+        physics = Physics.of(self._changed(change))
         columns, residual = [], []
         for part, position, derivative in self.run.pieces(physics, state, self.names):
             columns.append(derivative * self.weight[:, part, None])
@@ -145,9 +189,22 @@ class _Later:
         r = np.concatenate(residual, axis=1).reshape(-1)
         by_factor = np.zeros((*J.shape[:2], change.size))
         for i, name in enumerate(self.names):
-            joint = int(name.rsplit("_", 1)[1]) - 1
-            by_factor[:, :, joint] += J[:, :, i] * self.estimate.parameters[name]
+            by_factor[:, :, _joint_of(name)] += J[:, :, i] * self._scale(name)
         return np.concatenate((by_factor, J[:, :, len(self.names) :]), axis=2).reshape(r.size, -1), r
+
+    def _scale(self, name: str) -> float:
+        """Size of a parameter's change for a change of 1: friction changes by a factor, a torque by N m."""
+        return 1.0 if name.startswith("offset") else self.estimate.parameters[name]
+
+    def _changed(self, change: Array) -> dict[str, float]:
+        parameters = dict(self.estimate.parameters)
+        for name in self.names:
+            parameters[name] += self._scale(name) * float(change[_joint_of(name)])
+        return parameters
+
+
+def _joint_of(name: str) -> int:
+    return int(name.rsplit("_", 1)[1]) - 1
 
 
 def _is_finite(A: Array, r: Array) -> bool:

@@ -60,7 +60,8 @@ def _with_wave(
 ) -> Estimate:
     """Return the best fit of the estimate's model with a wave, from its most likely numbers of cycles.
 
-    A wave is most visible where other terms explain most, even if they only imitate it; they are fitted only for that.
+    A wave is most visible in the residual of a fit that explains most, even if its terms partly imitate the wave; that
+    fit is only used for the search.
     """
     model, joints = estimate.model.having(wave), range(1, estimate.model.joints + 1)
     rich = replace(estimate.model, friction=FRICTIONS[-1]).having("zeros", *SMOOTH)

@@ -13,7 +13,7 @@ from hil.estimator.simulation.encoder import measured, without_errors
 
 
 def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
-    """Predict the positions (joints, samples) [rad] of another settled period by `estimate`.
+    """Predict the positions (joints, samples) [rad] of another settled period from `estimate`.
 
     The simulation starts one period earlier, from the state measured there, and uses nothing but the torque from then
     on: a motion that counts as settled may still contain the end of a transient, which depends on where friction held

@@ -38,7 +38,7 @@ def considered(recordings: Sequence[Recording], estimate: ShootingEstimate) -> S
 
 
 def linearised(recordings: Sequence[Recording], estimate: ShootingEstimate, names: Sequence[str]) -> Linearised:
-    """Return the quadratic approximation of the weighted sum of squares about `estimate`, by parameters and zeros.
+    """Return the quadratic approximation of the weighted sum of squares about `estimate`, in parameters and zeros.
 
     The initial states of the segments are eliminated. names: additional parameters, expanded about the values at which
     they have no effect.

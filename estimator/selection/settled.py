@@ -105,7 +105,7 @@ class Selection:
         self._seconds = seconds
         self._begun: dict[tuple[Model, int, bool], Future[Trial]] = {}
         self.trials: list[Trial] = []
-        """All trials of the periods as they are corrected now, in chronological order."""
+        """All trials with the present correction of the periods, in chronological order."""
 
     @property
     def period(self) -> SettledPeriod:
@@ -186,7 +186,7 @@ class Selection:
         return best
 
     def _closest(self) -> list[Trial]:
-        """Return the trials that explain most, with and without presliding, best first.
+        """Return the trials that explain the most, with and without presliding, best first.
 
         Ripple is most visible where other terms explain most, whether or not they are significant yet; but bristles may
         have absorbed part of it.
@@ -196,10 +196,10 @@ class Selection:
         return sorted(kinds.values(), key=self._left)
 
     def _steadied(self, trial: Trial | None) -> Trial | None:
-        """Correct the periods for a change of friction, if one is seen and the motion is explained as well then.
+        """Correct the periods for a change of friction, if one is found and the motion is then explained as well.
 
-        The change is sought with the recordings as they are, so that a later call, with a better model, replaces or
-        withdraws an earlier correction. Returns the fit of the periods as they are then, or else `trial`.
+        The change is estimated from the uncorrected recordings, so that a later call, with a better model, replaces or
+        withdraws an earlier correction. Returns the fit of the corrected periods, or else `trial`.
         """
         periods, other = self._raw
         if trial is None or trial.estimate is None or other is None or self._seconds is None or len(periods) > 1:
@@ -240,9 +240,9 @@ class Selection:
     def _with_wave(self, best: Trial, plain: Trial | None = None) -> Trial:
         """Add ripple or cogging, whichever explains more, if the score test finds it.
 
-        The score test needs the model that explains most, `best`. A fit from there may end far from the truth: until
-        then, cables, saturation and load have imitated the wave, and only together do they explain about as much. So
-        the wave is first added to `plain`, which has few terms that could, and the others to the result.
+        The score test needs the model that explains most, `best`. A fit that starts from it may end far from the truth,
+        because until then cables, saturation and load together have imitated the wave. Therefore the wave is first
+        added to `plain`, which has few terms that could imitate it, and the others are then added to the result.
         """
         assert best.estimate is not None
         absent = [wave for wave in WAVES if wave not in best.model.options]

@@ -39,7 +39,7 @@ class Trial:
     """RMS error of the free prediction in units of the noise; without a held-out motion, the equivalent criterion."""
     seconds: float
     coarse: bool = False
-    """Whether the fit was stopped early if it left much of the motion unexplained."""
+    """Whether the fit was allowed to stop early if it left much of the motion unexplained."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Fitting:
     held_out: SettledPeriod | None
     starts: Sequence[Mapping[str, float]]
     drift: Drift | None = None
-    """Change of friction from the periods to `held_out`, for which both are corrected."""
+    """Change of friction from the fitted periods to `held_out`; both are corrected for it."""
 
     def trial(self, model: Model, near: Trial | None, values: Mapping[str, float], coarse: bool) -> Trial:
         """Fit `model` from the result of `near`, using `values` for what it lacks, or from scratch.

@@ -29,7 +29,7 @@ from hil.estimator.selection.segments import held_out_errors, missing_terms
 DEFAULTS = SelectionOptions()
 FITTED, PREDICTED = slice(0, None, 2), slice(1, None, 2)
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable")
-"""Terms that vanish smoothly, so that including them costs a fit little."""
+"""Terms that vanish smoothly, so that including them adds little cost to a fit."""
 FINE = ShootingOptions()
 QUICK = ShootingOptions(ftol=1e-3, max_step=FINE.coarse_step, reweightings=1)
 """Options of fits that are only compared with each other."""
@@ -187,7 +187,7 @@ class _Search:
     def judged(self, plain: ShootingEstimate, best: ShootingEstimate) -> SegmentChoice:
         """Return the choice: `best`, or the simplest model if that predicts held-out segments much better.
 
-        If no model explains the motion, predicting better at all is enough.
+        If no model explains the motion, any improvement is enough.
         """
         simple = Model(plain.model.joints, "coulomb", plain.model.drive)
         plainest, chosen = self.trial(plain, simple), self.trial(best, best.model)

@@ -27,7 +27,7 @@ class Levels:
     distortion: Array
     """Motion on the other lines, caused by the arm's nonlinearity."""
     noise: Array
-    """Noise of a sample, from the upper half of the lines."""
+    """Noise of a sample, as measured (`SettledPeriod.noise`)."""
     scatter: Array
     """Noise of a sample of the mean period, from the scatter between periods; 0 if there was only one."""
     model_error: Array
@@ -60,8 +60,8 @@ class Validation:
     relative_std: dict[str, float]
     """Relative standard error of each base parameter except offsets."""
     torque_std: dict[str, float]
-    """Standard error of the torque that each base parameter except offsets contributes, over the joint's torque (RMS,
-    worst joint).
+    """Standard error of the torque that each base parameter except offsets contributes, relative to the joint's torque
+    (RMS, worst joint).
     """
     levels: Levels
 
@@ -126,7 +126,7 @@ def levels(period: SettledPeriod, estimate: Estimate) -> Levels:
     order = np.arange(lines.shape[1])
     excited = excited_lines(period)
     other = ~excited & (order > 0) & (order <= cut_off(lines))
-    noise = noise_power(lines)
+    noise = np.minimum(noise_power(lines), np.square(period.noise) / period.samples)
     step = period.position_step
 
     def rms(chosen: Mask) -> Array:
@@ -138,7 +138,7 @@ def levels(period: SettledPeriod, estimate: Estimate) -> Levels:
     return Levels(
         rms(excited),
         rms(other),
-        np.sqrt(noise * period.samples) / step,
+        period.noise / step,
         scatter,
         np.sqrt(np.maximum(left, 0.0)) / step,
         distortion(period, estimate),

@@ -16,7 +16,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.identify import Estimate
 from hil.estimator.models.terms import OPTIONS, kind_of
 from hil.estimator.selection.candidates import Candidate
-from hil.estimator.selection.drift import LEAST, Drift
+from hil.estimator.selection.drift import LEAST, Drift, TorqueChange
 from hil.estimator.selection.validation import Validation
 
 EXPLAINED = 1.06  # ratio of residual to noise up to which the model explains the motion
@@ -69,6 +69,10 @@ class Evidence:
     """Missing terms, most significant first."""
     drift: Drift | None = None
     """Change of friction while the arm moved."""
+    torque: TorqueChange | None = None
+    """Constant torque in the held-out motion, where that explains it better than a change of friction."""
+    disturbances: tuple[str, ...] = field(default=())
+    """Faults of the recording itself, as sentences; they explain the residual and any change of friction."""
     doubts: tuple[str, ...] = field(default=())
     """Implausible or contradictory values, as sentences."""
     notes: tuple[str, ...] = field(default=())
@@ -85,8 +89,10 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
     trust = _trust(validation, evidence)
     sentences = (
         _noise(validation) if explained else _unexplained(estimate, validation, evidence, trust),
-        *(() if explained else _distorted(validation)),
-        *_drifted(evidence.drift),
+        *(() if explained or evidence.disturbances else _distorted(validation)),
+        *evidence.disturbances,
+        *(() if evidence.disturbances else _drifted(evidence.drift)),
+        *_pushed(evidence.torque),
         *_predicted(evidence.held_out, evidence.held_out_as_fitted),
         *evidence.doubts,
         *evidence.notes,
@@ -99,7 +105,8 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
 
 def _trust(validation: Validation, evidence: Evidence) -> Trust:
     left = float(validation.residual_over_floor.max())
-    doubtful = any(_is_weak(validation, name) for name in validation.relative_std) or bool(evidence.doubts)
+    doubtful = any(_is_weak(validation, name) for name in validation.relative_std)
+    doubtful = doubtful or bool(evidence.doubts or evidence.disturbances)
     if evidence.held_out is None:
         if left > MUCH_LEFT:
             return "no"
@@ -136,6 +143,8 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence,
         f"{subject} {moves}: its residual is {left[joint]:.1f} times the noise, a model error of {error:.2g} encoder "
         "steps RMS."
     )
+    if evidence.disturbances:
+        return said
     return " ".join((said, _suspicion(estimate, evidence), _spoilt(validation, trust)))
 
 
@@ -212,6 +221,22 @@ def _drifted(drift: Drift | None) -> tuple[str, ...]:
     )
 
 
+def _pushed(torque: TorqueChange | None) -> tuple[str, ...]:
+    if torque is None:
+        return ()
+    found = " and ".join(
+        f"{-change:+.2g} N m on joint {joint + 1}"  # the motor has to balance it
+        for joint, (change, seen) in enumerate(zip(torque.change.tolist(), torque.is_seen.tolist(), strict=True))
+        if seen
+    )
+    return (
+        f"A constant torque of {found} acted in the held-out motion but not in the fitted one, which explains the "
+        "difference better than a change of friction: something pushed or pulled the arm, a cable tightened, it "
+        "carried something, or its base tilted. The values are those of the fitted motion; remove the cause and record "
+        "again to validate them.",
+    )
+
+
 def _reason(change: float, seconds: float) -> str:
     """Return the possible cause of a change of friction, as the end of a sentence. While a servo warms up, its friction
     falls; a rise always indicates a fault.
@@ -234,18 +259,24 @@ def _warm_up(seconds: float) -> int:
 def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ...]:
     if held_out is None:
         return ("It was not validated on a held-out motion: set experiment.held_out = true.",)
-    worst = 100.0 * float(held_out.max())
-    said = f"It predicts a held-out motion to within {worst:.2g} % of that motion's RMS"
-    if as_fitted is None:
+    worst = _percent(held_out)
+    said = f"It predicts a held-out motion to within {worst} of that motion's RMS"
+    if as_fitted is None or _percent(as_fitted) == worst:
         return (f"{said}.",)
     return (
         f"{said} with friction as it was by then, one factor per joint taken from that motion itself; with friction as "
-        f"it was in the fitted motion, to within {100.0 * float(as_fitted.max()):.2g} %.",
+        f"it was in the fitted motion, to within {_percent(as_fitted)}.",
     )
 
 
+def _percent(error: Array) -> str:
+    """The largest of some relative errors in percent, never in exponential notation."""
+    worst = 100.0 * float(error.max())
+    return f"{worst:.2g} %" if worst < 99.5 else f"{worst:.0f} %"
+
+
 def improvement_of(name: str, torque_limit: str = "") -> str:
-    """What would determine the parameter `name` better; torque_limit: as in `Evidence`."""
+    """Advice on how to determine the parameter `name` better; torque_limit: as in `Evidence`."""
     return IMPROVEMENT[kind_of(name)].format(
         torque=torque_limit or "peak_torque", own_torque=torque_limit or "its peak_torque"
     )
@@ -283,7 +314,8 @@ def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
     # If the model is incomplete, a reading far from it is not necessarily wrong.
     if not estimate.outliers or not explained:
         return ()
+    one = estimate.outliers == 1
+    counted = "1 sample is an outlier and was" if one else f"{estimate.outliers} samples are outliers and were"
     return (
-        f"{estimate.outliers} samples are outliers and were downweighted: a jolt, backlash, or late or damaged "
-        "readings; the report's residuals show where.",
+        f"{counted} downweighted: a jolt, backlash, or late or damaged readings; the report's residuals show where.",
     )

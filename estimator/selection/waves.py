@@ -14,7 +14,9 @@ from hil.estimator.selection.candidates import columns_of, simulated_run
 
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 COMPARABLE = 0.3
-"""Other numbers of cycles are tried too if they decrease the sum of squares by this fraction of what the best does."""
+"""Other numbers of cycles are tried too if they decrease the sum of squares by at least this fraction of what the best
+one does.
+"""
 
 
 def wave_peaks(
@@ -28,8 +30,8 @@ def wave_peaks(
 
     What the fitted parameters explain is removed first. The result is by parameter name. If the estimate's model
     includes a wave that is sought, that wave is disabled first. While other terms have absorbed part of a wave, the
-    best number
-    may be a wrong one: those that explain at least `COMPARABLE` of what it does are returned as well.
+    best number may be wrong: those that explain at least the fraction `COMPARABLE` of what it explains are returned as
+    well.
 
     only: joints, from 1, that are considered; by default all.
     """

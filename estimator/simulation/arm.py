@@ -10,10 +10,10 @@ The equations are those of `hil.estimator.models.regressor` with a smooth fricti
 
 Here generated v is the back-EMF of a joint driven by voltage (`hil.estimator.simulation.back_emf`), 0 otherwise. In
 addition to friction there is the torque cable_stiffness q - cogging_sin sin(cogging_cycles q) - cogging_cos
-cos(cogging_cycles q). |v| is smoothed as well, to v tanh(v / width). An
-asymmetry of the Coulomb level itself is the offset. With presliding, the term level(v) tanh(v / width) is replaced by
-the bristles of `hil.estimator.simulation.bristles`. `hil.estimator.simulation.sensitivity` differentiates these
-equations and this integration scheme.
+cos(cogging_cycles q). |v| is smoothed as well, to v tanh(v / width). An asymmetry of the Coulomb level itself is
+described by the offset. With presliding, the term level(v) tanh(v / width) is replaced by the bristles of
+`hil.estimator.simulation.bristles`. `hil.estimator.simulation.sensitivity` differentiates these equations and this
+integration scheme.
 
 Each step uses the two-stage Rosenbrock method ROS2 (Verwer, Spee, Blom, Hundsdorfer 1999), which is L-stable for the
 slope of friction, the only part of the Jacobian that is included, and second-order regardless of what the Jacobian
@@ -118,7 +118,9 @@ def bump_at(ratio: float) -> float:
 
 
 def bend_at(v: float, sharp: float) -> tuple[float, float]:
-    """Return tanh(v sharp) and its derivative by v, from one exponential: the library's tanh takes twice as long."""
+    """Return tanh(v sharp) and its derivative with respect to v, from one exponential: the library's takes twice as
+    long.
+    """
     past = 2.0 * abs(v) * sharp
     if not past < FADED:
         return math.copysign(1.0, v), 0.0
@@ -177,7 +179,7 @@ def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float,
     """Return how many of the `left` substeps of length `piece` [s] may be taken at once.
 
     v1, v2: velocities [rad/s]. a1, a2: last accelerations [rad/s^2]. pieces: number of substeps in a step while each
-    joint is near standstill (joints,); a substep is a step divided by the larger one.
+    joint is near standstill (joints,); a substep is a step divided by the larger of them.
     """
     ahead = 2.0 * left * piece
     u1, u2 = v1 + ahead * a1, v2 + ahead * a2

@@ -9,7 +9,7 @@ voltage and a brake b without lag, is
 which is exact for a joint of inertia J: it moves like a joint whose inertia is smaller by b lag', under a command with
 the lag lag'. It is simulated in this way: `Physics.of` subtracts back_emf viscous (lag + delay) from the joint's own
 inertia, 5 to 10 % of it on an XL430. The estimated lag is lag', slightly larger than that of the winding. The effect of
-friction on the motor's current is late by lag' - lag (see `neglected`).
+friction on the motor's current is delayed by lag' - lag (see `neglected`).
 
 Ripple, saturation and load-dependent friction act on the motor's torque, which is that of the voltage minus that of the
 back-EMF (`hil.estimator.simulation.arm`).
@@ -21,11 +21,11 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import CONSTANTS, GENERATED, OWN_INERTIA, VISCOUS, Physics
 
 _LATE: dict[str, tuple[int, ...]] = {"lag": (0, 1), "delay": (0, 1), "lag_difference_2": (1,)}
-"""Joints whose torque each of these parameters delays."""
+"""Joints whose torque is delayed by each of these parameters."""
 
 
 def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the constants by which the simulation must differentiate to yield derivatives by `names`."""
+    """Return the constants whose derivatives the simulation must provide to obtain those with respect to `names`."""
     through = [
         CONSTANTS[place]
         for joint in _generating(physics)
@@ -36,10 +36,10 @@ def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Array:
-    """Return the derivatives (joints, samples, causes) by the parameters `names`, followed by the remaining causes.
+    """Return derivatives (joints, samples, causes) with respect to the parameters `names`, then the remaining causes.
 
-    They are computed from `derivative`, the simulation's derivatives by `causes_of` these names and the same remaining
-    causes. In the simulation viscous friction, back-EMF and the joint's inertia are separate constants.
+    They are computed from `derivative`, the simulation's derivatives with respect to `causes_of` these names and the
+    same remaining causes. In the simulation viscous friction, back-EMF and the joint's inertia are separate constants.
     """
     joints = _generating(physics)
     if not joints:
@@ -68,8 +68,8 @@ def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Arr
 def neglected(physics: Physics) -> dict[str, float]:
     """Return the standard deviations of the joints' own inertias due to what this description neglects [kg m^2].
 
-    Friction affects the motor's current later by lag' - lag, which is of second order in b lag' / J: negligible on most
-    arms, but 5 % of the inertia of an XL430 with hardly any load. The result is by name.
+    The effect of friction on the motor's current is delayed by lag' - lag, which is of second order in b lag' / J:
+    negligible on most arms, but 5 % of the inertia of an XL430 with hardly any load. The result is by name.
     """
     found = {}
     for joint in _generating(physics):

@@ -1,6 +1,7 @@
 """Motor torque from the commanded torque: held, delayed, and averaged over each integration step.
 
-It is compiled because the likelihood needs it for every simulation, of which it would take a third with numpy.
+It is compiled because the likelihood needs it in every simulation; with numpy it would take a third of the simulation's
+time.
 """
 
 import math
@@ -34,7 +35,7 @@ def motor_torque(
 def torque_and_slopes(
     command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float | Array
 ) -> tuple[Array, Array]:
-    """Return `motor_torque` and its derivatives by delay and by each joint's lag (2, joints, samples, steps) [N m/s].
+    """Return `motor_torque` and its derivatives (2, joints, samples, steps) [N m/s] with respect to delay and lag.
 
     If a command changes exactly at the edge of a step and there is no lag, the derivative is that for a smaller delay.
     """
@@ -45,7 +46,7 @@ def torque_and_slopes(
 def _torque(
     command: Array, rate: float, command_to_sample: float, steps: int, delay: float, lag: float | Array
 ) -> tuple[Array, Array, Array]:
-    """Return the mean torque over each step, and its derivatives by delay and lag."""
+    """Return the mean torque over each step, and its derivatives with respect to delay and lag."""
     joints, samples = command.shape
     total = np.zeros((joints, samples + 1))
     np.cumsum(command, axis=1, out=total[:, 1:])
@@ -102,7 +103,7 @@ def _average_loop(
                 gathered = (turns * total[j, samples] + total[j, at]) / rate + held * phases[i]
                 left = (lagging[0, at] - held) * fading[j, i]
                 present = held + left
-                # Without a lag, the torque jumps with the command and has no derivative by the lag here.
+                # Without a lag, the torque jumps with the command and has no derivative with respect to the lag.
                 by_lag = left * phases[i] / (lag * lag) + lagging[1, at] * fading[j, i] if lag > 0.0 else 0.0
                 if i > 0:
                     # lag y' = u - y, integrated over a step: the mean of y is that of u minus what the lag stores.
@@ -114,7 +115,7 @@ def _average_loop(
 
 
 def _follow(command: Any, j: int, rate: float, lag: float, lagging: Any) -> None:
-    """Compute joint j's periodic steady-state lagging torque at the commands, and its derivative by the lag.
+    """Compute joint j's periodic steady-state lagging torque at the commands, and its derivative with respect to lag.
 
     The result is written to `lagging` (2, samples). The torque obeys y[k + 1] = a y[k] + (1 - a) u[k]; the steady state
     follows from its value after one period starting from zero.

@@ -28,7 +28,7 @@ def without_errors(physics: Physics, reading: Array) -> Array:
 
 
 def slopes_without_errors(physics: Physics, position: Array) -> Array:
-    """Return the derivatives of `without_errors` by the joint's encoder errors (joints, samples, errors).
+    """Return the derivatives of `without_errors` with respect to the joint's encoder errors (joints, samples, errors).
 
     position: the resulting angles (joints, samples) [rad].
     """
@@ -37,17 +37,19 @@ def slopes_without_errors(physics: Physics, position: Array) -> Array:
 
 
 def by_motion(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return those of the parameters `names` on which the motion depends if no spring pulls the arm to a reading."""
+    """Return the `names` of parameters on which the motion depends if no spring pulls the arm to a reading."""
     return tuple(name for name in names if kind_of(name) not in ENCODER)
 
 
 def measured_and_slopes(
     physics: Physics, names: tuple[str, ...], moving: tuple[str, ...], position: Array, derivative: Array
 ) -> tuple[Array, Array]:
-    """Return the encoder readings (joints, samples) [rad] and their derivatives by `names`, then by the initial state.
+    """Return the encoder readings (joints, samples) [rad] and their derivatives.
+
+    The derivatives are with respect to `names`, then the initial state.
 
     position: true angles (joints, samples) [rad]. derivative: derivatives of the true angles (joints, samples, causes)
-    by `moving`, those of `names` on which the motion depends, then by the initial state.
+    with respect to `moving`, those of `names` on which the motion depends, then the initial state.
     """
     wanted = [name for name in names if kind_of(name) in ENCODER]
     if not wanted and not physics.encoder.any():
@@ -66,7 +68,7 @@ def measured_and_slopes(
 
 
 def _steepness(physics: Physics, position: Array) -> Array:
-    """Return the derivative of the readings by the true angles (joints, samples)."""
+    """Return the derivative of the readings with respect to the true angles (joints, samples)."""
     sin_1, cos_1, sin_2, cos_2 = np.moveaxis(_waves(position), 2, 0)
     slopes = np.stack((cos_1, -sin_1, 2.0 * cos_2, -2.0 * sin_2), axis=2)
     steepness: Array = 1.0 + np.einsum("jc,jsc->js", physics.encoder[: position.shape[0]], slopes)

@@ -84,7 +84,7 @@ class PreslidingSensitive(Sensitive):
 
 
 def _first_slopes(p: Array, velocity: Array, at: npt.NDArray[np.int64]) -> Array:
-    """Return the derivatives of `first_bend` (2, WIDE) by the causes in the columns `at`."""
+    """Return the derivatives of `first_bend` (2, WIDE) with respect to the causes in the columns `at`."""
     slopes = np.zeros((2, WIDE))
     for joint in np.flatnonzero(p[STIFFNESS : STIFFNESS + 2] > 0.0):
         coulomb, rise, fading, v = p[COULOMB + joint], p[RISE + joint], p[FADING + joint], velocity[joint]

@@ -1,4 +1,4 @@
-"""Forward sensitivities: the simulated motion and its derivatives by parameters and initial state, in one pass.
+"""Forward sensitivities: the simulated motion and its derivatives with respect to parameters and initial state.
 
 The derivative is that of the discrete scheme of `hil.estimator.simulation.arm`, step by step, so it is the exact
 gradient of the objective. With W = M + gamma h S (M mass matrix, S slopes of friction) and primes for quantities at the
@@ -81,7 +81,7 @@ class Sensitive:
 
     physics: physical constants.
     start: angles [rad] and velocities [rad/s] at the first sample (2, joints).
-    causes: names of the quantities by which to differentiate, from CAUSES.
+    causes: names of the quantities with respect to which to differentiate, from CAUSES.
     step: length of an integration step [s].
     max_substeps: maximum number of substeps into which a step is divided when a joint is near standstill.
     tracking_stiffness: stiffness of additional springs that pull the joints to given angles (joints,) [N m/rad].
@@ -125,9 +125,11 @@ class Sensitive:
 
         Args:
             torque: mean motor torque over each step after each sample (joints, samples, steps) [N m].
-            torque_slopes: its derivatives by delay and by each joint's lag (2, joints, samples, steps) [N m/s].
+            torque_slopes: its derivatives with respect to delay and each joint's lag (2, joints, samples, steps)
+                [N m/s].
             tracked: angles to which the springs pull, held between samples (joints, samples) [rad].
-            tracked_slopes: its derivatives by the encoder errors of the same joint (joints, samples, errors).
+            tracked_slopes: its derivatives with respect to the encoder errors of the same joint (joints, samples,
+                errors).
 
         Returns:
             The angles (joints, samples) [rad] and their derivatives (joints, samples, causes).
@@ -227,7 +229,7 @@ def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> Non
         given = scale * eased * shape * dt[cause, joint]
         rows[f + at[DELAY + cause]], rows[s + at[DELAY + cause]] = given * passed, given * loaded * bent
     if joint == 1:
-        # `given` still holds the derivative by the joint's own lag.
+        # `given` still holds the derivative with respect to the joint's own lag.
         rows[f + at[LAG_DIFFERENCE]], rows[s + at[LAG_DIFFERENCE]] = given * passed, given * loaded * bent
     cable = p[CABLE + joint]
     left[stage, joint] = motor + cogging - offset - cable * q - (viscous - per_speed) * v - dry * bend

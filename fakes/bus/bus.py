@@ -315,7 +315,7 @@ class FakeBus:
             self._instructions.receive(packet, now)
 
     def _receive_with_faults(self, packet: Packet, now: float) -> None:
-        """As `_receive`. A fault of one servo makes that servo miss every packet, including those to all servos."""
+        """Act like `_receive`; a fault of one servo makes it miss every packet, including those to all servos."""
         deaf: set[int] = set()
         for fault in self.faults.on_instructions:
             if not self.faults.strikes(fault, packet.id if fault.servo is None else fault.servo, now - self._origin):

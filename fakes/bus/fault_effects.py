@@ -33,7 +33,7 @@ def begin(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], 
                 lowest = servo.memory.get("Min Voltage Limit", 95) / 10
                 servo.dip(servo.input_voltage_v - (lowest - fault.size))
             case FaultKind.STUCK_JOINT:
-                _jam(plant, joint, True)
+                jam(plant, joint, jammed=True)
             case FaultKind.ENCODER_JUMP:
                 servo.present.jump_ticks += round(fault.size)
 
@@ -49,7 +49,7 @@ def end(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], pl
             case FaultKind.LOW_VOLTAGE:
                 servo.dip(0.0)
             case FaultKind.STUCK_JOINT:
-                _jam(plant, joint, False)
+                jam(plant, joint, jammed=False)
             case FaultKind.ENCODER_JUMP:
                 servo.present.jump_ticks -= round(fault.size)
 
@@ -96,7 +96,8 @@ def _flipped(data: bytes, bits: Sequence[int]) -> bytes:
     return bytes(changed)
 
 
-def _jam(plant: Plant, joint: int, jammed: bool) -> None:
+def jam(plant: Plant, joint: int, *, jammed: bool) -> None:
+    """Block a joint or release it; raises PlantError if the plant does not support this."""
     if not isinstance(plant, CanJam):
         raise PlantError(f"{type(plant).__name__} has no jam(joint, jammed): the fault stuck_joint needs it")
     plant.jam(joint, jammed)

@@ -99,11 +99,12 @@ class Hand:
         Raises PlantError if the plant's joints cannot be held, ValueError for an ID that no servo has.
         """
         now = self._time()
-        for move in moves:
-            self._joint_of(move)
-            self._to_come.append(move.model_copy(update={"at": now + move.at}))
+        free = {self._joint_of(move) for move in moves} - self._grips.keys()
         if moves and not isinstance(self._plant, CanBeHeld):
             raise PlantError(f"{type(self._plant).__name__} has no hold(joint, velocity): the hand needs it")
+        for joint in free:
+            self._hold(joint, None)  # a custom plant that cannot be held is refused now, not in the middle of a run
+        self._to_come += [move.model_copy(update={"at": now + move.at}) for move in moves]
         self._to_come.sort(key=lambda move: move.at)
         self._tell()
 

@@ -260,7 +260,7 @@ class Instructions:
         size = 1 + sum(length + 4 for _, _, length in parts)
         if not parts or size > MAX_LENGTH:
             return
-        whole = HEADER + bytes((BROADCAST_ID,)) + size.to_bytes(2, "little") + bytes((Instruction.STATUS,))
+        whole = HEADER + bytes((BROADCAST_ID, size & 0xFF, size >> 8, Instruction.STATUS))
         replies = []
         sent = 0
         for servo_id, address, length in parts:
@@ -268,7 +268,7 @@ class Instructions:
             if servo is None or not servo.has_fast_reads:
                 break
             error, data = self._read(servo, address, length, now)
-            whole += bytes((error | servo.alert, servo_id)) + data.ljust(length, b"\0")
+            whole = b"".join((whole, bytes((error | servo.alert, servo_id)), data.ljust(length, b"\0")))
             whole += crc(whole).to_bytes(2, "little")
             replies.append((servo_id, servo.return_delay_s, whole[sent:]))
             sent = len(whole)

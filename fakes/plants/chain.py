@@ -7,8 +7,8 @@ import numpy as np
 
 from hil.fakes.plants.arm import Drive, armature
 from hil.fakes.plants.chain_arm import ChainArm
-from hil.fakes.plants.chain_kernel import DRIVE, equations, run
-from hil.fakes.plants.motor import JAM, STEP_PER_WIDTH
+from hil.fakes.plants.chain_kernel import ARMATURE, DRIVE, equations, run
+from hil.fakes.plants.motor import JAM, LEAST_GRIP, STEP_PER_WIDTH
 
 LONGEST_STEP = 0.3e-3  # s: with more joints, coupling is stronger; compiled code makes short steps affordable
 
@@ -32,7 +32,7 @@ class SpatialChain:
         self._longest = min(
             [LONGEST_STEP, *(STEP_PER_WIDTH * drive.coulomb_width for drive in arm.drives if drive.coulomb_width)]
         )
-        self._jam = np.zeros(count)
+        self._held = np.zeros((3, count))
         self._state = np.zeros((4, count))
         self._state[0] = arm.start
         n = count
@@ -59,7 +59,13 @@ class SpatialChain:
 
     def jam(self, joint: int, jammed: bool) -> None:
         """Block a joint, or release it."""
-        self._jam[joint] = JAM if jammed else 0.0
+        self._held[0, joint] = JAM if jammed else 0.0
+
+    def hold(self, joint: int, velocity: float | None) -> None:
+        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
+        # Just stiff enough to move a bare rotor within one step.
+        grip = max(2.0 * self._drive[ARMATURE, joint] / self._longest, LEAST_GRIP)
+        self._held[1:, joint] = (0.0, 0.0) if velocity is None else (grip, velocity)
 
     def advance(self, until: float, current: Sequence[float]) -> None:
         remaining = until - self._time
@@ -68,7 +74,7 @@ class SpatialChain:
         self._time = until
         command = np.asarray(current, dtype=np.float64)
         longest = remaining / ceil(remaining / self._longest)
-        run(self._chain, self._drive, self._jam, self._state, command, remaining, longest, self._work, self._room)
+        run(self._chain, self._drive, self._held, self._state, command, remaining, longest, self._work, self._room)
 
     def equations(self, q: Sequence[float], v: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
         """Return the mass matrix and the torques for zero acceleration at a state.

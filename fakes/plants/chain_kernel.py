@@ -200,10 +200,12 @@ def _stick(A: Any, b: Any, dry: Any, x: Any) -> None:
 
 
 def _run_loop(  # noqa: PLR0912
-    chain: Any, drive: Any, jam: Any, state: Any, command: Any, remaining: float, longest: float, work: Any, room: Any
+    chain: Any, drive: Any, held: Any, state: Any, command: Any, remaining: float, longest: float, work: Any, room: Any
 ) -> None:
     """Integrate over `remaining` [s] in steps of at most `longest` [s].
 
+    held (3, joints): friction that jams a joint [N m]; damping between it and the hand that grips it [N m s/rad], 0
+    without a hand; and the hand's velocity [rad/s].
     state (4, joints): angles, velocities, previous accelerations, currents; updated in place.
     """
     q, v, a, amps = state[0], state[1], state[2], state[3]
@@ -214,12 +216,14 @@ def _run_loop(  # noqa: PLR0912
     while remaining > SHORTEST_STEP:
         step = cut if cut > 0.0 else (rest if rest > 0.0 else min(longest, remaining))
         half = 0.5 * step
-        held = False
+        is_jammed = False
         for j in range(n):
-            held = held or jam[j] > 0.0
+            is_jammed = is_jammed or held[0, j] > 0.0
             middle_q[j] = q[j] + half * v[j]
             middle_v[j] = v[j] + half * a[j] if v[j] != 0.0 else 0.0
             _push(drive, j, step, command[j], middle_q[j], middle_v[j], amps, out)
+            out[0, j] += held[1, j] * (held[2, j] - middle_v[j])
+            out[2, j] += held[1, j]
         _equations(chain, middle_q, middle_v, work)
         # (M + D) new = (M - D) v + step (force + slope middle_v) - dry, with D = step / 2 (viscous + slope).
         for i in range(n):
@@ -230,7 +234,7 @@ def _run_loop(  # noqa: PLR0912
                 total += M[i, j] * v[j]
                 A[i, j] = M[i, j]
             b[i] = total
-            dry[i] = step * (out[1, i] + jam[i])
+            dry[i] = step * (out[1, i] + held[0, i])
         for i in range(n):
             A[i, i] = M[i, i] = M[i, i] + half * (drive[VISCOUS, i] + out[2, i])
             slid[i] = b[i] - dry[i] if v[i] > 0.0 else b[i] + dry[i]
@@ -250,7 +254,7 @@ def _run_loop(  # noqa: PLR0912
                 cut = 0.0
             _stick(M, b, dry, new)
         for j in range(n):
-            a[j] = 0.0 if held else (new[j] - v[j]) / step
+            a[j] = 0.0 if is_jammed else (new[j] - v[j]) / step
             v[j] = new[j]
             q[j] = middle_q[j] + half * new[j]
             amps[j] = out[3, j]

@@ -257,7 +257,7 @@ def _shrunk(impulse: float, limit: float) -> float:
 
 @cache
 def _compiled() -> Callable[..., State]:
-    """Return the loop compiled, and from now on call compiled functions from the interpreted one, too."""
+    """Return the compiled loop; from then on, the interpreted one calls compiled functions, too."""
     import numba
 
     inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]

@@ -67,7 +67,7 @@ class Goals:
             mode=mode,
             pwm=value("Goal PWM"),
             pwm_limit=value("PWM Limit"),
-            current=value("Goal Current"),
+            current=max(-value("Current Limit"), min(value("Current Limit"), value("Goal Current"))),
             velocity=value("Goal Velocity"),
             position=value("Goal Position"),
             profile_velocity=value("Profile Velocity"),

@@ -9,7 +9,7 @@ from hil.fakes.servo.registers import EmulatedModel
 
 
 class Powered(ABC):
-    """A servo's supply and temperature. Limit violations stay in Hardware Error Status until a reboot."""
+    """A servo's supply and temperature. Limit violations remain set in Hardware Error Status until a reboot."""
 
     def __init__(self, model: EmulatedModel, memory: Memory, health: Health, input_voltage_v: float) -> None:
         self.model = model
@@ -68,7 +68,7 @@ class Powered(ABC):
         self._derive()
 
     def _check_health(self) -> None:
-        """Compare supply and temperature with their limits; violations stay in Hardware Error Status."""
+        """Compare supply and temperature with their limits; violations remain set in Hardware Error Status."""
         memory = self.memory
         decivolt, celsius = max(0, round(10 * self.supply_v)), max(0, min(255, round(self.temperature_c)))
         memory.set("Present Input Voltage", decivolt)

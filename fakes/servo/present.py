@@ -70,6 +70,7 @@ class Present:
         self._imperfect = noise is not None or senses_supply
         self._booted_at = 0.0
         self._turn_ticks = 0
+        """What the servo adds to its encoder's count [ticks], before reverse mode mirrors the sum."""
         self._shift = 0
         self._reversed = False
         self._moving_threshold = 0
@@ -184,7 +185,8 @@ class Present:
         self._turn_ticks = 0
         self._shift_changed()
         raw = round(self.ticks(position)) - self._homing_ticks()
-        self._turn_ticks = -(raw // TICKS_PER_TURN) * TICKS_PER_TURN
+        turns = -(raw // TICKS_PER_TURN) * TICKS_PER_TURN
+        self._turn_ticks = -turns if self._reversed else turns
         self._shift_changed()
 
     def _homing_ticks(self) -> int:
@@ -193,4 +195,5 @@ class Present:
         return 0 if ignored else offset
 
     def _shift_changed(self) -> None:
-        self._shift = self._turn_ticks + self._homing_ticks()
+        turns = -self._turn_ticks if self._reversed else self._turn_ticks
+        self._shift = turns + self._homing_ticks()

@@ -227,7 +227,9 @@ class EmulatedServo(Powered):
 
     @property
     def goal_current_ticks(self) -> int:
-        return self.memory.value("Goal Current")
+        """Goal Current as the drive obeys it: a goal from before Current Limit was lowered is limited too."""
+        goal, limit = self.memory.get("Goal Current"), self.memory.get("Current Limit")
+        return max(-limit, min(limit, goal))
 
     @property
     def watchdog_tripped(self) -> bool:

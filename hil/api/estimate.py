@@ -115,7 +115,7 @@ def _discard(folder: Path) -> None:
 
 
 def _again(folder: Path) -> Estimation:
-    """Estimate the recordings of an earlier estimate again, with the configuration in its folder, into that folder."""
+    """Repeat an earlier estimate of recordings with the configuration in its folder, and write the result there."""
     record = load_record(folder)
     found = estimate_recordings([Path(file.path) for file in record.files], folder / "config.toml", folder)
     write_recording_report(folder)

@@ -121,9 +121,9 @@ def record(
 def _earlier(config: Config, shown: Path, path: Path) -> Result:
     """The result of an earlier run. Raises ConfigError, ResultError, RunFolderError."""
     if config.is_chain or not config.experiment.pilot:
+        why = "this arm is spatial" if config.is_chain else "this file has none, because it gives peak_torque"
         raise ConfigError(
-            f"{shown}: an earlier run replaces the prior of a pilot, so it needs experiment.pilot = true and a planar "
-            "arm. Without a pilot it has no effect, because peak_torque is given."
+            f"{shown}: an earlier run replaces the prior of a planar arm's pilot (experiment.pilot = true), but {why}."
         )
     return read_result(path)
 

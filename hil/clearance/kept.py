@@ -10,7 +10,7 @@ from hil.description.arm import ArmDescription, ArmFileError
 
 
 def keep_shapes(arm: ArmDescription, folder: Path) -> None:
-    """Write the capsules of `arm` for the copy of its description in `folder`. Raises ArmFileError, OSError."""
+    """Write the capsules of `arm` to `folder`, next to the copy of its description. Raises ArmFileError, OSError."""
     shapes = shapes_of(arm)
     capsules = [[each.link, *each.ends.reshape(-1).tolist(), each.radius] for each in shapes.capsules]
     said = {"names": shapes.names, "guessed": shapes.guessed, "capsules": capsules}

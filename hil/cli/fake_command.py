@@ -18,7 +18,7 @@ def _list_faults(wanted: bool) -> None:
 
 def fake(
     config: Annotated[
-        Path, typer.Argument(metavar="ARM", help="TOML file with a [fake] table, or an arm's name (see below).")
+        Path, typer.Argument(metavar="ARM", help="TOML file with a [fake] table, or an arm's name (see above).")
     ],
     pty: Annotated[bool, typer.Option("--pty", help="Serve it on a pseudo-terminal until Ctrl-C or SIGTERM.")] = False,
     link: Annotated[Path | None, typer.Option(metavar="PATH", help="Symbolic link to that device.")] = None,

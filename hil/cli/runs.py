@@ -69,7 +69,7 @@ def note(
     name: Annotated[str | None, typer.Option("--name", help="Short name, shown by `hil runs`.")] = None,
     text: Annotated[str | None, typer.Option("--text", help="Free text.")] = None,
 ) -> None:
-    """Give a run a name and a note; without options, print them. Example: hil note RUN --text "new gearbox"."""
+    """Give a run a name and a note; without options, print them."""
     from hil.runs.collection import Note, read_note, write_note
 
     kept = read_note(run)
@@ -130,14 +130,12 @@ def _print_difference(difference: "Difference") -> None:
 
 
 def _would_show(detectable: "Mapping[str, float]") -> list[str]:
-    """Say which change of a single friction term two such runs would have revealed [% by name], and for which terms
-    none.
-    """
+    """Describe the smallest change of each friction term alone that two such runs would reveal [%, by name], if any."""
     least = [f"{name} {percent:.2g} %" for name, percent in detectable.items() if percent <= _WHOLE]
     never = [name for name, percent in detectable.items() if percent > _WHOLE]
     lines = []
     if least:
-        known = "Smallest changes of single terms that 95 of 100 such pairs of runs reveal"
+        known = "Smallest changes of single terms that 95 of 100 such pairs of runs would detect"
         lines.append(f"{known}: {', '.join(least)}.")
     if never:
         lines.append(f"Not even a doubling would be detected: {', '.join(never)}.")

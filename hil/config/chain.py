@@ -29,10 +29,21 @@ def described_arm(config: "Config") -> ArmDescription:
     return _read(config.arm.urdf, tuple(joint.name for joint in config.joints), _changed(config.arm.urdf))
 
 
+def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
+    """Warn of described inertias that no mass distribution can have, one sentence each."""
+    return tuple(f"{arm.path.name}: {doubt}." for doubt in arm.doubts)
+
+
 def base_gravity(config: "Config") -> NDArray[np.float64]:
     """Gravity in the base frame (3,) [m/s^2]."""
     down = np.array([0.0, 0.0, -config.arm.gravity])
     turned: NDArray[np.float64] = rotation_of(*config.arm.base).T @ down
+    return turned
+
+
+def base_up(config: "Config") -> NDArray[np.float64]:
+    """The direction opposite to gravity in the base frame (3,)."""
+    turned: NDArray[np.float64] = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, 1.0])
     return turned
 
 
@@ -66,6 +77,8 @@ def chain_slips(config: "Config") -> Iterator[str]:
     if not config.is_chain:
         yield from _planar_slips(config)
         return
+    if config.arm.link_lengths is not None:
+        yield "arm.link_lengths: a spatial arm has its lengths from arm.urdf; remove one of the two"
     fake = None if config.fake is None or config.fake.chain is None else Path(config.fake.chain.urdf)
     if fake is not None and fake.name == Path(config.arm.urdf).name and fake != Path(config.arm.urdf):
         yield (

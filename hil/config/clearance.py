@@ -21,7 +21,7 @@ class BoxConfig(Table):
     name: str = Field(min_length=1, max_length=40)
     centre: Point = Field(description="m")
     size: Annotated[list[Annotated[float, Field(gt=0, le=20)]], Field(min_length=3, max_length=3)] = Field(
-        description="m along its edges"
+        description="m, lengths of its edges"
     )
     turned: Annotated[list[Turned], Field(min_length=3, max_length=3)] = Field(
         [0.0, 0.0, 0.0], description="roll, pitch and yaw, rad"
@@ -31,7 +31,7 @@ class BoxConfig(Table):
 class ClearanceConfig(Table):
     """`[clearance]`: how close a spatial arm may come to itself, the floor and boxes."""
 
-    margin: float = Field(0.01, ge=0, le=0.5, description="m that must stay free along the whole planned motion")
+    margin: float = Field(0.01, ge=0, le=0.5, description="m, minimum clearance along the whole planned motion")
     floor: _Floor = Field(
         0.0, description='height of the table or floor above the base\'s origin, m; "none" if none is in reach'
     )

@@ -67,7 +67,7 @@ class Columns(_Table):
         None, description="encoder ticks in one turn of the joint, for positions in ticks"
     )
     zero: list[Angle] | None = Field(
-        None, description="rad added to each position, so that joint 1 is measured from the horizontal"
+        None, description="rad, added to each position, so that joint 1 is measured from the horizontal"
     )
     position_step: PositiveFloat | None = Field(
         None, le=0.05, description="rad per encoder step; detected from the data if absent"
@@ -77,7 +77,7 @@ class Columns(_Table):
     current: list[Column] | None = Field(None, description="one column per joint, in place of torque")
     current_unit: Literal["A", "mA"] | None = None
     torque_constant: list[Gain] | None = Field(
-        None, description="N m/A per joint at the output shaft, with current; with resistance also for voltage"
+        None, description="N m/A per joint at the output shaft; with current, or with voltage and resistance"
     )
     voltage: list[Column] | None = Field(None, description="motor voltage, one column per joint, in place of torque")
     voltage_unit: Literal["V", "mV"] | None = None
@@ -91,7 +91,9 @@ class Columns(_Table):
         None, description="N m/V per joint at standstill: stall torque over voltage, or torque_constant / resistance"
     )
     between: Literal["held", "linear"] = Field("linear", description="held for a command, linear for a measurement")
-    segment: PositiveFloat = Field(1.0, le=60, description="s per shooting segment, each with an unknown initial state")
+    segment: PositiveFloat = Field(
+        1.0, le=60, description="s, duration of a shooting segment, each with an unknown initial state"
+    )
     zeros_unknown: bool = Field(True, description="estimate each encoder's zero offset")
 
     @property
@@ -194,7 +196,7 @@ def load_recording_config(path: Path) -> RecordingConfig:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}.") from error
+        raise ConfigError(f"{path} cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}.") from error
     return parse_recording_config(text, path)
 
 
@@ -211,7 +213,7 @@ def parse_recording_config(text: str, path: Path) -> RecordingConfig:
 
 
 def _with_urdf_beside(values: dict[str, object], path: Path) -> dict[str, object]:
-    """Return the tables with a relative arm.urdf found from the TOML file's folder."""
+    """Return the tables with a relative arm.urdf resolved relative to the TOML file's folder."""
     arm = values.get("arm")
     if isinstance(arm, dict) and isinstance(arm.get("urdf"), str):
         return {**values, "arm": {**arm, "urdf": str(path.parent / arm["urdf"])}}

@@ -29,9 +29,12 @@ class ExperimentConfig(Table):
     pilot: bool = Field(False, description="find peak_torque with a small pilot run first, then raise it to the limits")
     design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" uses the pilot\'s model')
     ramp: float = Field(1.0, ge=0, le=60, description="s, at start and end")
-    rest: float = Field(0.5, ge=0, le=60, description="s without torque beforehand")
+    rest: float = Field(0.5, ge=0, le=60, description="s, time without torque beforehand")
     warm_up: float = Field(
-        0.0, ge=0, le=3600, description="s of the same motion before the first recorded period, to warm up the friction"
+        0.0,
+        ge=0,
+        le=3600,
+        description="s, duration of the same motion before the first recorded period, to warm up the friction",
     )
     settle_within: PositiveFloat = Field(
         0.01, lt=1, description="RMS difference between periods, relative to the motion's RMS"
@@ -61,7 +64,7 @@ class ExperimentConfig(Table):
         return self
 
     def _meant(self, band: list[float]) -> str:
-        """Name the unit in which a band that is not below a quarter of the rate would make sense."""
+        """Name the unit in which a band that is too high for the rate would make sense."""
         hint = in_other_units(band, "Hz", lambda line: 0.5 / self.period <= line < self.rate / 4)
         return f". {hint}" if hint and band[0] < band[1] else ""
 

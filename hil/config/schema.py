@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from difflib import get_close_matches
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -100,7 +101,7 @@ class ArmConfig(Table):
     rest_pose: list[float] = Field(description="rad: where the undriven arm comes to rest")
     rest_tolerance: PositiveFloat = Field(
         0.5,
-        description="rad of deviation from the rest pose allowed at the start (friction may hold the arm away from it)",
+        description="rad, deviation from the rest pose allowed at the start (friction may hold the arm away from it)",
     )
     link_lengths: list[PositiveFloat] | None = Field(
         None, description="m, from joint to joint and to the tip, for dry runs"
@@ -111,24 +112,26 @@ class ArmConfig(Table):
 class SafetyConfig(Table):
     """`[safety]`: what stops the arm besides the joint limits, and how."""
 
-    watchdog: float = Field(0.08, ge=0.02, le=2.54, description="s without packets after which a servo stops by itself")
+    watchdog: float = Field(
+        0.08, ge=0.02, le=2.54, description="s, time without packets after which a servo stops by itself"
+    )
     allow_no_watchdog: bool = Field(
         False, description="accept firmware without a Bus Watchdog: nothing then stops the servo when packets cease"
     )
     write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
-    missing_time: PositiveFloat = Field(0.015, le=2, description="s for which a servo may fail to reply")
-    late_time: PositiveFloat = Field(0.05, le=2, description="s for which deadlines may be missed")
+    missing_time: PositiveFloat = Field(0.015, le=2, description="s, time for which a servo may fail to reply")
+    late_time: PositiveFloat = Field(0.05, le=2, description="s, time for which deadlines may be missed")
     max_missing: int | None = Field(
         None, ge=1, le=1000, description="consecutive lost replies, instead of missing_time"
     )
     max_late: int | None = Field(None, ge=1, le=1000, description="consecutive missed deadlines, instead of late_time")
-    rest_time: float = Field(3.0, gt=0, le=60, description="s allowed for coming to rest at the end")
-    rest_velocity: PositiveFloat = Field(0.1, le=2, description="rad/s below which a joint counts as at rest")
+    rest_time: float = Field(3.0, gt=0, le=60, description="s, time allowed for coming to rest at the end")
+    rest_velocity: PositiveFloat = Field(0.1, le=2, description="rad/s, speed below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, le=1e4, description="A/s (V/s in PWM mode): maximum rate of change of goals")
     max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C inside a servo")
     min_voltage: float = Field(0.0, ge=0, le=60, description="V; default: the models' factory shutdown thresholds")
     max_voltage: PositiveFloat = Field(30.0, le=60, description="V")
-    follow_time: PositiveFloat = Field(0.05, le=5, description="s for which a current may deviate from its goal")
+    follow_time: PositiveFloat = Field(0.05, le=5, description="s, time for which a current may deviate from its goal")
     follow_share: PositiveFloat = Field(
         0.3, le=1, description="fraction of the planned peak by which a current may deviate for longer"
     )
@@ -138,7 +141,7 @@ class SafetyConfig(Table):
     stop: Literal["damp", "cut"] = Field("damp", description='"damp" brakes, where possible, before torque is cut')
     damp_time: float = Field(0.06, ge=0, le=2, description="s, maximum braking time")
     lower_speed: PositiveFloat = Field(
-        0.6, le=5, description="rad/s at which a stop lowers a spatial arm to its rest pose"
+        0.6, le=5, description="rad/s, speed at which a stop lowers a spatial arm to its rest pose"
     )
     lower_time: PositiveFloat = Field(
         10.0, le=60, description="s: longest duration of that lowering; on longer paths the arm moves faster"
@@ -294,9 +297,9 @@ class Config(Table):
         return self.port.url.startswith(FAKE_URL)
 
 
-def load_config(path: Path) -> Config:
+def load_config(path: str | PathLike[str]) -> Config:
     """Read and check a TOML file, or the bundled one of that bare name. Raises ConfigError."""
-    path = find_config(path)
+    path = find_config(Path(path))
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -305,7 +308,7 @@ def load_config(path: Path) -> Config:
             within = next(iter(sorted(path.glob("*.toml"))), None)
             reason = "it is a folder" + ("" if within is None else f"; did you mean {within}?")
         end = "" if reason.endswith("?") else f".{meant(path)}"
-        raise ConfigError(f"{path}: cannot be read: {reason}{end}") from error
+        raise ConfigError(f"{path} cannot be read: {reason}{end}") from error
     return parse_config(text, path)
 
 

@@ -1,6 +1,7 @@
 """A serial arm as described by a file: joints in space and the rigid bodies between them."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,8 @@ class ArmJoint:
     """The link merged with everything that is rigidly attached to it."""
     fixed: tuple[str, ...]
     """Names of the links attached to this joint's link by fixed or held joints."""
+    movable: Mapping[str, Body] = field(default_factory=dict)
+    """Those of them that held joints move, each without what is attached to it, in the frame of this joint's link."""
 
 
 @dataclass(frozen=True)

@@ -125,7 +125,7 @@ class _Tree:
     def branch(self, names: list[str]) -> list[int]:
         """The bodies that these joints move. Raises ArmFileError unless they lie on one branch, in this order."""
         if not names:
-            raise ArmFileError(f"{self.path}: has no hinge, so there is no arm")
+            raise ArmFileError(f"{self.path} has no hinge, so there is no arm")
         moved = [self._moved(name) for name in names]
         self._check_equalities(names)
         way = self._way(moved[-1])
@@ -149,7 +149,7 @@ class _Tree:
         found = [j for j in range(self.model.njnt) if self.model.joint(j).name == name]
         if not found:
             raise ArmFileError(
-                f'{self.path}: has no joint "{name}"; the rotating joints are {", ".join(self.hinges) or "none"}'
+                f'{self.path} has no joint "{name}"; the rotating joints are {", ".join(self.hinges) or "none"}'
             )
         kind = int(self.model.jnt_type[found[0]])
         if kind != HINGE:

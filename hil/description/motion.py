@@ -1,11 +1,11 @@
-"""Where a described arm is, and which way each joint moves it, in terms that a person can compare."""
+"""Where a described arm is, and which way each joint moves it, in terms that a person can compare with the real arm."""
 
 import numpy as np
 
 from hil.description.arm import ArmDescription, Array
 
-DIRECTIONS = (("forwards (+x)", "backwards (-x)"), ("to the left (+y)", "to the right (-y)"), ("up (+z)", "down (-z)"))
-"""For the base's x, y and z axes: names of the positive and the negative direction."""
+UPRIGHT = (0.0, 0.0, 1.0)
+"""The direction opposite to gravity, in the frame of a base that stands upright."""
 LEAST_LEVER = 0.01  # m: an end closer to an axis than this has no direction of motion
 
 
@@ -23,18 +23,35 @@ def axis_of(arm: ArmDescription, angles: Array, joint: int) -> tuple[Array, Arra
     return place, direction
 
 
-def moves(arm: ArmDescription, angles: Array, joint: int) -> str:
-    """In words: which way the positive angle of a joint moves the arm's end, or turns it."""
+def moves(arm: ArmDescription, angles: Array, joint: int, up: Array | tuple[float, float, float] = UPRIGHT) -> str:
+    """In words: which way the positive angle of a joint moves the arm's end, or turns it.
+
+    up: the direction opposite to gravity in the base's frame (3,).
+    """
     place, direction = axis_of(arm, angles, joint)
-    velocity = np.cross(direction, end_point(arm, angles) - place)
+    velocity, up = np.cross(direction, end_point(arm, angles) - place), np.asarray(up)
     if float(np.linalg.norm(velocity)) < LEAST_LEVER:
-        return f"turns the end about its own axis, {_towards(direction)}, counter-clockwise as seen from that side"
-    return f"moves the end {_towards(velocity)}"
+        return f"turns the end about its own axis, {_towards(direction, up)}, counter-clockwise as seen from that side"
+    return f"moves the end {_towards(velocity, up)}"
 
 
-def _towards(vector: Array) -> str:
+def _towards(vector: Array, up: Array) -> str:
+    """Name the base's axis that is nearest to a vector, and the direction of this axis for someone beside the arm.
+
+    They look along the base's x axis or, where that is vertical (a base on a wall), along its z axis.
+    """
+    upwards = int(np.argmax(np.abs(up)))
+    forwards = 0 if upwards != 0 else 2
+    left = np.cross(up, np.eye(3)[forwards])
     main = int(np.argmax(np.abs(vector)))
-    return DIRECTIONS[main][0 if vector[main] > 0.0 else 1]
+    sign = 1.0 if vector[main] > 0.0 else -1.0
+    if main == upwards:
+        word = "up" if sign * up[main] > 0.0 else "down"
+    elif main == forwards:
+        word = "forwards" if sign > 0.0 else "backwards"
+    else:
+        word = "to the left" if sign * left[main] > 0.0 else "to the right"
+    return f"{word} ({'+' if sign > 0.0 else '-'}{'xyz'[main]})"
 
 
 def _frames(arm: ArmDescription, angles: Array) -> list[tuple[Array, Array]]:

@@ -5,7 +5,7 @@ Format: wiki.ros.org/urdf/XML. Only geometry and inertias are read; meshes are n
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,13 +49,12 @@ def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
     chosen = {joint.name for joint in branch if joint.name in names}
     arm, held = [], []
     rotation, translation = np.eye(3), np.zeros(3)
-    on_branch = {joint.name for joint in branch}
     for joint in branch:
         translation = translation + rotation @ joint.translation
         rotation = rotation @ joint.rotation
         if joint.name not in chosen:
             continue
-        body, fixed, stiff = _rigid(joint.child, bodies, tree, chosen, on_branch)
+        body, fixed, stiff, movable = _rigid(joint.child, bodies, tree, chosen)
         held += stiff
         if not body.mass > 0.0:
             raise ArmFileError(
@@ -63,7 +62,10 @@ def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
                 "<inertial> with a rough mass [kg], centre and inertia; they are only a starting point"
             )
         arm.append(
-            ArmJoint(joint.name, joint.child, rotation, translation, joint.axis, joint.limits, body, tuple(fixed))
+            ArmJoint(
+                *(joint.name, joint.child, rotation, translation, joint.axis, joint.limits, body, tuple(fixed)),
+                movable=movable,
+            )
         )
         rotation, translation = np.eye(3), np.zeros(3)
     check_units(arm, path)
@@ -80,18 +82,18 @@ def parse_urdf(path: Path) -> ET.Element:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ArmFileError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+        raise ArmFileError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ArmFileError(f"{path}: contains a document type or entities, which a URDF does not need: remove them")
+        raise ArmFileError(f"{path} contains a document type or entities, which a URDF does not need: remove them")
     try:
         root = ET.fromstring(text, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     except ET.ParseError as error:
-        raise ArmFileError(f"{path}: is not XML: {error}") from error
+        raise ArmFileError(f"{path} is not XML: {error}") from error
     if root.tag != "robot":
         raise ArmFileError(f"{path}: its root is <{root.tag}>, not <robot>: it is not a URDF")
     if "<xacro:" in text:
         raise ArmFileError(
-            f"{path}: contains xacro macros: expand them into another file first, xacro {path.name} > "
+            f"{path} contains xacro macros: expand them into another file first, xacro {path.name} > "
             f"{path.stem}_expanded.urdf, and name that file"
         )
     return root
@@ -105,7 +107,7 @@ def _links(root: ET.Element, path: Path) -> tuple[dict[str, Body], dict[str, boo
             raise ArmFileError(f'{path}: two links are named "{name}"')
         bodies[name] = _body(element.find("inertial"), f'link "{name}"', path)
     if not bodies:
-        raise ArmFileError(f"{path}: has no links")
+        raise ArmFileError(f"{path} has no links")
     return bodies, {name: body.mass == 0.0 or body.is_physical for name, body in bodies.items()}
 
 
@@ -124,6 +126,8 @@ def _body(element: ET.Element | None, where: str, path: Path) -> Body:
             ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), strict=True
         ):
             inertia[row, column] = inertia[column, row] = _number(given, key, where, path, 0.0)
+            if row == column and inertia[row, row] < 0.0:
+                raise ArmFileError(f"{path}: {where}: its {key} is {inertia[row, row]:g} kg m^2; it cannot be negative")
     return Body(kilograms, np.zeros(3), inertia).moved(rotation, translation)
 
 
@@ -215,7 +219,7 @@ def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) ->
     for name in names:
         if name not in tree:
             turning = [joint.name for joint in tree.values() if joint.kind in TURNING]
-            raise ArmFileError(f'{path}: has no joint "{name}"; the rotating joints are {", ".join(turning) or "none"}')
+            raise ArmFileError(f'{path} has no joint "{name}"; the rotating joints are {", ".join(turning) or "none"}')
         joint = tree[name]
         if joint.kind not in TURNING:
             raise ArmFileError(f'{path}: joint "{name}" is {joint.kind}: only rotating joints can be identified')
@@ -254,20 +258,35 @@ def _way_to(tree: dict[str, _Joint], base: str, name: str, path: Path) -> list[_
 
 
 def _rigid(
-    link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: set[str], on_branch: set[str]
-) -> tuple[Body, list[str], list[str]]:
-    """Merge a link with everything attached to it; also return the names of merged links and of held joints."""
+    link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: set[str]
+) -> tuple[Body, list[str], list[str], dict[str, Body]]:
+    """Merge a link with everything attached to it.
+
+    Also returned: the names of merged links and of held joints, and the own bodies of the links that these move.
+    """
     body, fixed, held = bodies[link], [], []
+    movable: dict[str, Body] = {}
     for joint in tree.values():
         if joint.parent != link or joint.name in chosen:
             continue
+        part, names, more, within = _rigid(joint.child, bodies, tree, chosen)
         if joint.kind != "fixed":
             held.append(joint.name)
-        part, names, more = _rigid(joint.child, bodies, tree, chosen, on_branch)
+            within = dict(_own(joint.child, bodies, tree, chosen))
         body = body.joined(part.moved(joint.rotation, joint.translation))
         fixed += [joint.child, *names]
         held += more
-    return body, fixed, held
+        movable |= {name: each.moved(joint.rotation, joint.translation) for name, each in within.items()}
+    return body, fixed, held, movable
+
+
+def _own(link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: set[str]) -> Iterator[tuple[str, Body]]:
+    """Yield a link and all links attached to it by any joint, each with its own body in the first one's frame."""
+    yield link, bodies[link]
+    for joint in tree.values():
+        if joint.parent == link and joint.name not in chosen:
+            for name, body in _own(joint.child, bodies, tree, chosen):
+                yield name, body.moved(joint.rotation, joint.translation)
 
 
 def check_units(arm: Sequence[ArmJoint], path: Path) -> None:

@@ -33,9 +33,9 @@ RAN_AWAY = 1e3
 class ChainPrediction:
     """Prediction of a spatial arm's experiment.
 
-    peaks: as for a planar arm. nearest: least clearance of all arms, at `moment` [s] of the segment `role`. rooms: each
-    arm's least clearance minus the required one (arms,) [m]. tracking: median of the arms' largest tracking errors
-    (joints,) [rad]. ways: number of samples of the transition at either end of the first segment.
+    peaks: predicted peaks and their limits. nearest: least clearance of all arms, `moment` [s] into the segment `role`.
+    rooms: least clearance of each arm minus the required one (arms,) [m]. tracking: median of the arms' largest
+    tracking errors (joints,) [rad]. ways: number of samples of the transition at either end of the first segment.
     """
 
     peaks: Prediction

@@ -11,6 +11,7 @@ from hil.config.schema import Config, PriorConfig
 from hil.drivers.servo_model import Mode
 from hil.drivers.servo_prior import servo_prior
 from hil.estimator.chain.model.dynamics import TERMS
+from hil.estimator.chain.model.late_torque import MOST_LOST
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.plan.chain_model import KnownChain
 
@@ -41,6 +42,9 @@ def prior_arms(config: Config, known: KnownChain, count: int, seed: int = 0) -> 
     drive[:, 4] = _log_normal(random, np.ones(n), scale, count)
     drive[:, 5] = _log_normal(random, *friction["lag"], count)
     rotors = _log_normal(random, *friction["armature"], count)
+    # The back-EMF of voltage-driven joints lags too, so that they move like lighter ones.
+    lost = friction["generated"][0] * drive[:, 0] * drive[:, 5]
+    rotors = rotors - np.minimum(lost, MOST_LOST * rotors)
     every = np.concatenate((links, rotors[:, :, None]), axis=2).reshape(count, -1)
     return ChainArms(known.base, np.asarray(every @ known.base.grouping.T), drive)
 
@@ -66,7 +70,7 @@ def _links(random: np.random.Generator, described: Array, count: int, spread: fl
 
 
 def _drives(config: Config, given: PriorConfig) -> dict[str, tuple[Array, Array]]:
-    """Medians and relative spreads of friction, lag and armature.
+    """Medians and relative spreads of friction, lag, armature, and the fraction of viscous friction due to back-EMF.
 
     Friction and armature are multiplied by the number of servos on the joint.
     """
@@ -74,7 +78,7 @@ def _drives(config: Config, given: PriorConfig) -> dict[str, tuple[Array, Array]
     servos = np.array([len(joint.ids) for joint in config.joints], dtype=np.float64)
     emf = np.array([joint.joint.servo.torque_per_ampere.value / GEAR_EFFICIENCY for joint in config.joints])
     per_volt = np.array([j.torque_per_goal if j.drive_mode is Mode.PWM else 0.0 for j in config.joints])
-    found = {}
+    found: dict[str, tuple[Array, Array]] = {}
     for name in ("viscous", "coulomb", "armature", "lag"):
         value, spread = np.array([(getattr(p, name).median, getattr(p, name).spread) for p in priors]).T
         times = np.ones_like(servos) if name == "lag" else servos
@@ -82,6 +86,8 @@ def _drives(config: Config, given: PriorConfig) -> dict[str, tuple[Array, Array]
         more = servos * emf * per_volt if name == "viscous" else np.zeros_like(value)
         spread = np.hypot(spread * value, GENERATED_SPREAD * more) / (value + more)
         value = value + more
+        if name == "viscous":
+            found["generated"] = more / value, np.zeros_like(more)
         told = getattr(given, name, None)
         if told is not None:
             value, spread = np.array(told), np.full(len(priors), given.spread)

@@ -78,10 +78,10 @@ class ChainStops:
             )
         if down.lies < LAID_DOWN:
             return (
-                f"only {100 * down.lies:.0f} % of the simulated stops bring the arm to the rest pose, of at least "
-                f"{100 * LAID_DOWN:.0f} % required: {down.joint!r} ends up to {down.away:.2g} rad away. Raise its "
-                f"{down.limit}, {down.slower}, choose a rest_pose in which gravity pulls it less or farther from "
-                "its limits, or give the masses more accurately"
+                f"only {100 * down.lies:.0f} % of the simulated stops bring the arm to the rest pose, but at least "
+                f"{100 * LAID_DOWN:.0f} % must: {down.joint!r} ends up to {down.away:.2g} rad away. Raise its "
+                f"{down.limit}, {down.slower}, choose a rest_pose in which gravity pulls it less or farther from its "
+                "limits, or give the masses more accurately"
             )
         return ""
 
@@ -134,7 +134,7 @@ def _dropped(space: Space, first: Array, before: Array, last: Array, rate: float
 
 
 def _slower(config: Config, longest: float) -> str:
-    """Say how to make a lowering slower whose path takes at most `longest` [s]."""
+    """Return how to slow down a lowering whose path takes at most `longest` [s]."""
     return "raise safety.lower_time" if longest >= config.safety.lower_time else "lower safety.lower_speed"
 
 

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from hil.config.chain import described_arm, doubted_inertias
 from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction
 from hil.dry_run.chain_stop import LAID_DOWN, ChainStops
@@ -22,7 +23,8 @@ class ChainDryRun:
 
     config: with the path and stabiliser that would be used. share: fraction of the designed path's amplitude; 1 if
     [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of links with parts
-    that touch by design and are not checked.
+    that touch by design and are not checked. refused: why the pilot has no safe first step; "" if it has one, None
+    without a pilot, whose decision counts.
     """
 
     config: Config
@@ -34,6 +36,7 @@ class ChainDryRun:
     shapes_guessed: tuple[str, ...]
     as_built: tuple[tuple[str, str], ...]
     servos: tuple[str, ...]
+    refused: str | None = None
 
     @property
     def prediction(self) -> Prediction:
@@ -50,7 +53,11 @@ class ChainDryRun:
         return not self.why_not(config)
 
     def why_not(self, config: Config) -> str:
-        """Explain why the motion, or a stop of it, is not safe; "" if both are."""
+        """Explain why the motion, or a stop of it, is not safe; "" if both are safe."""
+        return self.doubt(config) if self.refused is None else self.refused
+
+    def doubt(self, config: Config) -> str:
+        """Explain which of the simulated arms would not move or stop safely; "" if all would."""
         return unsafe(config, self.foreseen) or ("" if config.safety.stop == "cut" else self.stops.unsafe)
 
 
@@ -153,15 +160,18 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
     ]
     if run.shapes_guessed:
         lines.append(
-            f"No collision geometry could be read for {', '.join(run.shapes_guessed)}: replaced by capsules from joint "
-            "to joint (a base is left out)."
+            f"No collision geometry could be read for {', '.join(run.shapes_guessed)}: these links are replaced by "
+            "capsules from joint to joint (a base link is left out)."
         )
     if run.as_built:
         pairs = ", ".join(f"{a} and {b}" for a, b in run.as_built)
         lines.append(
-            "Parts of these links that touch in nearly every pose, by design, are not checked; the other parts "
-            f"of them are: {pairs}."
+            "Parts of these links touch by design in nearly every pose and are not checked; their other parts are: "
+            f"{pairs}."
         )
+    lines += [f"Warning: {warning}" for warning in doubted_inertias(described_arm(run.config))]
     if run.share < 1.0:
-        lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which this shows.")
+        lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which is shown here.")
+    if run.refused == "" and (doubt := run.doubt(run.config)):
+        lines.append(f"hil identify decides with fewer of these arms. With all {run.arms} arms, not safe: {doubt}.")
     return [*lines, f"NOT SAFE: {why}." if why else "SAFE. Not tested on hardware."]

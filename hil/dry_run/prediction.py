@@ -27,7 +27,8 @@ Array = NDArray[np.float64]
 QUANTITIES = ("lowest position", "highest position", "velocity", "current", "torque", "power")
 UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")
 GUARDED = 3
-"""Number of quantities, from the first, at whose limits the guard stops; current is clamped, the others follow from it.
+"""The guard stops at the limits of this many quantities, counted from the first; current is clamped, the others follow
+from it.
 """
 
 QUANTILE = 0.99

@@ -9,7 +9,6 @@ from hil.config.schema import Config
 from hil.errors import ConfigError
 from hil.estimation.chain_calibrate import calibrate_chain_runs, link_of
 from hil.estimation.model_from_config import voltage_driven, wanted_model
-from hil.estimation.result import QUANTISATION_FLOOR_TICKS
 from hil.estimation.settled_period import settled_period
 from hil.estimator.calibration import Calibration, KnownMass, calibrate
 from hil.estimator.chain.calibration import ChainCalibration, MassOnLink
@@ -90,15 +89,14 @@ def calibrate_runs(without: RunFolder, with_mass: RunFolder, added: AddedMass) -
     if config.is_chain:
         if added.at is None or added.distance is not None or added.length is not None:
             raise ConfigError(
-                "a spatial arm: give the position of the mass in its link's frame, --at X Y Z in metres (and --joint "
-                "NAME "
-                "if it is not on the last link), instead of --distance and --length."
+                "for a spatial arm, give the position of the mass in its link's frame, --at X Y Z in metres (and "
+                "--joint NAME if it is not on the last link), instead of --distance and --length."
             )
         mass = MassOnLink(added.mass, added.at, link_of(config, added.joint), added.inertia)
         return _described_chain(config, calibrate_chain_runs((without, with_mass), (config, other), mass))
     if added.distance is None or added.at is not None or added.joint is not None:
         raise ConfigError(
-            "a planar arm: give --distance (from the last joint to the mass) instead of --at and --joint."
+            "for a planar arm, give --distance (from the last joint to the mass) instead of --at and --joint."
         )
     length = added.length
     if length is None and config.known is not None and config.known.length_1 is not None:
@@ -152,7 +150,7 @@ def _described_chain(config: Config, found: ChainCalibration) -> CalibrationResu
         },
         fit=CalibrationFit(
             residual_rms_ticks=tuple(map(tuple, steps.tolist())),
-            misfit=float(np.mean((steps / QUANTISATION_FLOOR_TICKS) ** 2)),
+            misfit=float(np.mean((steps / found.estimate.noise_steps) ** 2)),
             joints=len(config.joints),
             reached=found.estimate.reached,
         ),

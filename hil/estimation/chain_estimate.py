@@ -7,17 +7,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config.chain import described_arm
+from hil.config.chain import described_arm, doubted_inertias
 from hil.config.schema import Config
 from hil.errors import RecordingCutShort
 from hil.estimation.model_from_config import voltage_driven
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
+from hil.estimation.result_checks import describe_chain_choice
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
+from hil.estimation.slips.position_jumps import jump_disturbances
 from hil.estimation.truth import back_emf
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import SYSTEMATIC, ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.model.tilt import TILT, tilt_between
 from hil.estimator.chain.simulation.prediction import predict
 from hil.fakes.plants.arm import armature
@@ -30,7 +33,8 @@ from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFacts, RunFolder
 from hil.runs.timing import timing
 
-EXPLAINED = 1.2  # ratio of residual to encoder rounding up to which the model counts as complete
+EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
+NOISY = 1.05  # ratio of noise to encoder rounding above which the noise is mentioned
 PREDICTED = 0.01  # held-out prediction error relative to the motion, up to which the model is trusted
 WRONG = 0.05  # the same, beyond which the model is rejected
 UNMOVED = 0.03  # range of motion [rad] below which a joint shows neither friction nor inertia
@@ -43,8 +47,11 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     known = known_chain(config)
     model = wanted_chain_model(config, known)
     period = settled_period(config, facts, samples, IDENTIFY)
-    fit = choose_chain if config.model.friction == "auto" else identify_chain
-    estimate = fit(period, model, known.prior)
+    if config.model.friction == "auto":
+        choice = choose_chain(period, model, known.prior)
+        estimate = choice.estimate
+    else:
+        choice, estimate = None, identify_chain(period, model, known.prior)
     model = estimate.model
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
     if HELD_OUT in facts.segments:
@@ -53,7 +60,6 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
             predicted = predict(model, estimate.parameters, other)
             played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
-    over_floor = estimate.residual_steps / QUANTISATION_FLOOR_TICKS
     seconds = round(time.perf_counter() - started, 3)
     linear = len(model.linear_names)
     result = SettledResult(
@@ -75,10 +81,18 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
         ),
         validation=Validation(
             held_out_rms=None if held_out is None else tuple(map(float, held_out)),
-            residual_over_floor=tuple(over_floor.tolist()),
+            residual_over_floor=tuple(estimate.over_noise.tolist()),
         ),
-        verdict=_verdict(config, estimate, known, held_out, unmoved(config, period.position)),
-        warnings=tuple(warnings_of(config, facts, samples, period)),
+        verdict=_verdict(
+            config,
+            estimate,
+            known,
+            held_out,
+            unmoved(config, period.position),
+            jump_disturbances(config, facts, samples),
+        ),
+        model_choice=None if choice is None else describe_chain_choice(choice),
+        warnings=(*warnings_of(config, facts, samples, period), *doubted_inertias(described_arm(config))),
         timing=RunTiming.of(timing(samples, config.experiment.rate), seconds),
         arm=arm_facts(config),
         chain=_facts(config, estimate, known),
@@ -163,17 +177,14 @@ def _verdict(
     known: KnownChain,
     held_out: NDArray[np.float64] | None,
     still: list[str],
+    disturbances: tuple[str, ...] = (),
 ) -> Verdict:
     """Decide whether the result can be trusted, name the least well identified base parameter, and give the reasons."""
     count = known.base.count
     certain = estimate.std[:count] / known.prior.std
     weakest = known.base.names[int(np.argmax(certain))]
-    over = estimate.residual_steps / QUANTISATION_FLOOR_TICKS
-    worst = config.joints[int(np.argmax(over))].name
-    sentences = [
-        f"The residual of {worst} is the largest: {over.max():.2f} times encoder rounding; "
-        + _remains(estimate, float(over.max()))
-    ]
+    over = estimate.over_noise
+    sentences = [_unexplained(config, estimate)]
     trust = "yes" if over.max() <= EXPLAINED and estimate.systematic <= SYSTEMATIC else "with care"
     if held_out is None:
         sentences.append("No second path was recorded, so the prediction could not be validated.")
@@ -183,6 +194,9 @@ def _verdict(
         joint = config.joints[int(np.argmax(held_out))].name
         sentences.append(f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst.")
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
+    if disturbances:
+        trust = "with care" if trust == "yes" else trust
+        sentences += disturbances
     if still:
         trust = "no"
         sentences.append(
@@ -195,6 +209,9 @@ def _verdict(
             f"The recording hardly determines {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
             "wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
         )
+    if said := vague(known.prior, known.base.names, estimate.std, estimate.from_prior):
+        trust = "with care" if trust == "yes" else trust
+        sentences.append(said)
     if not estimate.reached:
         trust = "with care" if trust == "yes" else trust
         sentences.append(
@@ -209,16 +226,42 @@ def _verdict(
     return Verdict(trust, weakest, tuple(sentences))
 
 
-def _remains(estimate: ChainEstimate, over: float) -> str:
-    """What the residual, relative to encoder rounding, says about the model."""
-    if over <= EXPLAINED and estimate.systematic <= SYSTEMATIC:
-        return "nothing remains unexplained."
-    causes = "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time"
-    if estimate.model.friction != "stribeck_load":
-        causes = f'load-dependent friction ([model] friction = "auto" tries that), {causes}'
-    if over > EXPLAINED:
-        return f"the model is incomplete. Possible causes: {causes}."
+def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_prior: tuple[str, ...]) -> str:
+    """Name base parameters, besides `from_prior`, with standard errors larger than the prior's; empty if none."""
+    found = [name for name in prior.surpassing(names, std) if name not in from_prior]
+    if not found:
+        return ""
     return (
-        f"but part of it repeats with the motion, which increases the standard errors {estimate.systematic:.1f} times, "
-        f"and some values may be wrong by more than these say. A small effect is missing from the model: {causes}."
+        f"The standard errors of {', '.join(found)} are larger than the uncertainty that the URDF's values are assumed "
+        "to have: errors of the model, or a fit that stopped short, outweigh what the recording says about them."
+    )
+
+
+def _unexplained(config: Config, estimate: ChainEstimate) -> str:
+    """How large the residual is compared with the noise, and what that says about the model."""
+    over, joint = float(estimate.over_noise.max()), int(np.argmax(estimate.over_noise))
+    noise = float(estimate.noise_steps[joint])
+    measured = (
+        f"the noise of its angle ({noise:.2g} encoder steps RMS; rounding alone is 0.29)"
+        if noise > NOISY * QUANTISATION_FLOOR_TICKS
+        else "encoder rounding"
+    )
+    said = f"The residual of {config.joints[joint].name} is the largest: {over:.2f} times {measured};"
+    if over <= EXPLAINED and estimate.systematic <= SYSTEMATIC:
+        return f"{said} nothing remains unexplained."
+    causes = "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time"
+    if not estimate.model.base_tilt and np.any(estimate.model.base.chain.gravity):
+        causes = f"a base that is not level ([model] base_tilt = true identifies it), {causes}"
+    tried = ""
+    if estimate.model.friction != "stribeck_load":
+        if config.model.friction == "auto":
+            tried = " Friction that depends on the load was tried and does not explain it."
+        else:
+            causes = f'load-dependent friction ([model] friction = "auto" tries that), {causes}'
+    if over > EXPLAINED:
+        return f"{said} the model is incomplete.{tried} Possible causes: {causes}."
+    return (
+        f"{said} but part of it repeats with the motion, which increases the standard errors by a factor of "
+        f"{estimate.systematic:.1f}, and some values may be wrong by more than these indicate. A small effect is "
+        f"missing from the model: {causes}.{tried}"
     )

@@ -1,4 +1,4 @@
-"""What limited the torque that a pilot found: advice to raise peak_torque would not help then."""
+"""The limit that determined the torque of a pilot: advice to raise peak_torque would not help then."""
 
 import numpy as np
 from numpy.typing import NDArray

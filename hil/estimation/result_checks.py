@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.estimator.chain.choice import ChainChoice
 from hil.estimator.selection import distortion, trial, unsettled, validation, verdict
 from hil.results.parts import (
     Confounded,
@@ -83,6 +84,24 @@ def describe_segment_choice(choice: unsettled.SegmentChoice) -> ModelChoice:
         chosen=choice.chosen.model.description,
         error_divided_by=choice.gained,
         tried=tuple(_tried(trial) for trial in choice.trials),
+    )
+
+
+def describe_chain_choice(choice: ChainChoice) -> ModelChoice:
+    """Convert the choice among models of a spatial arm, judged on the fitted motion, one step ahead."""
+    return ModelChoice(
+        chosen=choice.estimate.model.description,
+        error_divided_by=choice.gained,
+        tried=tuple(
+            TriedModel(
+                model=each.model.description,
+                parameters=len(each.model.names),
+                held_out_rms=None,
+                score=each.error if np.isfinite(each.error) else None,
+                seconds=round(each.seconds, 3),
+            )
+            for each in choice.trials
+        ),
     )
 
 

@@ -19,6 +19,7 @@ from hil.estimation.result import Checks, make_result
 from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
+from hil.estimation.slips.position_jumps import jump_disturbances
 from hil.estimation.slips.rest_shift import rest_shift_warnings
 from hil.estimation.supply import supply_notes, supply_sag
 from hil.estimator.data.relative_error import relative_error
@@ -26,7 +27,7 @@ from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate
 from hil.estimator.models.parameters import Physics
 from hil.estimator.selection.candidates import candidates, considered
-from hil.estimator.selection.drift import Drift, drifting, friction_change
+from hil.estimator.selection.drift import Drift, TorqueChange, drifting, friction_change, torque_change
 from hil.estimator.selection.given import fit_given
 from hil.estimator.selection.other_period import predict_period
 from hil.estimator.selection.settled import choose
@@ -70,10 +71,14 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     left_out = candidates(period, estimate, {})
     estimate = replace(estimate, covariance=_with_neglected(considered(period, estimate), estimate))
     drift = None if other is None or between is None else friction_change(other, estimate, between)
+    jumps = jump_disturbances(config, facts, samples)
+    torque = _torque_instead(other, estimate, drift)
+    if jumps or torque is not None:
+        drift = None  # what changed was not friction
     if drift is not None:
         left = drift.after_correction() if is_corrected else drift
         estimate = replace(estimate, covariance=drifting(period, estimate, left))
-    if other is not None and drift is not None:
+    if other is not None:
         played[HELD_OUT] = _predicted(estimate, other, drift, is_corrected)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     as_fitted = _as_fitted(estimate, other, drift)
@@ -81,7 +86,18 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     wrong = doubts(config, estimate, float(np.abs(period.torque).max()))
     notes = supply_notes(config, supply_sag(config, samples))
     limit = torque_limit(config, samples)
-    evidence = Evidence(held_out, as_fitted, left_out, drift, wrong, notes, choice is not None, limit)
+    evidence = Evidence(
+        held_out,
+        as_fitted,
+        left_out,
+        drift,
+        torque,
+        jumps,
+        wrong,
+        notes,
+        tried_all=choice is not None,
+        torque_limit=limit,
+    )
     judged = judge(estimate, validation, evidence)
     checks = Checks(
         describe_validation(validation, held_out, as_fitted),
@@ -121,10 +137,20 @@ def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tup
         ]
 
 
-def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift, is_corrected: bool) -> PlayedPeriod:
+def _torque_instead(other: SettledPeriod | None, estimate: Estimate, drift: Drift | None) -> TorqueChange | None:
+    """The constant torque in the held-out period that explains it better than a change of friction; None if none."""
+    if other is None or drift is None or not drift.is_seen:
+        return None
+    torque = torque_change(other, estimate)
+    return torque if torque.explains_better_than(drift) else None
+
+
+def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift | None, is_corrected: bool) -> PlayedPeriod:
     """Predict the held-out period with the friction at that time. is_corrected: correct it for friction that changes
     within the period, as the fitted one was.
     """
+    if drift is None:
+        return PlayedPeriod(other.rate, other.torque, other.position, predict_period(estimate, other))
     later = drift.at_the_later(estimate) if drift.is_seen else estimate
     predicted = predict_period(later, steadied(other, later, drift) if is_corrected else other)
     return PlayedPeriod(other.rate, other.torque, other.position, predicted)

@@ -10,6 +10,7 @@ from hil.errors import RecordingCutShort
 from hil.estimation.lateness import acting_torque, lateness, velocity_of
 from hil.estimation.supply import supply_sag, torque_factor
 from hil.estimator.data.periodicity import settling_difference
+from hil.estimator.data.repeated_noise import repeated_noise
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.simulation.closed_loop import Stabilised
 from hil.plan.stabiliser import feedback_of, feedback_torque
@@ -41,7 +42,8 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
     if first is None or whole - first < experiment.periods:
         wanted = experiment.periods + 1
         raise RecordingCutShort(
-            f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole periods"
+            f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole "
+            + ("period" if whole == 1 else "periods")
             + (
                 f": it ended too early. {wanted} periods, {wanted * count} samples, are needed. Record again."
                 if whole < wanted
@@ -67,7 +69,21 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
         before=_state_at(samples, int(np.flatnonzero(chosen)[begin - count]), experiment.rate),
     )
     on_time = angle - velocity_of(period) * _by_period(late[None], count)
-    return replace(period, position=_mean_of_periods(on_time), position_std=scatter(on_time))
+    return replace(
+        period,
+        position=_mean_of_periods(on_time),
+        position_std=scatter(on_time),
+        repeated_noise=repeated_noise(_passes(position, first, on_time), period.position_step, experiment.periods),
+    )
+
+
+def _passes(position: NDArray[np.float64], first: int, on_time: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Second halves of the settled periods `on_time` (periods, joints, samples), and of the period before.
+
+    In its first half, the period before may still hold a transient.
+    """
+    half = on_time.shape[2] // 2
+    return position[first - 1, :, half:], *on_time[:, :, half:]
 
 
 def _mean_of_periods(position: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -122,7 +138,7 @@ def scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
     seen = np.isfinite(position).sum(axis=0)
     mean = np.nansum(position, axis=0) / np.maximum(seen, 1)
     squares = np.nansum((position - mean) ** 2, axis=0)
-    # Samples that are there in one period only, or in none, tell nothing about the scatter.
+    # Samples received in only one period, or in none, say nothing about the scatter.
     several = seen > 1
     variance = np.where(several, squares / np.maximum(seen - 1, 1), 0.0).sum(axis=1)
     std: NDArray[np.float64] = np.sqrt(variance / np.maximum(several.sum(axis=1), 1) / count)

@@ -54,9 +54,9 @@ class ChainWatch:
         mean, covariance = observed_parameters(arms)
         n = len(self._constants)
         # A light joint's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
-        largest = np.maximum(self._constants * np.array(planned), _FRICTIONS * mean[len(mean) - 2 * n : len(mean) - n])
+        largest = self._constants * np.array(planned)
         interval = 1.0 / config.experiment.rate if interval is None else interval
-        self._observer = ChainObserver(arms.base, mean, covariance, largest, interval)
+        self._observer = ChainObserver(arms.base, mean, covariance, largest, interval, _FRICTIONS)
         self._names = [joint.joint.title for joint in config.joints]
         self._rest = np.array(config.arm.rest_pose)
         self._was_below, self._was_above = np.zeros((2, n), dtype=np.bool_)

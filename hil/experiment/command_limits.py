@@ -4,7 +4,6 @@ finite.
 
 from collections.abc import Sequence
 from math import inf
-from typing import NoReturn
 
 from hil.config.schema import Config
 from hil.errors import Cause, SafetyStop
@@ -22,22 +21,24 @@ class CommandLimits:
     def clamp(self, goals: Sequence[float]) -> list[float]:
         """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""
         slew = self._slew
-        clamped = []
-        for index, (goal, former, limit) in enumerate(zip(goals, self._former, self._limits, strict=True)):
-            if not abs(goal) < inf:
-                self._not_a_number(index, goal)
-            wanted = limit if goal > limit else -limit if goal < -limit else goal
-            change = wanted - former
-            clamped.append(former + slew if change > slew else former - slew if change < -slew else wanted)
-        self._former = clamped
-        return clamped
+        joints = zip(goals, self._former, self._limits, self._names, strict=True)
+        self._former = [
+            goal
+            if -limit <= goal <= limit and -slew <= goal - former <= slew
+            else self._limited(goal, former, limit, name)
+            for goal, former, limit, name in joints
+        ]
+        return self._former
 
     def holding(self, goals: Sequence[float]) -> None:
         """The goals that the servos have now [A or V]: `clamp` continues from these."""
         self._former = list(goals)
 
-    def _not_a_number(self, index: int, goal: float) -> NoReturn:
-        raise SafetyStop(
-            f"{self._names[index]} would have received a goal current of {goal}, which is not a number.",
-            Cause.NOT_A_NUMBER,
-        )
+    def _limited(self, goal: float, former: float, limit: float, name: str) -> float:
+        if not abs(goal) < inf:
+            raise SafetyStop(
+                f"{name} would have received a goal current of {goal}, which is not a number.", Cause.NOT_A_NUMBER
+            )
+        wanted = limit if goal > limit else -limit if goal < -limit else goal
+        change, slew = wanted - former, self._slew
+        return former + slew if change > slew else former - slew if change < -slew else wanted

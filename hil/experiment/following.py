@@ -31,7 +31,7 @@ SIGMA_SHARE = 0.1
 """Standard deviation of ordinary sensor and current-loop errors, relative to the planned peak."""
 
 SIGMA_TICKS = 4.0
-"""That standard deviation in register ticks, if this is larger than that of SIGMA_SHARE."""
+"""Lower bound of that standard deviation, in register ticks."""
 
 LOST_AFTER_S = 0.03
 """Time for which a current must look like zero, at full weight, before it is taken for zero [s]."""

@@ -7,7 +7,7 @@ commands or replies (`deadlines` and `silence`); `command_limits` clamps what is
 """
 
 from collections.abc import Sequence
-from math import isnan
+from math import copysign, isnan
 from typing import NoReturn
 
 import numpy as np
@@ -91,7 +91,7 @@ class Guard:
         self._commands.holding(goals)
 
     def woke_up(self, now: float, late: float) -> None:
-        """Record that this program woke up at `now` [s], `late` [s] after it wanted to (negative: earlier)."""
+        """Record that this program woke up at `now` [s], `late` [s] after the intended time (negative: earlier)."""
         self._silence.woke_up(now, late)
 
     def late(self, seconds: float = 0.0) -> None:
@@ -237,12 +237,21 @@ class Guard:
         )
 
     def _not_followed(self, index: int, state: State) -> NoReturn:
+        carried, commanded, joint = state.current[index], state.goal_current[index], self._joints[index]
+        away = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
+        is_driven = away > abs(commanded) + joint["following"]["allowed"] or away < -joint["following"]["allowed"]
+        if is_driven:
+            causes = "It has torque, but another: another program commands it, or its current sensor is wrong."
+        else:
+            causes = (
+                "Its torque is off, it was rebooted, its watchdog acted, or it cannot deliver this much at its speed "
+                "and supply voltage (safety.follow_share)."
+            )
         self._stop(
             index,
             Cause.NOT_FOLLOWING,
-            f"carries {state.current[index]:.3f} instead of the commanded {state.goal_current[index]:.3f}, for "
-            f"{1e3 * self._joints[index]['found']:.0f} ms. Its torque is off, it was rebooted, its watchdog acted, or "
-            "it cannot deliver this much at its speed and supply voltage (safety.follow_share).",
+            f"carries {carried:.3f} instead of the commanded {commanded:.3f}, for {1e3 * joint['found']:.0f} ms. "
+            f"{causes}",
         )
 
     def _not_together(self, index: int, servo: int, turned: float) -> NoReturn:

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 from hil.drivers.state import State
-from hil.estimator.compiled import compiled
+from hil.estimator.compiled import compiled, only_version
 from hil.experiment import consistency, following, work
 
 FINE = -1
@@ -77,6 +77,7 @@ class JointChecks:
         for joint in joints:
             consistency.begin(joint["consistency"])
         _look(joints, self._sample, 0, 0, 0.0, 0.0, interval, 0.0, 0)  # compile
+        self._check = only_version(_look)
 
     def look(self, state: State, unsure: float) -> int:
         """Check all joints, none of which missed this reply or the one before; return FINE or CHECKS * joint + check.
@@ -85,13 +86,14 @@ class JointChecks:
         """
         self._pack(self._bytes, 0, *state.position, *state.velocity, *state.goal_current, *state.current)
         before, after = state.time_before_write, state.time_after_read
-        return _look(self.joints, self._sample, 0, self._count, before, after, self.interval, unsure, 0)
+        return int(self._check(self.joints, self._sample, 0, self._count, before, after, self.interval, unsure, 0))
 
     def look_at(self, joint: int, state: State, unsure: float, missed: int) -> int:
         """Check one joint whose last `missed` replies were missing; return as `look` does."""
         self._pack(self._bytes, 0, *state.position, *state.velocity, *state.goal_current, *state.current)
         before, after = state.time_before_write, state.time_after_read
-        return _look(self.joints, self._sample, joint, joint + 1, before, after, self.interval, unsure, missed)
+        only = joint, joint + 1
+        return int(self._check(self.joints, self._sample, *only, before, after, self.interval, unsure, missed))
 
 
 def _may_be_outside(joint: Any, position: float) -> bool:

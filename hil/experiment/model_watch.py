@@ -20,7 +20,7 @@ from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble, prior_ensemble
 from hil.errors import Cause, SafetyStop
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled
+from hil.estimator.compiled import compiled, only_version
 from hil.estimator.models.momentum_observer import NAMES, MomentumObserver
 from hil.estimator.models.parameters import CONSTANTS
 
@@ -42,7 +42,7 @@ _INERTIA = 0.3
 """Standard deviations for an arm without a description, as multiples of the planned torque in SI units.
 
 If a small first torque moves an arm by a tenth of a radian, the arm's gravity torque is ten times as large. But the arm
-does move, which it would not if viscous friction or inertia were several times the planned torque.
+does move, which it would not if viscous friction or inertia were several times as large as the planned torque.
 """
 _FLAT = 0.3
 """Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the same units."""
@@ -66,7 +66,7 @@ _USUAL_S = 1.0
 _GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which changes of velocity are not judged."""
 _WINDOW_S = 0.3
-"""Time over which a message about a stationary joint gives the range of its torque [s]: a single value may be near
+"""Time span over which a message about a stationary joint gives the range of its torque [s]: a single value may be near
 zero.
 """
 
@@ -101,13 +101,15 @@ class Jolts:
         self._velocity = np.zeros(count)
         self._pack = Struct(f"{count}d").pack_into
         self._bytes = memoryview(self._velocity.data).cast("B")
+        self._jolting: Callable[..., int] = _jolting
         self.look([0.0] * count, 0.0, 0.0)  # compile
+        self._jolting = only_version(_jolting)
         self.forget()
 
     def look(self, velocity: Sequence[float], seconds: float, now: float) -> tuple[int, float] | None:
         """Process velocities [rad/s], `seconds` after the previous ones [s]; return the joint and change of a jolt."""
         self._pack(self._bytes, 0, *velocity)
-        joint = _jolting(self._joints, self._former, self._velocity, seconds, now, self._least)
+        joint = self._jolting(self._joints, self._former, self._velocity, seconds, now, self._least)
         return None if joint < 0 else (joint, float(self._joints["change"][joint]))
 
     def forget(self) -> None:
@@ -165,8 +167,7 @@ class ModelWatch:
         interval = 1.0 / config.experiment.rate if interval is None else interval
         # A pilot's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         is_described = arms is not None or config.arm.link_lengths is not None
-        dry = [_FRICTIONS * is_described * mean[f"coulomb_{number}"] for number in range(1, len(largest) + 1)]
-        self._observer = MomentumObserver(mean, covariance, np.maximum(largest, dry), interval)
+        self._observer = MomentumObserver(mean, covariance, largest, interval, _FRICTIONS * is_described)
         self._names = [joint.joint.title for joint in config.joints]
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0

@@ -1,12 +1,12 @@
 """Comparison of successive periods sample by sample, which avoids a burst of work at the end of a period.
 
-The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated during the period:
-at its end only a few divisions remain. The previous period is kept in one buffer, which the latest one overwrites.
+The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated during the period, so that
+only a few divisions remain at its end. The previous period is kept in one buffer, which the latest one overwrites.
 
 The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same
 sample of the previous period. If they differ by more than `TIMES` the RMS difference between the two previous periods,
 plus `FLOOR_RAD`, for `LASTING_S`, the joint does not repeat its motion (`unlike`). In the second half of the second
-period, it is the RMS difference in its first half, since transients only decay.
+period, the RMS difference in its first half is used instead, since transients only decay.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.estimator.compiled import compiled
+from hil.estimator.compiled import compiled, only_version
 
 _EMPTY = float("nan")
 
@@ -40,7 +40,7 @@ _SUMS = np.dtype(
 
 lowest, highest: range of its positions [rad]. first: first one compared, which is subtracted from the others to avoid
 cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of squares
-and number of changes from the period before. early_squared, early_pairs: of those in the first half of the period.
+and number of changes from the period before. early_squared, early_pairs: the same for the first half of the period.
 """
 
 
@@ -60,6 +60,7 @@ class Repetition:
         self._bytes = memoryview(self._latest.data).cast("B")
         self.begin(samples)
         _add(self._former, self._sums, self._allowed, self._unlike_for, self._latest, 0, False, True)  # compile
+        self._compare = only_version(_add)
 
     def begin(self, samples: int, *, anew: bool = False) -> None:
         """Start a new period of `samples` samples. anew: whether its torque differs from the previous period's.
@@ -79,7 +80,7 @@ class Repetition:
         """Add sample `index` of the period: positions of all joints [rad], NaN where missing."""
         self._pack(self._bytes, 0, *position)
         compared = index >= self._half
-        joint = _add(
+        joint = self._compare(
             self._former, self._sums, self._allowed, self._unlike_for, self._latest, index, compared, self._anew
         )
         self.unlike = joint if self._unlike_for[joint] >= self._lasting else None

@@ -106,7 +106,7 @@ def run_experiment(
 
 @contextmanager
 def _with_torque(torque: str) -> Iterator[None]:
-    """Add whether torque is off to a recording that cannot be closed, and to a stop requested while it was cut."""
+    """Append the torque state to an error while the recording is closed, and to a stop request during cut-off."""
     try:
         yield
     except (RunFolderError, StopRequested) as error:
@@ -162,7 +162,7 @@ def _try_again(bus: ServoBus, note: Note) -> None:
 
 
 def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
-    """If no servo was heard: which ones answered when torque was cut, since a silent servo hides those after it."""
+    """If no servo was heard, return which ones answered when torque was cut: a silent servo hides those after it."""
     report = bus.torque_off_report
     if not isinstance(stop, SafetyStop) or stop.cause is not Cause.MISSING or report is None:
         return ""
@@ -195,7 +195,7 @@ def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException) 
     if isinstance(stop, SafetyStop) and stop.cause in EXPLAINED:
         changed = changed_settings(before, settings_now(bus))
         if changed:
-            stop.args = (f"{changed} What was seen: {stop}",)
+            stop.args = (f"{changed} Symptom: {stop}",)
 
 
 @contextmanager
@@ -251,7 +251,7 @@ def _wait_for_rest(bus: ServoBus) -> str:
             return ""
         if clock.now() >= end:
             return (
-                f"{bus.joints[away.index(max(away))]} still moves after {_LONGEST_REST_S:.0f} s without torque: "
+                f"{bus.joints[away.index(max(away))]} is still moving after {_LONGEST_REST_S:.0f} s without torque: "
                 f"{max(away):.3f} rad in {_REST_EVERY_S:g} s. Bring the arm to rest, then start again."
             )
         former = latest
@@ -265,7 +265,7 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
     if has_moved():
         _check_inside(config, bus)
     tolerance = config.rest_tolerance * (_MOVED if has_moved() else 1.0)
-    or_there = " If the arm lies there without torque, set arm.rest_pose." if config.is_chain else ""
+    or_there = " If that is where the arm lies without torque, set arm.rest_pose to it." if config.is_chain else ""
     for joint, position, rest in zip(bus.joints, bus.read_positions(), config.arm.rest_pose, strict=True):
         if abs(position - rest) > tolerance:
             ticks = joint.zero_ticks + round((position - rest) / joint.position_unit)

@@ -6,15 +6,15 @@ come counts as silence.
 
 A busy computer also delays what it has received: the kernel passes on the bytes of a serial port in a separate thread,
 which has to wait for a core like any other program, for 4 to 10 ms at a time. So while this program itself wakes up
-late, silence of all servos may be the computer's, and is limited as missed deadlines are, too. If some servos are heard
-and one is not, the silence is that servo's.
+late, silence of all servos may be due to the computer, and is limited as missed deadlines are, too. If some servos are
+heard and one is not, the silence is that servo's.
 """
 
 from hil.config.schema import Config
 from hil.plan.silence import Limit, is_missing_too_long, late_limit, missing_limit
 
 LATE_WAKE_UP_S = 1e-3
-"""Lateness of this program that shows a busy computer [s]; an idle one stays below a third of it."""
+"""Lateness of this program that indicates a busy computer [s]; an idle one stays below a third of it."""
 
 BUSY_S = 2.0
 """How long a computer counts as busy after this program was late [s]."""
@@ -49,14 +49,14 @@ class Silence:
         return self._asked_at is not None and self._asked_at < self._busy_until
 
     def woke_up(self, now: float, late: float) -> None:
-        """Record that this program woke up at `now` [s], `late` [s] after it wanted to."""
+        """Record that this program woke up at `now` [s], `late` [s] after the intended time."""
         if late >= LATE_WAKE_UP_S:
             self._busy_until = now + BUSY_S
 
     def ask(self, now: float) -> None:
         """Begin an exchange at `now` [s]."""
         since = 0.0 if self._asked_at is None else now - self._asked_at
-        self._turn = min(since, self._longest_turn)
+        self._turn = since if since < self._longest_turn else self._longest_turn
         self._asked_at = now
 
     def heard(self, joint: int, now: float) -> None:
@@ -71,7 +71,8 @@ class Silence:
         self._last_heard = [now] * len(self.counts)
 
     def missed(self, joint: int, now: float, *, refused: bool = False, alone: bool = True) -> str | None:
-        """Record a missing reply to the exchange that began at `now` [s]; return what was too long, or None.
+        """Record a missing reply to the exchange that began at `now` [s]; return a description of a silence that is too
+        long, or None.
 
         refused: the servo answered, with an error instead of its state; one such answer is enough. alone: another servo
         was heard.

@@ -39,6 +39,9 @@ from hil.setup.servo_session import has_moved
 
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
+_BY_OTHER_GOALS = {Cause.NOT_FOLLOWING, Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY}
+"""Causes of a stop that another program's goals may have."""
+
 _FORGETS = 0.98
 """Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
 
@@ -130,13 +133,19 @@ class Stream:
         try:
             self._play_all()
         except ExperimentError as error:
-            if isinstance(error, SafetyStop) and error.cause is Cause.MISSING and (heard := self._bus.heard_instead):
+            if isinstance(error, SafetyStop) and (heard := self._told_by_the_bus(error.cause)):
                 error.add_note(heard)
             if self._lowering is not None and may_lower(self._config, error):
                 self._lower(self._lowering, error)
             elif may_brake(self._config, error):
                 self._brake()
             raise
+
+    def _told_by_the_bus(self, cause: Cause) -> str:
+        """What the bus knows about the cause of a stop; "" for nothing."""
+        if cause is Cause.MISSING:
+            return self._bus.heard_instead
+        return self._bus.commanded_by_another if cause in _BY_OTHER_GOALS else ""
 
     def _play_all(self) -> None:
         self._rest()
@@ -354,9 +363,13 @@ class Stream:
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
 
     def _lower(self, lowering: Lowering, error: ExperimentError) -> None:
-        """Brake and lower the arm until it lies, anything is wrong, or a second signal comes. Never raises."""
+        """Brake and lower the arm until it is at rest, a check fails, or a second signal arrives. Never raises."""
         state = self._state
         if state is None or any(state.missing) or any(state.error) or lowering.lies(state):
+            return
+        since = 0.0 if self._sent_at is None else self._clock.now() - self._sent_at
+        if since >= self._safety.watchdog:
+            self._told(error, "The arm could not be lowered: the servos' watchdogs had already acted, so it fell.")
             return
         self._note(f"lowering the arm after: {error}")
         try:

@@ -15,7 +15,7 @@ import numpy as np
 __all__ = ["MEMORY", "TOLERANCE_RAD", "begin", "look"]
 
 TOLERANCE_RAD = 0.04
-"""Work taken out of the arm, divided by the joint's largest planned torque, above which the joint's sign is called
+"""Work taken out of the arm, divided by the joint's largest planned torque, above which the joint's sign is considered
 wrong [rad].
 
 A healthy motor returns some because of delays: a heavy arm at 20 Hz up to 0.02 rad.

@@ -11,8 +11,8 @@ def add_actuators(root: ET.Element, model: ArmModel | ChainArmModel) -> None:
     """Add actuators controlled by a goal [A, or V in pwm mode]: gain gives torque, bias the offset, filter the drive's
     lag. Each has its joint's name.
 
-    A cable is the joint's own spring; one that pushes the joint away from its angle, which a joint cannot have, is
-    part of the bias.
+    A cable is exported as the joint's own stiffness. A negative stiffness, which a joint cannot have, is part of the
+    bias.
     """
     actuators = ET.SubElement(root, "actuator")
     units = ", ".join(f"{joint.name} [{joint.goal_unit}]" for joint in model.joints)

@@ -17,7 +17,7 @@ from hil.description.arm import Body
 from hil.description.files import is_mjcf
 from hil.description.urdf import parse_urdf
 from hil.export.actuators import add_actuators
-from hil.export.chain_links import ChainLinks, chain_links
+from hil.export.chain_links import ChainLinks, chain_links, without_movable
 from hil.export.source import Source, write_text
 from hil.export.xml_text import comment, numbers, to_text
 
@@ -32,11 +32,18 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
     joints = {element.get("name"): element for element in root.findall("joint")}
     for index, (joint, body) in enumerate(zip(found.arm.joints, found.bodies, strict=True)):
         link = links[joint.link]
-        _replace_inertial(link, body)
-        if joint.fixed:
-            comment(link, f"including {', '.join(joint.fixed)}, fixed to it and without separate inertia")
-            for name in joint.fixed:
+        own, share = without_movable(joint, body)
+        _replace_inertial(link, own)
+        merged = [name for name in joint.fixed if name not in joint.movable]
+        if merged:
+            comment(link, f"including {', '.join(merged)}, fixed to it and without separate inertia")
+            for name in merged:
                 _remove(links[name], "inertial")
+        if joint.movable:
+            comment(link, f"without {', '.join(joint.movable)}, which held joints move: described, not identified")
+        if share < 1.0:
+            for name in joint.movable:
+                _scale_inertial(links[name], share)
         dynamics = joints[joint.name].find("dynamics")
         if dynamics is None:
             dynamics = ET.SubElement(joints[joint.name], "dynamics")
@@ -53,7 +60,7 @@ def _export_own_urdf(found: ChainLinks, model: ChainArmModel, path: Path) -> lis
     """Write the URDF of an arm that was described by MJCF, with its joints, frames and body names."""
     root = ET.Element("robot", name=found.path.stem)
     rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
-    left = ["the MJCF's shapes", *rotors, *found.left_out]
+    left = ["the MJCF's shapes", *_held(found), *rotors, *found.left_out]
     _describe(root, model, found, left)
     ET.SubElement(root, "link", name=found.arm.base)
     parent = found.arm.base
@@ -82,7 +89,11 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
     root = ET.Element("mujoco", model=found.path.stem)
     solids = solids_of(found.arm)
     kept = ("offset_", "lag", "base_tilt")
-    left = [*_not_in_mjcf(found, solids), *(each for each in found.left_out if not each.startswith(kept))]
+    left = [
+        *_not_in_mjcf(found, solids),
+        *_held(found),
+        *(each for each in found.left_out if not each.startswith(kept)),
+    ]
     _describe(root, model, found, left)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     ET.SubElement(root, "option", gravity=numbers(*model.base_gravity), timestep="0.001", integrator="implicitfast")
@@ -111,6 +122,15 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
     return left
 
 
+def _held(found: ChainLinks) -> list[str]:
+    """What a file without the joints outside the arm leaves out."""
+    if not found.arm.held:
+        return []
+    with_links = [joint.link for joint in found.arm.joints if joint.movable]
+    carried = f"; the links that they move are part of {', '.join(with_links)}" if with_links else ""
+    return [f"the joints {', '.join(found.arm.held)}, which were held during the identification{carried}"]
+
+
 def _not_in_mjcf(found: ChainLinks, solids: Sequence[Solid]) -> list[str]:
     is_known = not is_mjcf(found.path)
     meshes = [f"the {'URDF' if is_known else 'MJCF'}'s meshes"] if any(not solid.size for solid in solids) else []
@@ -120,7 +140,7 @@ def _not_in_mjcf(found: ChainLinks, solids: Sequence[Solid]) -> list[str]:
 
 
 def _add_geoms(body: ET.Element, solids: Sequence[Solid]) -> None:
-    """Add the boxes, cylinders, capsules and spheres of a link; they touch nothing unless contype is set."""
+    """Add the boxes, cylinders, capsules and spheres of a link; they collide with nothing unless contype is set."""
     for solid in solids:
         if solid.size:
             place = {"pos": numbers(*solid.translation), "quat": numbers(*_quaternion(solid.rotation))}
@@ -147,6 +167,14 @@ def _replace_inertial(link: ET.Element, body: Body) -> None:
     ET.SubElement(inertial, "mass", value=numbers(body.mass))
     names = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
     ET.SubElement(inertial, "inertia", {key: numbers(body.inertia[at]) for key, at in names.items()})
+
+
+def _scale_inertial(link: ET.Element, share: float) -> None:
+    """Multiply the described mass and inertia of a link by a number below 1."""
+    comment(link, f"{share:g} of the described mass and inertia: with all of it, nothing would be left for its parent")
+    for element in (*link.findall("inertial/mass"), *link.findall("inertial/inertia")):
+        for key, value in element.attrib.items():
+            element.set(key, numbers(share * float(value)))
 
 
 def _remove(parent: ET.Element, tag: str) -> None:

@@ -8,15 +8,21 @@ from pathlib import Path
 import numpy as np
 
 from hil.chain_model import ChainArmModel
-from hil.description.arm import ArmDescription, ArmFileError, Body
+from hil.description.arm import ArmDescription, ArmFileError, ArmJoint, Body
 from hil.description.files import read_arm
+from hil.drivers.errors import DriverError
+from hil.drivers.servo_model import servo_model
+from hil.drivers.servo_prior import servo_prior
 from hil.errors import ExportError
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.physical_links import nearest_links
+from hil.estimator.chain.model.prior import ARMATURE
 from hil.estimator.chain.model.tilt import TILT
 from hil.export.source import Source
 
+HALVINGS = 12
+LEAST_LEFT = 0.1  # of a link's mass, after separating what held joints move
 FAR = 3.0  # standard errors between physical links and identified parameters above which a note is added
 _SAID = ("viscous", "coulomb", "armature", "torque_scale", "moment", "inertia", "mass")
 
@@ -46,12 +52,12 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
     base = BaseParameters.of(chain, tilts=TILT[0] in model.values)
     if not _same_groups(base, model.groups):
         raise ExportError(
-            f"{source.run}: the version that estimated this run groups the parameters of the links differently "
-            "than this one. Run hil estimate again."
+            f"{source.run}: this run was estimated by a version of hil that groups the links' parameters differently. "
+            "Run hil estimate again."
         )
     value = np.array([model.values[name] for name in base.names])
     std = np.array([model.stds[name] for name in base.names])
-    rotors = np.array([max(model.values.get(f"armature_{n}", 0.0), 1e-3) for n in range(1, len(model.joints) + 1)])
+    rotors = np.array([_rotor(model, number) for number in range(1, len(model.joints) + 1)])
     found = nearest_links(base, value, std, arm.parameters, rotors)
     said = []
     if found.misfit > FAR:
@@ -61,6 +67,23 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
         )
     bodies = tuple(_body(row) for row in found.links)
     return ChainLinks(path, arm, bodies, tuple(found.armature.tolist()), (*said, *_left_out(model)))
+
+
+def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
+    """Separate a link from what its held joints move, such as a gripper's fingers, so that these keep their inertia.
+
+    Their described masses may leave no possible body for the link itself; all of them then keep the largest fraction,
+    halved as often as needed, that does. Returns the link's body and that fraction.
+    """
+    share = 1.0
+    for _ in range(HALVINGS):
+        left = body
+        for each in joint.movable.values():
+            left = left.joined(Body(-share * each.mass, each.centre, -share * each.inertia))
+        if left.mass > LEAST_LEFT * body.mass and left.is_physical:
+            return left, share
+        share *= 0.5
+    raise ExportError(f"link {joint.link!r}: no part of what its held joints move can be separated from it")
 
 
 def _same_groups(base: BaseParameters, groups: Mapping[str, str]) -> bool:
@@ -79,6 +102,19 @@ def _same_word(one: str, other: str) -> bool:
     if one[0].isdigit() and other[0].isdigit():
         return isclose(float(one), float(other), rel_tol=1e-4)
     return one == other
+
+
+def _rotor(model: ChainArmModel, number: int) -> float:
+    """A joint's rotor inertia [kg m^2]: as identified or, where it is part of a sum, as usual for its servo.
+
+    A guess that is far too small would be made up for by a link that is far too heavy.
+    """
+    if (known := model.values.get(f"armature_{number}", 0.0)) > 0.0:
+        return known
+    try:
+        return servo_prior(servo_model(model.joints[number - 1].servo)).armature.median
+    except DriverError:  # recordings of an unknown servo
+        return 0.5 * ARMATURE
 
 
 def _left_out(model: ChainArmModel) -> list[str]:

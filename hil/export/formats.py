@@ -14,6 +14,7 @@ from hil.export.parameters import export_json, export_toml
 from hil.export.source import Recorded, Source
 from hil.export.tables import export_csv, export_mat, export_parquet
 from hil.export.urdf import export_urdf
+from hil.runs.run_folder import RunFolder
 
 S = TypeVar("S", Source, Recorded)
 
@@ -63,7 +64,7 @@ def export(run: Path, name: str, out: Path | None = None, link_length: float | N
     """Write the run in one format, by default into the run folder. Raises ResultError, ExportError, RunFolderError."""
     if name in RECORDING_FORMATS:
         recording = RECORDING_FORMATS[name]
-        path = out or run / recording.file_name
+        path = _not_its_own(run, out, recording.file_name)
         return Written(name, path, recording.write(Recorded.open(run), path))
     if name not in FORMATS:
         raise ExportError(
@@ -71,12 +72,22 @@ def export(run: Path, name: str, out: Path | None = None, link_length: float | N
             + _each_its_own(name)
         )
     arm = FORMATS[name]
-    path = out or run / arm.file_name
+    path = _not_its_own(run, out, arm.file_name)
     return Written(name, path, arm.write(Source.open(run, link_length), path))
 
 
+def _not_its_own(run: Path, out: Path | None, default: str) -> Path:
+    """The file to write, which must not be part of the run itself: an arm's description may be called arm.urdf."""
+    path = out or run / default
+    if path.parent.resolve() != run.resolve() or path.name not in RunFolder.open(run).own_files():
+        return path
+    if out is not None:
+        raise ExportError(f"{path} belongs to the run, which would be lost: choose another file name.")
+    return run / f"identified_{default}"
+
+
 def _each_its_own(name: str) -> str:
-    """How to name several formats that were given as a list."""
+    """Advice on how to request several formats, if `name` is a list of them; otherwise ""."""
     parts = [part for part in re.split(r"[,; ]+", name) if part]
     if len(parts) < 2 or any(part not in (*FORMATS, *RECORDING_FORMATS) for part in parts):
         return ""

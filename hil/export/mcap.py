@@ -78,7 +78,7 @@ def _write(writer: Any, source: Recorded) -> None:
 
 
 def _write_scene(writer: Any, source: Recorded, start: int) -> None:
-    """Write the arm's shapes once, and its frames wherever all joints were read."""
+    """Write the arm's shapes once, and its frames for every sample in which all joints were read."""
     scene = moving_scene(source.config)
     samples = source.samples
     time = samples["deadline"] - samples["deadline"][0]

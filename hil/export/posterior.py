@@ -34,10 +34,10 @@ _FRICTION = ("viscous", "coulomb")
 _LEAST_WIDTH = 1e-4
 """Smallest width of a drawn arm's Coulomb step [rad/s]: hardly different from friction that truly sticks."""
 _POSES = 20
-"""Poses in which the mass matrix of a drawn spatial arm must be positive definite."""
+"""Number of poses in which the mass matrix of a drawn spatial arm must be positive definite."""
 
 _IN_TORQUE = ("N m", "kg m^2")
-"""Beginnings of the units of parameters that scale with the torque constant."""
+"""Prefixes of the units of parameters that scale with the torque constant."""
 
 
 @dataclass(frozen=True)

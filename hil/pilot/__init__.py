@@ -7,7 +7,7 @@ search   from the first careful run to a run at the limits
 rehearsal  the first run and the largest safe torque, simulated for `hil dry-run`
 full     the run at the limits and its estimate
 
-For spatial arms: chain_belief, chain_paths and chain_search.
+For spatial arms: chain_belief, chain_paths, chain_shares and chain_search.
 """
 
 from hil.pilot.full import identify_in_steps

@@ -42,7 +42,8 @@ MOVED_STEPS = 26
 """Smallest range of motion of a joint that counts as having moved [encoder steps]."""
 _STILL = 0.02  # rad, allowed range of a simulated joint whose real counterpart stood still
 _MOST_RAISES, _RAISE = 12, (0.05, 0.25)
-"""Largest number of increases of log friction until a simulated joint stands still too, and their range."""
+"""Maximum number of random increases of log friction, made until a simulated joint stands still too, and their range.
+"""
 
 _INFLATIONS = (12.0, 6.0, 4.0, 2.0)
 """Error inflation of each update; the reciprocals add up to 1, so that the data count once."""
@@ -192,7 +193,8 @@ def prior_belief(config: Config, arms: int, seed: int = 0) -> Belief:
 def earlier_belief(config: Config, result: Result, arms: int, seed: int = 0) -> Belief:
     """Draw the belief from the result of an earlier run on the same arm. Raises ConfigError.
 
-    Terms that the result's model lacks are absent. Friction varies more than its error bars: with temperature.
+    Terms that the result's model lacks are absent. Friction is drawn with a wider spread than its error bars, since it
+    varies with temperature.
     """
     prior = prior_belief(config, arms, seed)
     if result.joints != len(config.joints):

@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
-    """Return `torque` (joints,) [N m], with that of joints that stood `still` raised from that of the `former` run.
+    """Return `torque` (joints,) [N m], where joints that stood `still` get more than in the `former` run.
 
     most: torque that the current limits allow (joints,) [N m].
     """

@@ -43,9 +43,7 @@ _HALVINGS = 6
 _LIGHTER = 0.25
 """Smallest plausible inertia of a joint, relative to that of the lightest arm of the prior."""
 _LIGHTER_THAN_MEAN = 0.5
-"""Smallest plausible inertia of a joint, relative to that of the arm with the fitted parameters, if that arm is lighter
-still.
-"""
+"""The same relative to the inertia of the arm with the fitted parameters, if that arm is lighter still."""
 
 SIMULATED = 100
 """Largest number of arms that are simulated."""
@@ -67,6 +65,12 @@ class ChainBelief:
         """Draw the ensemble before the first run. Raises ArmFileError."""
         arms = prior_arms(config, known_chain(config), DRAWN)
         return cls(config, arms, inertias(arms.first(SIMULATED), _poses(config))[1].min(axis=0))
+
+    def at_least(self, count: int) -> ChainArms:
+        """Return `count` arms: the first ones of the ensemble and, for a prior that is too small, further ones."""
+        if count <= self.arms.size:
+            return self.arms.first(count)
+        return self.arms.and_more(prior_arms(self.config, known_chain(self.config), count - self.arms.size, seed=1))
 
     @property
     def torque(self) -> ChainTorque:
@@ -125,8 +129,8 @@ class ChainBelief:
 
     @property
     def _links(self) -> Array:
-        """Derivatives of the base parameters by the parameters of links and rotors, in units of their spread (base
-        parameters, all).
+        """Derivatives of the base parameters with respect to the parameters of links and rotors, in units of their
+        spread (base parameters, all).
         """
         described = known_chain(self.config).described.reshape(-1, TERMS)
         found: Array = self.arms.base.grouping * spread_of(described).reshape(-1)

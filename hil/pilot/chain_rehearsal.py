@@ -5,12 +5,14 @@ from hil.config.schema import Config
 from hil.dry_run.chain_prediction import Tell, predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_stop import foreseen_stops
-from hil.dry_run.chain_summary import ChainDryRun, unsafe
+from hil.dry_run.chain_summary import ChainDryRun
+from hil.errors import NoSafeTorque
+from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
-from hil.pilot.chain_search import PILOT_SHARES, SEARCH_ARMS, step_config
+from hil.pilot.chain_shares import ARMS, PILOT_SHARES, SafeShares, step_config
 from hil.plan.chain_model import known_chain
-from hil.plan.chain_plan import check_rest_pose, make_chain_plan
+from hil.plan.chain_plan import NoHeadroom, check_rest_pose, make_chain_plan
 from hil.plan.plan import Plan
 from hil.setup.idle_bus import quiet_stream
 
@@ -18,27 +20,44 @@ SHOWN = 30
 
 
 def rehearse(config: Config, arms: int, servos: bool = False, tell: Tell | None = None) -> ChainDryRun:
-    """Simulate the configured path, or the pilot's first step. Raises ConfigError, NoSafeTorque; with `servos`,
-    DriverError."""
+    """Simulate the configured path, or the pilot's first step as `hil identify` would choose it.
+
+    Whether a pilot is safe is decided by `SafeShares`, as `hil identify` does; more arms only add to the peaks that are
+    shown. Raises ConfigError, NoSafeTorque; with `servos`, DriverError.
+    """
     check_rest_pose(config)
     said = quiet_stream(config) if servos else ()
-    played, plan, share = _what_is_played(config)
-    drawn = prior_arms(played, known_chain(played), arms)
-    foreseen = predict_chain(played, plan, drawn, tell, SHOWN)
-    space = Space.of(played)
-    stops = foreseen_stops(played, plan, drawn)
-    return ChainDryRun(played, "prior", arms, share, foreseen, stops, space.shapes.guessed, space.as_built, said)
-
-
-def _what_is_played(config: Config) -> tuple[Config, Plan, float]:
     if not config.experiment.pilot:
-        return config, make_chain_plan(config), 1.0
-    config = chain_config(config)
-    belief = ChainBelief.prior(config)
-    paths = Paths.of(config, belief.torque)
-    held = step_config(belief.with_stabiliser(config))
-    for share in PILOT_SHARES:
-        plan = paths.plan(held, belief.torque, share)
-        if not unsafe(held, predict_chain(held, plan, belief.arms.first(SEARCH_ARMS))):
-            break
-    return held, plan, share
+        plan = make_chain_plan(config)
+        drawn = prior_arms(config, known_chain(config), arms)
+        return _simulated(config, plan, drawn, 1.0, None, tell, said)
+    given = chain_config(config)
+    belief = ChainBelief.prior(given)
+    search = SafeShares(given, belief, Paths.of(given, belief.torque), lambda _: None, tell=tell)
+    played, refused = step_config(search.config), ""
+    try:
+        found = search.safe(played, PILOT_SHARES)
+    except NoSafeTorque as error:
+        share, refused = PILOT_SHARES[-1], str(error)
+        try:
+            plan = search.paths.plan(played, belief.torque, share)
+        except NoHeadroom:  # there is nothing to show
+            raise error from None
+    else:
+        share, plan = found.share, found.plan
+    return _simulated(played, plan, belief.at_least(max(arms, ARMS)), share, refused, tell, said)
+
+
+def _simulated(
+    config: Config,
+    plan: Plan,
+    arms: ChainArms,
+    share: float,
+    refused: str | None,
+    tell: Tell | None,
+    servos: tuple[str, ...],
+) -> ChainDryRun:
+    foreseen = predict_chain(config, plan, arms, tell, SHOWN)
+    stops, space = foreseen_stops(config, plan, arms), Space.of(config)
+    guessed, built = space.shapes.guessed, space.as_built
+    return ChainDryRun(config, "prior", arms.size, share, foreseen, stops, guessed, built, servos, refused)

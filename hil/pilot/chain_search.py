@@ -7,44 +7,26 @@ full      the designed path at the largest safe fraction, and a held-out path
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
-from hil.dry_run.chain_prediction import ChainPrediction, predict_chain
-from hil.dry_run.chain_stop import foreseen_stops
-from hil.dry_run.chain_summary import unsafe
 from hil.dry_run.prediction import peaks_of
-from hil.errors import DidNotMove, ExperimentError, NoSafeTorque, NotSettled
+from hil.errors import DidNotMove, ExperimentError, NotSettled
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Watch
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
+from hil.pilot.chain_shares import PILOT_SHARES, SHARES, Found, SafeShares, step_config
 from hil.pilot.punctual import punctual
 from hil.pilot.steps import Say, Step, tells_of_the_arm
-from hil.plan.chain_model import limit_names
-from hil.plan.chain_plan import NoHeadroom
-from hil.plan.plan import Plan
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 from hil.setup.servo_session import servo_session
 
-Array = NDArray[np.float64]
-
-SEARCH_ARMS, ARMS = 24, 72
-"""Number of arms simulated while searching for a share, and to confirm the one found."""
-
-PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
-SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4, 0.28, 0.18)
-SMALL = 0.5
-"""Fraction of the wanted share below which other paths, with more reserve, are designed."""
-
-REDESIGNS = 2
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7
 RAISED = 1.3
@@ -54,33 +36,14 @@ MOST_RAISE = 2.5
 """Largest ratio of a step's share of the amplitude to that of the previous run."""
 
 
-@dataclass(frozen=True)
-class Found:
-    """A safe share of the amplitude, with its plan and the predicted motion."""
+@dataclass(kw_only=True)
+class ChainSearch(SafeShares):
+    """Runs so far and the current belief."""
 
-    share: float
-    plan: Plan
-    foreseen: ChainPrediction
-
-
-@dataclass
-class ChainSearch:
-    """Runs so far and the current belief.
-
-    last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are shares of `paths`,
-    and are converted when these are replaced.
-    """
-
-    given: Config
     run: RunFolder
     shown_path: Path
     watch: Watch
-    say: Say
-    belief: ChainBelief
-    paths: Paths
     steps: list[Step] = field(default_factory=list)
-    cap: float = 1.0
-    last: float = np.inf
 
     @classmethod
     def of(cls, config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say) -> "ChainSearch":
@@ -92,77 +55,7 @@ class ChainSearch:
             f"Designed a path that leaves the worst base parameter {100 * paths.identify.worst:.2g} % of its prior "
             f"standard error (held-out path, with random phases: {100 * paths.held_out.worst:.2g} %)."
         )
-        return cls(config, run, shown_path, watch, say, belief, paths)
-
-    @property
-    def config(self) -> Config:
-        """The configuration with a stabiliser suited to the current ensemble."""
-        return self.belief.with_stabiliser(self.given)
-
-    def safe(self, config: Config, shares: tuple[float, ...], most: float = np.inf) -> Found:
-        """Find the first of the `shares` of the designed path that is safe for all simulated arms.
-
-        most: largest share; of other paths, it is the share with the same amplitude. The shares are scaled to it.
-
-        If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
-        kept. Raises NoSafeTorque if no share of any path is safe.
-        """
-        most = min(most, self.cap) if self.cap < 1.0 else most
-        found, why, shortage = self._largest(config, _up_to(most, shares))
-        reserve = self.paths.reserve
-        for _ in range(REDESIGNS):
-            if found is not None and found.share >= SMALL * min(most, shares[0]):
-                break
-            former, reserve = self.paths, reserve.larger(shortage)
-            try:
-                self.paths = Paths.of(self.given, self.belief.torque, reserve)
-            except NoSafeTorque:
-                break
-            times = self.paths.amplitude_over(former)
-            other, other_why, shortage = self._largest(config, _up_to(most / times, shares))
-            if other is None or (found is not None and self._worth(former, found) <= self._worth(self.paths, other)):
-                self.paths = former
-            else:
-                found = other
-                most, self.last = most / times, self.last / times
-                self.cap = min(self.cap / times, 1.0) if self.cap < 1.0 else 1.0
-                self.say("Designed another path, which stays farther from the limits.")
-            why = why if other is not None else other_why
-        if found is None:
-            raise NoSafeTorque(
-                f"{config.path}: no motion is safe for all arms consistent with what is known, not even "
-                f"{100 * shares[-1]:.0f} % of the designed path: {why}. {_remedy(config)}"
-            )
-        return found
-
-    def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
-        """The first safe share of the paths, why a larger one is not, and how much clearance that one lacks [m]."""
-        why, shortage = "", 0.0
-        for share in shares:
-            try:
-                plan = self.paths.plan(config, self.belief.torque, share)
-            except NoHeadroom as error:  # the arm is heavier than the paths were designed for
-                why = str(error)
-                continue
-            for count in (SEARCH_ARMS, ARMS):
-                foreseen = predict_chain(config, plan, self.belief.arms.first(count))
-                not_safe = unsafe(config, foreseen)
-                shortage = max(shortage, -float(foreseen.rooms.min()))
-                if not_safe:
-                    break
-            not_safe = not_safe or self._unsafe_stop(config, plan)
-            if not not_safe:
-                return Found(share, plan, foreseen), why, shortage
-            why = not_safe
-        return None, why, shortage
-
-    def _worth(self, paths: Paths, found: Found) -> float:
-        """Worst relative standard error of the base parameters after the found share of a path."""
-        return paths.designer.worth(paths.designer.scaled(paths.identify, found.share))[0]
-
-    def _unsafe_stop(self, config: Config, plan: Plan) -> str:
-        """Explain why a stop would not lower the arm safely; "" if it would."""
-        return "" if config.safety.stop == "cut" else foreseen_stops(config, plan, self.belief.arms.first(ARMS)).unsafe
+        return cls(config, belief, paths, say, run=run, shown_path=shown_path, watch=watch)
 
     def step(self, name: str, folder: str, shares: tuple[float, ...]) -> Found:
         """Play one step, compare it with the prediction, and update the belief."""
@@ -183,9 +76,9 @@ class ChainSearch:
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
-        """Play a run, whose share is then the `last`; return the error that ended it early, or None.
+        """Play a run and set `last` to its share; return the error that ended it early, or None.
 
-        Only errors that are informative about the arm are returned; all others that a run raises are raised.
+        Only errors that are informative about the arm are returned; all others are raised.
         """
         error, self.last = None, found.share
         try:
@@ -224,22 +117,6 @@ class ChainSearch:
                 f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from the "
                 "assumptions."
             )
-
-
-def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the shares, scaled so that the first is at most `most`."""
-    return tuple(min(1.0, most / shares[0]) * share for share in shares)
-
-
-def _remedy(config: Config) -> str:
-    """Return the changes with which a user may make a path safe."""
-    spread = 0.3 if config.arm.prior is None else config.arm.prior.spread
-    return (
-        "Depending on the reason, these changes help: a rest_pose farther from limits and obstacles; a wider "
-        "position_limit; more room in [clearance] (floor, boxes, margin), if there is more; a larger "
-        f"{limit_names(config)} or velocity_limit; or masses in the URDF that are known better, with [arm.prior] "
-        f"spread below {spread:g}."
-    )
 
 
 def identify_chain_in_steps(
@@ -286,9 +163,3 @@ def _full(search: ChainSearch) -> str:
         search.say(f"Repeating with {how}.")
         search.run.set_aside(f"stopped-{number}", config)
     raise AssertionError  # the loop returns or raises
-
-
-def step_config(config: Config) -> Config:
-    """The configuration of a step: one path, run for two periods whether or not it settles."""
-    update: dict[str, Any] = {"held_out": False, "max_settling_periods": 1, "periods": 1, "settle_within": 0.99}
-    return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})

@@ -57,7 +57,7 @@ class Search:
     fast: NDArray[np.bool_] = field(init=False)
     """Joints that exceeded their velocity limit in the last run before they had moved (joints,)."""
     calm: Array = field(init=False)
-    """Torque (joints,) [N m] below that of all runs in which a joint did so; infinite if none did."""
+    """Cap on the torque (joints,) [N m], below that of all runs in which a joint did so; infinite if none did."""
 
     def __post_init__(self) -> None:
         self.fast = np.zeros(len(self.config.joints), dtype=np.bool_)
@@ -196,7 +196,7 @@ class Search:
         if self.fast.any():
             yield (
                 f"{_and(_names(self.config, self.fast))} exceeded the velocity limit before moving by {MOVED_STEPS} "
-                "encoder steps: less torque is next."
+                "encoder steps: the next run uses less torque."
             )
         held = still & ~self.fast
         if held.any():
@@ -310,7 +310,9 @@ class Search:
         return np.asarray(np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0))
 
     def _refuse_velocity_limit(self, fast: NDArray[np.bool_], held: NDArray[np.bool_]) -> NoReturn:
-        """fast: joints that exceeded their velocity limit. held: joints that did not move with all their torque."""
+        """Raise ExperimentError because of the velocity limit. fast: joints that exceeded it. held: joints that did not
+        move with all their torque.
+        """
         said = "; ".join(
             f"{joint.name}: velocity_limit = {joint.velocity_limit:g} rad/s, {MOVED_STEPS} encoder steps are "
             f"{MOVED_STEPS * joint.joint.servo.position_unit:.2g} rad"

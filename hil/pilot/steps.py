@@ -160,7 +160,7 @@ def tells_of_the_arm(error: ExperimentError) -> bool:
 
 
 def _stood_still(config: Config, folder: RunFolder, error: ExperimentError) -> bool:
-    """Whether the only unexpected thing was a joint that did not move at all: friction is larger than believed."""
+    """Whether the only unexpected thing was a joint that did not move at all: friction is larger than assumed."""
     if not isinstance(error, SafetyStop) or error.cause is not Cause.UNEXPECTED:
         return False
     position = load_samples(folder.samples_path, len(config.joints))["position"]

@@ -24,7 +24,7 @@ A light joint that is braked too hard is thrown back faster than it came before 
 """
 
 DELAY_S = 0.002
-"""Time until a goal takes effect [s]: a brake acts from one exchange to the next, and for that long."""
+"""Time until a goal takes effect [s]; a braking goal thus acts for the interval between exchanges plus this time."""
 
 GETS_FASTER = 0.2
 """Increase in speed, relative to the velocity limit, at which braking is abandoned.
@@ -44,7 +44,7 @@ def may_brake(config: Config, error: BaseException) -> bool:
 
 
 def braking_gains(config: Config, interval: float | None = None) -> list[float]:
-    """Braking gain of each joint [A s/rad, or V s/rad in PWM mode]: one brake at most stops the lightest joint.
+    """Braking gains [A s/rad, or V s/rad in PWM mode] with which no single goal reverses the lightest joint.
 
     interval: time between two exchanges [s]; by default, that on a fast bus.
     """

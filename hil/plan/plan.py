@@ -29,8 +29,8 @@ class Segment:
 
     @property
     def ramp_in(self) -> NDArray[np.float64]:
-        """Goal currents before the first period: the end of a period, faded in, so that the first period starts
-        complete.
+        """Goal currents before the first period: the end of a period, faded in, so that the first period starts at full
+        amplitude.
         """
         count = self.ramp_samples
         fade = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))

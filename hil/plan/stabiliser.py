@@ -21,7 +21,7 @@ INTEGRAL_TIME_S = 1.0
 """Time after which the integral of a constant deviation adds as much current as the spring."""
 
 BALANCED_RAD = 0.02
-"""Deviation from the rest pose up to which the integral stops growing: friction holds an arm that close to balance."""
+"""Deviation from the rest pose below which the integral stops growing: friction holds an arm this close to balance."""
 
 
 def must_balance(config: Config) -> bool:

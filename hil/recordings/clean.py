@@ -86,7 +86,7 @@ def _unrepeated(source: str, rows: Rows) -> Rows:
     if count > FEW * rows.time.size:
         raise CsvError(
             f"{source}: {100 * count / rows.time.size:.0f} % of the times are the same as the one before, with other "
-            "values: they are too coarse. Write them with more digits, or, if the samples are equally spaced, set "
+            "data: they are too coarse. Write them with more digits, or, if the samples are equally spaced, set "
             "columns.rate (samples per second) in place of columns.time."
         )
     return rows.kept(~again, f"{source}: {count} rows with the same time as the row before were left out.")

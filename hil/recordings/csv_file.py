@@ -20,7 +20,7 @@ def read_csv_table(path: Path) -> Table:
     remarks = [line for _, line in lines if line.lstrip().startswith(_REMARKS)]
     rows = [(number, line) for number, line in lines if not line.lstrip().startswith(_REMARKS)]
     if not rows:
-        raise CsvError(f"{path}: is empty; it needs a header line and at least one line of numbers.")
+        raise CsvError(f"{path} is empty; it needs a header line and at least one line of numbers.")
     delimiter = _delimiter([line for _, line in rows])
     header, rows = _header(path, rows, remarks, delimiter)
     double = {name for name in header if header.count(name) > 1}
@@ -33,7 +33,7 @@ def read_csv_table(path: Path) -> Table:
         units = {name: field.strip(" []()") for name, field in named if field.strip(" []()")}
         fields = fields[1:]
     if not fields:
-        raise CsvError(f"{path}: is empty; it needs a header line and at least one line of numbers.")
+        raise CsvError(f"{path} is empty; it needs a header line and at least one line of numbers.")
     wide = len(header)
     if all(len(row) == wide + 1 and not row[-1].strip() for _, row in fields):  # each line ends in a delimiter
         fields = [(number, row[:-1]) for number, row in fields]
@@ -48,17 +48,17 @@ def read_csv_table(path: Path) -> Table:
 def _text(path: Path) -> str:
     try:
         if path.stat().st_size > MOST_CSV_BYTES:
-            raise CsvError(f"{path}: is larger than {MOST_CSV_BYTES // 2**20} MB, the most that is read. Split it.")
+            raise CsvError(f"{path} is larger than {MOST_CSV_BYTES // 2**20} MB, the most that is read. Split it.")
         data = path.read_bytes()
     except OSError as error:
-        raise CsvError(f"{path}: cannot be read: {error.strerror}.") from error
+        raise CsvError(f"{path} cannot be read: {error.strerror}.") from error
     wide = data.startswith((b"\xff\xfe", b"\xfe\xff"))
     try:
         text = data.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("latin-1")
     if "\0" in text:
-        raise CsvError(f"{path}: cannot be read: it is not a text file but a binary one. Export it as CSV.")
+        raise CsvError(f"{path} cannot be read: it is not a text file but a binary one. Export it as CSV.")
     return text
 
 
@@ -90,7 +90,7 @@ def _header(
         if len(names) == len(first):
             return names, rows
     raise CsvError(
-        f"{path}: has no header line, only numbers. Put the names of the {len(first)} columns into its first line."
+        f"{path} has no header line, only numbers. Put the names of the {len(first)} columns into its first line."
     )
 
 

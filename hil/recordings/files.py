@@ -22,7 +22,7 @@ def is_recording(path: Path) -> bool:
 def read_tables(path: Path) -> list[Table]:
     """Read the tables in one file or folder. Raises CsvError, which names it."""
     if not path.exists():
-        raise CsvError(f"{path}: cannot be read: No such file or directory.")
+        raise CsvError(f"{path} cannot be read: No such file or directory.")
     if path.is_dir():
         return read_dataset(path) if is_dataset(path) else read_bag(path)
     kind = path.suffix.lower()

@@ -50,7 +50,7 @@ def read_bag(folder: Path) -> list[Table]:
     if not files:
         kept = ", ".join(sorted({path.suffix for path in folder.iterdir() if path.suffix != ".yaml"})) or "nothing"
         raise CsvError(
-            f"{folder}: is a ROS 2 bag without MCAP files (it holds {kept}). Convert it: ros2 bag convert, with "
+            f"{folder} is a ROS 2 bag without MCAP files (it holds {kept}). Convert it: ros2 bag convert, with "
             "storage_id: mcap."
         )
     return [_table(str(folder), files)]
@@ -68,7 +68,7 @@ def _table(source: str, files: list[Path]) -> Table:
             topics.setdefault(topic, _Topic()).add(time, dict(_numbers(topic, message)))
     topics = {name: each for name, each in topics.items() if each.values}
     if not topics:
-        raise CsvError(f"{source}: holds no messages with numbers.")
+        raise CsvError(f"{source} holds no messages with numbers.")
     # The topic with the most samples defines the rows; values of other topics are held until their next message.
     first = max(topics, key=lambda name: len(topics[name].time))
     order = np.argsort(topics[first].time, kind="stable")
@@ -109,11 +109,11 @@ def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
                 decoded = decode(message.data)
                 yield channel.topic, _stamp(decoded, message.log_time), decoded
     except (OSError, McapError, ValueError, KeyError, struct.error) as error:
-        raise CsvError(f"{path}: cannot be read: {str(error).rstrip('.') or type(error).__name__}.") from error
+        raise CsvError(f"{path} cannot be read: {str(error).rstrip('.') or type(error).__name__}.") from error
     if not found:
         what = ", ".join(sorted(refused)) or "no messages"
         raise CsvError(
-            f"{path}: holds nothing that can be decoded here: {what}. Readable: JSON and, with "
+            f"{path} holds nothing that can be decoded here: {what}. Readable: JSON and, with "
             "pip install 'hil[recordings]', ROS 2 (cdr)."
         )
 

@@ -29,10 +29,10 @@ def read_dataset(folder: Path) -> list[Table]:
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
         features = dict(info.get("features", {}))
     except (OSError, ValueError, AttributeError, TypeError) as error:
-        raise CsvError(f"{folder / INFO}: cannot be read: {error}.") from error
+        raise CsvError(f"{folder / INFO} cannot be read: {error}.") from error
     files = sorted((folder / "data").rglob("*.parquet"))
     if not files:
-        raise CsvError(f"{folder}: is a LeRobot dataset without data: it has no data/**/*.parquet.")
+        raise CsvError(f"{folder} is a LeRobot dataset without data: it has no data/**/*.parquet.")
     return [table for file in files for table in _tables(file, features)]
 
 
@@ -45,7 +45,7 @@ def _tables(path: Path, features: dict[str, Any]) -> list[Table]:
     try:
         whole = parquet.read_table(path)
     except (OSError, pa.ArrowException) as error:
-        raise CsvError(f"{path}: cannot be read: {str(error).splitlines()[0].rstrip('.')}.") from error
+        raise CsvError(f"{path} cannot be read: {str(error).splitlines()[0].rstrip('.')}.") from error
     columns: dict[str, Values] = {}
     units: dict[str, str] = {}
     for column in whole.schema:
@@ -55,7 +55,7 @@ def _tables(path: Path, features: dict[str, Any]) -> list[Table]:
         if stated:
             units |= dict.fromkeys(flat, stated.decode())
     if not columns or not whole.num_rows:
-        raise CsvError(f"{path}: is empty: it has no numeric columns or no rows.")
+        raise CsvError(f"{path} is empty: it has no numeric columns or no rows.")
     if EPISODE not in columns:
         return [Table(str(path), columns, units)]
     episodes = columns[EPISODE]

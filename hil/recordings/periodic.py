@@ -67,7 +67,7 @@ def _period(torque: Array) -> int | None:
 
 
 def _settled(position: Array, noise: Array) -> int:
-    """Number of periods, counted backwards from the last, that repeat. position: (joints, periods, samples)."""
+    """Number of periods at the end that repeat the same motion. position: (joints, periods, samples)."""
     count = 1
     motion = np.nanstd(position[:, -1], axis=1)
     for latest in range(position.shape[1] - 1, 0, -1):

@@ -23,8 +23,8 @@ T = TypeVar("T")
 
 
 class FormError(ValueError):
-    """A JSON value does not match the dataclass. The message continues a sentence that starts with "it", as "has no
-    'arm'".
+    """A JSON value does not match the dataclass. The message continues a sentence that starts with "it", such as "has
+    no 'arm'".
     """
 
 

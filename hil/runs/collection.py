@@ -13,7 +13,7 @@ from typing import Any
 
 from hil.errors import ResultError, RunFolderError
 from hil.model_file import read_result
-from hil.next_step import command
+from hil.next_step import command, only_steps, steps_of
 from hil.runs.run_folder import write_json
 
 NOTE_FILE = "note.json"
@@ -91,6 +91,8 @@ def read_note(path: Path) -> Note:
 
 
 def _no_run(path: Path) -> RunFolderError:
+    if path.is_dir() and (steps := steps_of(path)):
+        return RunFolderError(only_steps(path, steps))
     return RunFolderError(
         f"{path} is not a run folder: it has neither run.json nor samples.npy. List those that you have: "
         f"{command('runs')}"

@@ -38,7 +38,10 @@ class RecordingFile:
 
 @dataclass(frozen=True)
 class RecordingRecord:
-    """run.json. config: path of the configuration, empty without one. started: ISO 8601. notes: sentences."""
+    """The contents of run.json.
+
+    config: path of the configuration, empty without one. started: ISO 8601. notes: sentences.
+    """
 
     config: str
     started: str

@@ -35,7 +35,7 @@ from hil.config.experiment import ExperimentConfig
 from hil.config.schema import Config, StabiliserConfig, parse_config
 from hil.description.kept_file import kept_bytes
 from hil.errors import RunFolderError
-from hil.next_step import command
+from hil.next_step import command, only_steps, steps_of
 from hil.plan.plan import Plan
 from hil.results.json_form import FormError, from_json, to_json
 from hil.results.result import Result
@@ -159,6 +159,8 @@ class RunFolder:
                 f"{path} is an estimate from another tool's recording; this command needs a run of hil identify or hil "
                 "record."
             )
+        if steps := steps_of(path):
+            raise RunFolderError(only_steps(path, steps))
         for needed in (run.config_path, run.run_path, run.samples_path):
             if not needed.is_file():
                 raise RunFolderError(
@@ -169,6 +171,13 @@ class RunFolder:
     @property
     def config_path(self) -> Path:
         return self.path / "config.toml"
+
+    def own_files(self) -> frozenset[str]:
+        """Names of the files that make up the run: those written by a run, and the descriptions of its arm.
+
+        Raises RunFolderError, ConfigError.
+        """
+        return _OF_A_START | {"result.json", "lateness.json"} | {urdf.name for urdf in _urdfs(self.load_config())}
 
     @property
     def run_path(self) -> Path:

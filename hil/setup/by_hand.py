@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config.chain import described_arm
+from hil.config.chain import base_up, described_arm
 from hil.config.schema import Config
 from hil.description.motion import end_point, moves
 from hil.drivers.clock import Clock
@@ -57,10 +57,10 @@ def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
 
 def guided(config: Config, read: Read, clock: Clock, ask: Callable[[str], None]) -> Iterator[Moved]:
     """Ask for each joint in turn to be moved in its positive direction, and compare."""
-    arm = described_arm(config)
+    arm, up = described_arm(config), base_up(config)
     for index, joint in enumerate(config.joints):
         before = np.array(read())
-        asked = f"Move {joint.name!r} by hand by about 0.3 rad in the direction that {moves(arm, before, index)}."
+        asked = f"Move {joint.name!r} by hand by about 0.3 rad in the direction that {moves(arm, before, index, up)}."
         ask(asked)
         change = _awaited(read, clock, before)
         yield judge(config, index, asked, change)

@@ -25,13 +25,13 @@ EXPLAINED = frozenset(
         Cause.EARLY_MOTION,
     }
 )
-"""Causes of a stop that such a change can be behind."""
+"""Causes of a stop that such a change can explain."""
 
 Settings = Mapping[tuple[Joint, str], int]
 
 
 def settings_now(bus: ServoBus) -> Settings:
-    """Read what decides how a servo moves and what it reports; servos that do not answer are left out."""
+    """Read the settings that determine how servos move and what they report; servos that do not answer are left out."""
     found = {}
     for joint, servo in bus.drives.items():
         with suppress(DriverError):
@@ -42,7 +42,7 @@ def settings_now(bus: ServoBus) -> Settings:
 
 
 def changed_settings(before: Settings, after: Settings) -> str:
-    """One sentence about the settings that differ; "" if none does."""
+    """One sentence about the settings that differ; "" if there are none."""
     changed = [
         f"{joint}: {register} is {after[joint, register]} and was {value}"
         for (joint, register), value in before.items()
@@ -50,4 +50,4 @@ def changed_settings(before: Settings, after: Settings) -> str:
     ]
     if not changed:
         return ""
-    return f"Another program has changed the settings of a servo during the run ({'; '.join(changed)})."
+    return f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."

@@ -13,10 +13,12 @@ from hil.drivers.errors import BusShared, DriverError, NoReply, PortLost, PortNo
 from hil.drivers.joint import Joint
 from hil.drivers.latency import FACTORY_MS, WANTED_MS, command_to_set, latency_timer, read_latency_ms
 from hil.drivers.packet import MAX_ID, HardwareError
-from hil.drivers.preparation.prepare import TIME_BASED_PROFILE, check_quiet
+from hil.drivers.preparation.prepare import TIME_BASED_PROFILE, check_quiet, shuts_down
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode
+from hil.errors import ConfigError
+from hil.plan.chain_plan import check_rest_pose
 from hil.plan.stabiliser import too_slow
 from hil.rest_pose_hint import rest_pose_hint
 from hil.setup.bus_rate import check_rate, goals_taken
@@ -60,6 +62,7 @@ def check_arm(config: Config) -> Iterator[Finding]:
         yield Finding(Level.OK, bus.port.url, "port", f"opened at {config.port.baud} baud")
         if why := too_slow(config):
             yield Finding(Level.STOP, "stabiliser", "rate", f"{config.experiment.rate:g} Hz", why)
+        yield from _rest_pose(config)
         yield _latency_timer(bus)
         yield from _others(config, bus)
         all_well = True
@@ -75,6 +78,18 @@ def check_arm(config: Config) -> Iterator[Finding]:
         yield from goals
         if all(finding.level is not Level.STOP for finding in goals):
             yield from _rate(config, bus)
+
+
+def _rest_pose(config: Config) -> Iterator[Finding]:
+    """Whether a spatial arm is clear of itself, the floor and the boxes in its rest pose."""
+    if not config.is_chain:
+        return
+    try:
+        check_rest_pose(config)
+    except ConfigError as error:
+        yield Finding(Level.STOP, "arm", "rest pose", "not free", str(error))
+        return
+    yield Finding(Level.OK, "arm", "rest pose", "clear of itself, the floor and the boxes")
 
 
 def _latency_timer(bus: ServoBus) -> Finding:
@@ -184,7 +199,8 @@ def _status_level(_config: Config, _joint_config: JointConfig, _joint: Joint, se
 
 def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     error = servo.hardware_error()
-    fix = "It stays without torque until rebooted: find the cause, then power-cycle it."
+    stays = "It stays without torque until rebooted: find" if shuts_down(servo, error) else "Find"
+    fix = f"{stays} the cause, then power-cycle it."
     return _graded(error == HardwareError(0), "hardware error", describe_error(error), fix)
 
 

@@ -40,8 +40,7 @@ REBOOT_S = 0.6
 
 
 COUNT_DOWN_S = 5.0
-"""Time from the announcement that an arm whose last run was stopped will move again by itself until torque is on
-[s].
+"""Time between the warning that an arm will move again after a stopped run and switching torque on [s].
 """
 
 

@@ -1,5 +1,6 @@
 """What the servos hold right before a cycle shows whether another master commands them."""
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -65,6 +66,20 @@ def test_a_goal_written_once_or_twice_is_no_proof(fake_config: Make) -> None:
 
     with driven(fake_config(interval=INTERVAL)) as bus:
         after_each(bus, twice, 100)
+
+
+def test_a_foreign_goal_is_told_from_the_first_sighting_until_some_time_after_the_last(fake_config: Make) -> None:
+    with driven(fake_config(interval=INTERVAL)) as bus:
+
+        def once(servos: Any) -> None:
+            if not bus.commanded_by_another:
+                servos[1].write(102, b"\xf7\xff")
+
+        assert bus.commanded_by_another == ""
+        after_each(bus, once, 20)
+        assert re.search(r"Goal Current of .*shoulder.* was -9 although \d+ had been", bus.commanded_by_another)
+        after_each(bus, nothing, 40)
+        assert bus.commanded_by_another == ""
 
 
 def test_a_changed_mode_is_found_within_a_tenth_of_a_second(fake_config: Make) -> None:

@@ -98,7 +98,7 @@ def test_files_that_are_no_description(tmp_path: Path, content: bytes, said: str
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(DescriptionError, match=r"nowhere\.toml: cannot be read: No such file"):
+    with pytest.raises(DescriptionError, match=r"nowhere\.toml cannot be read: No such file"):
         load_fake(tmp_path / "nowhere.toml")
 
 

@@ -166,7 +166,7 @@ def test_list_of_faults(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("nowhere.toml", "--pty"), "nowhere.toml: cannot be read"),
+        (("nowhere.toml", "--pty"), "nowhere.toml cannot be read"),
         ((str(CONFIG), "--pty", "--link", str(CONFIG)), "exists already"),
         ((str(CONFIG), "--pty", "--fault", "gone"), "kinds: lost_reply"),
         ((str(CONFIG), "--pty", "--fault", "overload:servo=9"), "servo = 9: the IDs in"),

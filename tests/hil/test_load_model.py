@@ -34,6 +34,11 @@ def test_it_has_the_estimators_equations(identified: Path) -> None:
     np.testing.assert_allclose(sharp.inverse_dynamics(q, dq, ddq), expected, atol=1e-13)
 
 
+def test_it_is_shown_in_one_line(identified: Path) -> None:
+    model = load_model(identified)
+    assert repr(model) == f"<ArmModel of 2 joints (shoulder, elbow), {len(model.values)} parameters>"
+
+
 def full(model: ArmModel) -> ArmModel:
     """The model with every friction term, ripple, cogging and a cable."""
     more = {"coulomb_width": 0.01, "stribeck_rise": 0.4, "stribeck_velocity": 0.15, "load": 0.05, "ripple_cos": 0.02}
@@ -124,12 +129,12 @@ def test_files_that_hold_no_model_are_refused_with_their_name(identified: Path, 
     }
     for text, said in cases.items():
         damage(path, text)
-        with pytest.raises(ResultError, match=rf"result\.json: .*{said}"):
+        with pytest.raises(ResultError, match=rf"result\.json.* {said}"):
             load_model(identified)
     path.unlink()
     with pytest.raises(ResultError, match=r"has no result\.json.* hil estimate"):
         load_model(identified)
-    with pytest.raises(ResultError, match=r"nowhere: cannot be read: No such file"):
+    with pytest.raises(ResultError, match=r"nowhere cannot be read: No such file"):
         load_model(tmp_path / "nowhere")
 
 

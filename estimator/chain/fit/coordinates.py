@@ -46,7 +46,7 @@ SHAPES = {
 """Priors on the shape of friction and on drives: typical value [its unit] and standard deviation of its logarithm.
 
 Without them, these parameters would be undetermined for a joint that never moves slowly, or has little inertia. Early
-in a fit they do not move at all: a lag that has once been taken for zero, while other errors dominate, hardly grows.
+in a fit they are held fixed: a lag that is driven to zero while other errors dominate would hardly grow again.
 """
 ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
 """Priors on small angles that gravity may not reveal: standard deviations around zero [rad]."""
@@ -106,7 +106,7 @@ class ChainCoordinates:
         return least
 
     def slopes(self, x: Array) -> Array:
-        """Return the derivative of each parameter by its coordinate (parameters,)."""
+        """Return the derivative of each parameter with respect to its coordinate (parameters,)."""
         slope: Array = np.where(self._positive, self.values(x), self._scales)
         return slope
 

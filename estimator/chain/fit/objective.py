@@ -30,7 +30,7 @@ MOST_KEPT = 1 << 26  # bytes of derivatives
 
 @dataclass
 class _Latest:
-    """The latest simulation with derivatives: at the end of a fit, the covariance needs that of the minimum again."""
+    """The latest simulation with derivatives, kept because the covariance needs the one at the minimum again."""
 
     x: Array | None = None
     parts: dict[int, list[tuple[slice, Array, Array]]] = field(default_factory=dict)
@@ -66,8 +66,8 @@ class ChainProblem:
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; less near the minimum."""
     prior_weight: float = 1.0
-    """Factor of the prior's precision: above 1 while model errors exceed the noise that the weights assume, so that
-    the prior still decides what the data do not determine."""
+    """Factor on the prior's precision: above 1 while model errors exceed the noise that the weights assume, so that the
+    prior still decides what the data do not determine."""
     added: tuple[Array | None, ...] = ()
     """Known base parameters of what was added to the arm in each period (base parameters,) [SI]; None for nothing."""
     _latest: _Latest = field(init=False, repr=False, compare=False, default_factory=_Latest)
@@ -103,7 +103,7 @@ class ChainProblem:
         )
 
     def _thinned(self, of_steps: Array) -> Array:
-        """Return the means over each `every` samples of values given for each step (samples, steps, ...)."""
+        """Average values per step (samples, steps, ...) over groups of `every` samples."""
         if self.every > 1:
             whole = of_steps[: len(of_steps) // self.every * self.every]
             of_steps = whole.reshape(-1, self.every, *of_steps.shape[1:]).mean(axis=1)
@@ -185,7 +185,9 @@ class ChainProblem:
         return tuple(found)
 
     def _motions(self, x: Array) -> Iterator[tuple[ChainRun, Array | None]]:
-        """Yield each period's run and its simulated positions (samples, joints) [rad], None if they diverge."""
+        """Yield each period's run and its simulated positions (samples, joints) [rad], or None if the simulation
+        diverges.
+        """
         parameters = self.parameters(x)
         for index, period in enumerate(self.periods):
             run = self.run_of(period, parameters)
@@ -232,7 +234,7 @@ class ChainProblem:
         """Yield the samples, residuals and derivatives of a period, piece by piece.
 
         The residuals, predicted minus measured (samples, joints) [rad], are 0 where a sample is missing, and None if
-        the motion diverges. The derivatives are by parameters and initial state.
+        the motion diverges. The derivatives are with respect to parameters and initial state.
         """
         latest = self._latest
         if latest.x is None or not np.array_equal(latest.x, x):
@@ -265,7 +267,7 @@ class ChainProblem:
         return self.added[index] if self.added else None
 
     def _of_period(self, index: int, parameters: dict[str, float]) -> dict[str, float]:
-        """Return the parameters of the arm as it moved in a period, with what had been added to it."""
+        """Return the parameters of the equivalent arm (`as_moving`) in a period, with what had been added to it."""
         parameters, added = as_moving(self.model.base, parameters), self._added(index)
         if added is None:
             return parameters
@@ -273,7 +275,9 @@ class ChainProblem:
         return parameters | {name: parameters[name] + scale * float(x) for name, x in zip(names, added, strict=True)}
 
     def _where(self, x: Array, index: int) -> tuple[list[int], Array]:
-        """Return the coordinates on which a period's motion depends, and the slopes of parameters and state by them."""
+        """Return the coordinates on which a period's motion depends, and the derivatives of parameters and state with
+        respect to them.
+        """
         size = self.state_scale.size
         first = self.count + index * size
         where = [*range(self.count), *range(first, first + size)]

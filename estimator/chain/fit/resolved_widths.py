@@ -1,4 +1,9 @@
-"""The narrowest smoothed Coulomb steps that a chain's simulation resolves; see `hil.estimator.fit.resolved_widths`."""
+"""Inertias of a chain's joints in a recording, and the narrowest smoothed Coulomb steps that a simulation resolves.
+
+See `hil.estimator.fit.resolved_widths`.
+"""
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -13,8 +18,7 @@ POSES = 40  # of a recording, in which the joints' inertias are computed
 def resolved_widths(problem: ChainProblem, x: Array, shortest_step: float, widths_per_substep: float) -> Array:
     """Return the narrowest Coulomb step that is resolved for each joint (joints,) [rad/s].
 
-    The inertia of a joint is that about its own axis while all others move freely, the smallest in the poses of the
-    recording. widths_per_substep: see `hil.estimator.options.CoordinateOptions`.
+    widths_per_substep: see `hil.estimator.options.CoordinateOptions`.
 
     Args:
         problem: the recordings.
@@ -24,11 +28,21 @@ def resolved_widths(problem: ChainProblem, x: Array, shortest_step: float, width
     """
     model = problem.model
     parameters = as_moving(model.base, problem.parameters(x))
+    inertia = free_inertias(problem, parameters)
+    reversal = 2.0 * np.array([parameters[f"coulomb_{joint + 1}"] for joint in range(model.joints)]) / inertia
+    return np.asarray(reversal * shortest_step / widths_per_substep)
+
+
+def free_inertias(problem: ChainProblem, parameters: Mapping[str, float]) -> Array:
+    """Return each joint's inertia about its own axis while all others move freely (joints,) [kg m^2].
+
+    The smallest in the poses of the recordings.
+    """
+    model = problem.model
     every = model.base.as_all(np.array([parameters[name] for name in model.base.names]))
     inertia = np.inf * np.ones(model.joints)
     for period in problem.periods:
         for q in period.filled()[:, :: max(1, period.samples // POSES)].T:
             inverse = np.linalg.pinv(mass_matrix(model.base.chain, every, q), hermitian=True)
             inertia = np.minimum(inertia, 1.0 / np.maximum(np.diag(inverse), 1e-9))
-    reversal = 2.0 * np.array([parameters[f"coulomb_{joint + 1}"] for joint in range(model.joints)]) / inertia
-    return np.asarray(reversal * shortest_step / widths_per_substep)
+    return inertia

@@ -15,7 +15,7 @@ from hil.estimator.chain.fit.coordinates import ChainCoordinates, kind_of
 from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.fit.resolved_widths import resolved_widths
 from hil.estimator.chain.fit.stage1 import ChainLinear
-from hil.estimator.chain.fit.uncertainty import coloured_covariance
+from hil.estimator.chain.fit.uncertainty import coloured_covariance, neglected_covariance
 from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod
@@ -64,7 +64,7 @@ class ChainOptions:
     initial_width: float = 0.03
     """Initial width of the smoothed Coulomb step [rad/s]."""
     other_initial_widths: tuple[float, ...] = (0.005, 0.001)
-    """Initial widths of further fits, while none explains the motion [rad/s]."""
+    """Initial widths of further fits, tried as long as no fit explains the motion [rad/s]."""
     min_initial_lag: float = 5e-4
     """Minimum initial guess of the lag [s]."""
     reach: float = 0.3
@@ -79,8 +79,9 @@ class ChainOptions:
     towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
     """Initial guesses as fractions of the way from the prior to stage 1; the first that can be simulated is used."""
     unfinished: float = 1.0
-    """Decrease of the sum of squares, expected of one more step, above which the minimum counts as not reached: the
-    fit continues with shorter integration steps. 1 is a distance of one standard error."""
+    """Expected decrease of the sum of squares in one more step, above which the minimum counts as not reached and the
+    fit continues with shorter integration steps. 1 is a distance of one standard error.
+    """
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""
     outlier_threshold: float = 4.0
@@ -91,7 +92,7 @@ DEFAULTS = ChainOptions()
 REPEATED = 4  # consecutive equal readings that still count in full: a moving joint produces as many
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 NEARER, LAST = MinimiserOptions(max_damping=0.1), MinimiserOptions(max_damping=1.0)
-"""Options of the last iterations with coarse steps, which fine ones follow, and with fine steps.
+"""Options of the last iterations with coarse steps, and of those with fine steps that follow.
 
 Where a joint is on the verge of sticking, the sum of squares is slightly discontinuous. A decrease that is only
 achieved with heavy damping is such a discontinuity and is not pursued.
@@ -123,12 +124,16 @@ class ChainFit:
     softness: float
     """Natural frequency of the observer at the end [Hz]."""
     remaining: float
-    """Decrease of the sum of squares that is expected of one more step, which leads to the minimum."""
+    """Decrease of the sum of squares that is expected from one more step, the one that would reach the minimum."""
+    neglected: Array
+    """Covariance due to what the model of voltage-driven joints neglects (parameters, parameters) [SI]."""
 
     @property
     def total_covariance(self) -> Array:
-        """Covariance of `value` about the truth: that at the minimum, widened by the distance to the minimum."""
-        return np.asarray(self.covariance + np.outer(self.missing, self.missing))
+        """Covariance of `value` about the truth: that at the minimum, widened by the distance to the minimum and by
+        what the model is known to neglect.
+        """
+        return np.asarray(self.covariance + np.outer(self.missing, self.missing) + self.neglected)
 
     @property
     def reached(self) -> bool:
@@ -357,6 +362,7 @@ def _fit(
         iterations,
         problem.softness,
         decrease,
+        neglected_covariance(problem, x),
     )
 
 

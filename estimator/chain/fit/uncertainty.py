@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.objective import ChainProblem
+from hil.estimator.chain.fit.resolved_widths import free_inertias
+from hil.estimator.chain.model.late_torque import lost_inertia, rotor
 
 MOST_SAMPLES = 1 << 13  # of a period: enough to estimate a noise level to within a tenth
 SUPPOSED = 10.0  # degrees of freedom assigned to white noise, and to the common level in that of each joint
@@ -41,13 +43,31 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
     return covariance
 
 
+def neglected_covariance(problem: ChainProblem, x: Array) -> Array:
+    """Return the covariance (parameters, parameters) [SI] due to what the description of late back-EMF neglects.
+
+    Friction affects the motor's current later by the difference of both lags, which makes a joint's inertia wrong by
+    the square of what it loses, relative to the inertia (`hil.estimator.simulation.back_emf.neglected`).
+    """
+    base, parameters = problem.model.base, problem.parameters(x)
+    total = np.zeros((problem.count, problem.count))
+    lost = lost_inertia(base, parameters)
+    if lost:
+        inertia = free_inertias(problem, parameters)
+        for joint, each in lost.items():
+            wrong = each**2 / inertia[joint] * rotor(base, joint)
+            total[: base.count, : base.count] += np.outer(wrong, wrong)
+    return total
+
+
 @dataclass(frozen=True)
 class _Spectrum:
     """One joint's Jacobian and residual in one period, by frequency."""
 
     joint: int
     lines: NDArray[np.complex128]
-    """Jacobian by scaled coordinates (lines, coordinates), normalised as in a real orthonormal transform."""
+    """Jacobian with respect to scaled coordinates (lines, coordinates), normalised as in a real orthonormal transform.
+    """
     power: Array
     """Power of the residual (lines,); 1 for white noise with the variance that the weights assume."""
     share: Array

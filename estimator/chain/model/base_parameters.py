@@ -28,11 +28,11 @@ CLEARLY_INDEPENDENT = 0.1
 
 It is relative to the largest column of the same link and kind.
 """
-INDEPENDENT = 1e-4
+INDEPENDENT = 2e-3
 """Norm of that part, on the same scale, above which the column is kept in the end.
 
-Angles such as 1.5708 in a description make every parameter slightly independent, but change no torque by more than this
-fraction.
+Angles such as 1.57 or 1.5708 in a description make every parameter slightly independent, but change no torque by more
+than this fraction of what the parameter contributes where it counts. No recording would determine such a parameter.
 """
 LEAST_FACTOR = 1e-7  # of a group
 NOTHING = 1e-9
@@ -55,8 +55,8 @@ class BaseParameters:
     def of(cls, chain: Chain, seed: int = 1, *, tilts: bool = False) -> "BaseParameters":
         """Return the base parameters of this chain.
 
-        tilts: those for any direction of gravity, since the base may be tilted. A first joint that is vertical then
-        counts as one that gravity may turn, so there are more of them.
+        tilts: allow for a tilted base, that is, for any direction of gravity. Gravity may then also act on a vertical
+        first joint, so there are more base parameters.
         """
         anywhere = replace(chain, gravity=tilted(chain.gravity, *GENERIC)) if tilts else chain
         Y = _random_regressor(anywhere, seed)

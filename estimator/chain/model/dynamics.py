@@ -43,7 +43,7 @@ def mass_matrix(chain: Chain, parameters: Array, position: Array) -> Array:
 def torque_derivatives(
     chain: Chain, parameters: Array, position: Array, velocity: Array, acceleration: Array
 ) -> tuple[Array, Array]:
-    """Return the derivatives of the torques by angles and by velocities at one instant.
+    """Return the derivatives of the torques with respect to angles and to velocities at one instant.
 
     Both are (joints, joints) [N m/rad, N m s/rad].
     """

@@ -1,4 +1,4 @@
-"""Compiled rigid-body dynamics of a serial chain: torque, mass matrix, regressor, derivatives by angle and velocity.
+"""Compiled rigid-body dynamics of a serial chain: torque and its derivatives, mass matrix, regressor.
 
 Recursive Newton-Euler and composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms, 2008), with all spatial
 vectors expressed about the base's origin, so that no transformation between links is needed: motions are (angular,
@@ -197,7 +197,9 @@ def accelerate(armature: Any, gravity: Any, v: Any, a: Any, room: Any) -> None:
 
 
 def differentiate(gravity: Any, room: Any) -> None:
-    """Compute the torques' derivatives by angles and velocities at the accelerations last given to `accelerate`."""
+    """Compute the torques' derivatives with respect to angles and velocities, at the last accelerations of
+    `accelerate`.
+    """
     _, motion, body, seized, _, _, by_q, by_v, spare = room
     n = motion.shape[0]
     still, falling, force, forced, both = spare[0], spare[1], spare[2], spare[3], spare[4]
@@ -322,7 +324,7 @@ def _into(f: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
 
 
 def invert(matrix: Any, inverse: Any, factor: Any) -> bool:  # noqa: PLR0912
-    """Invert a symmetric positive definite matrix by its Cholesky factor; return False if it is not one."""
+    """Invert a symmetric matrix by its Cholesky factor; return False if the matrix is not positive definite."""
     n = matrix.shape[0]
     for i in range(n):
         for j in range(i + 1):

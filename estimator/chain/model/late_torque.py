@@ -2,20 +2,24 @@
 
 The back-EMF passes the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the product of
 its back-EMF and its lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due to
-it.
+it. No lag of a winding makes a joint lighter by more than half of its inertia, where the poles of the equivalent motor
+meet, so parameters that ask for more, far from the minimum of a fit, are limited to that.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.base_parameters import BaseParameters
-from hil.estimator.chain.model.dynamics import TERMS
+from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 
 MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
-"""What the kinds of parameters that only chains have mean."""
+"""Meanings of the kinds of parameters that only chains have."""
+MOST_LOST = 0.5
+"""Largest fraction of a joint's inertia by which a lagging back-EMF makes it move like a lighter one."""
 _ARMATURE = 10  # of a link's parameters
+_POSES = np.random.default_rng(4).uniform(-np.pi, np.pi, (6, 7))  # in which inertias are compared (poses, joints)
 
 
 def lags_of(parameters: Mapping[str, float], joints: int) -> Array:
@@ -25,24 +29,42 @@ def lags_of(parameters: Mapping[str, float], joints: int) -> Array:
 
 
 def as_moving(base: BaseParameters, parameters: Mapping[str, float]) -> dict[str, float]:
-    """Return the parameters of the arm that moves under lagging voltages as this one does."""
+    """Return the parameters of the equivalent arm, with lighter rotors, whose back-EMF does not lag."""
     moving = dict(parameters)
-    for joint, share, viscous, late in _generating(base.chain.joints, parameters):
-        for name, factor in zip(base.names, _rotor(base, joint), strict=True):
-            moving[name] -= share * viscous * late * factor
+    generating = _generating(base.chain.joints, parameters)
+    possible = _possible(base, parameters, generating)
+    for joint, share, viscous, late in generating:
+        for name, factor in zip(base.names, rotor(base, joint), strict=True):
+            moving[name] -= possible * share * viscous * late * factor
     return moving
 
 
-def complete(base: BaseParameters, parameters: Mapping[str, float], names: tuple[str, ...], derivative: Array) -> None:
-    """Turn derivatives (samples, joints, causes) of the simulation into those by `names`, in place.
+def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[int, float]:
+    """Return by how much lighter each voltage-driven joint (from 0) moves than it is [kg m^2]."""
+    generating = _generating(base.chain.joints, parameters)
+    possible = _possible(base, parameters, generating)
+    return {joint: possible * share * viscous * late for joint, share, viscous, late in generating}
 
-    The simulation is that of the arm of `as_moving`, with derivatives by each joint's own lag. names: the base
-    parameters are the first.
+
+def rotor(base: BaseParameters, joint: int) -> Array:
+    """Return the base parameters of a unit rotor inertia of a joint, counted from 0 (base parameters,)."""
+    column: Array = base.grouping[:, TERMS * joint + _ARMATURE]
+    return column
+
+
+def complete(base: BaseParameters, parameters: Mapping[str, float], names: tuple[str, ...], derivative: Array) -> None:
+    """Convert the simulation's derivatives (samples, joints, causes) to those with respect to `names`, in place.
+
+    The simulated arm is that of `as_moving`, and its derivatives are with respect to each joint's own lag. names: the
+    base parameters come first.
     """
     at = {name: index for index, name in enumerate(names)}
     ratios = [parameters.get(f"lag_ratio_{joint + 1}", 1.0) for joint in range(base.chain.joints)]
-    for joint, share, viscous, late in _generating(base.chain.joints, parameters):
-        by_rotor = derivative[:, :, : base.count] @ _rotor(base, joint)
+    generating = _generating(base.chain.joints, parameters)
+    # At the limit the loss no longer grows with its causes.
+    free = _possible(base, parameters, generating) == 1.0
+    for joint, share, viscous, late in generating if free else ():
+        by_rotor = derivative[:, :, : base.count] @ rotor(base, joint)
         own = f"lag_ratio_{joint + 1}"
         for name, change in {
             f"viscous_{joint + 1}": share * late,
@@ -59,7 +81,9 @@ def complete(base: BaseParameters, parameters: Mapping[str, float], names: tuple
 
 
 def _generating(joints: int, parameters: Mapping[str, float]) -> list[tuple[int, float, float, float]]:
-    """Voltage-driven joints with the share of their viscous friction, that friction, and the delay of their torque."""
+    """Return each voltage-driven joint, the fraction of its viscous friction due to back-EMF, that friction, and its
+    delay.
+    """
     late = lags_of(parameters, joints) + max(parameters.get("delay", 0.0), 0.0)
     return [
         (joint, parameters[f"back_emf_{joint + 1}"], parameters[f"viscous_{joint + 1}"], float(late[joint]))
@@ -68,7 +92,20 @@ def _generating(joints: int, parameters: Mapping[str, float]) -> list[tuple[int,
     ]
 
 
-def _rotor(base: BaseParameters, joint: int) -> Array:
-    """Base parameters of a unit rotor inertia of a joint (base parameters,)."""
-    column: Array = base.grouping[:, TERMS * joint + _ARMATURE]
-    return column
+def _possible(
+    base: BaseParameters, parameters: Mapping[str, float], generating: Sequence[tuple[int, float, float, float]]
+) -> float:
+    """Return the fraction, at most 1, of the inertias lost to lagging back-EMF that these joints can lose."""
+    lost = np.zeros(base.chain.joints)
+    for joint, share, viscous, late in generating:
+        lost[joint] = share * viscous * late
+    if not lost.any() or not np.all(np.isfinite(lost)):
+        return 1.0
+    every = base.as_all(np.array([parameters[name] for name in base.names]))
+    root = np.sqrt(lost)
+    largest = 0.0
+    for pose in _POSES[:, : base.chain.joints]:
+        mass = mass_matrix(base.chain, every, pose)
+        if np.all(np.isfinite(mass)) and np.linalg.eigvalsh(mass)[0] > 0.0:  # else it cannot be simulated anyway
+            largest = max(largest, float(np.linalg.eigvalsh(root[:, None] * np.linalg.inv(mass) * root)[-1]))
+    return min(1.0, MOST_LOST / largest) if largest > 0.0 else 1.0

@@ -91,7 +91,7 @@ def _link(x: Array) -> Array:
 
 
 def _link_slopes(x: Array) -> Array:
-    """Return the derivatives of `_link` by its coordinates (10, 10)."""
+    """Return the derivatives of `_link` with respect to its coordinates (10, 10)."""
     columns = []
     for k, step in enumerate(STEP * _scales()):
         ahead, behind = x.copy(), x.copy()
@@ -102,7 +102,7 @@ def _link_slopes(x: Array) -> Array:
 
 
 def _coordinates(link: Array) -> Array:
-    """Return a link's coordinates; a link that is not physical is first made so."""
+    """Return a link's coordinates; an unphysical link is first made physically consistent."""
     mass = max(float(link[0]), LEAST_MASS)
     centre = link[1:4] / mass if link[0] > LEAST_MASS else np.zeros(3)
     inertia = np.zeros((3, 3))

@@ -27,6 +27,10 @@ class Prior:
     """Inverse covariance of the logarithms of the torque scales of all joints but the first (joints - 1, joints - 1);
     None if nothing is known about them."""
 
+    def surpassing(self, names: tuple[str, ...], std: Array) -> tuple[str, ...]:
+        """Return the base parameters whose standard errors (base parameters or more,) exceed the prior's."""
+        return tuple(name for name, each, own in zip(names, std[: self.std.size], self.std, strict=True) if each > own)
+
     @classmethod
     def of(
         cls, base: BaseParameters, links: Array, armature: Array | None = None, scale_std: Array | None = None
@@ -34,7 +38,7 @@ class Prior:
         """Create the prior from described link parameters.
 
         Args:
-            base: the combinations of them that affect the torque.
+            base: the parameter combinations that affect the torque.
             links: (joints, 10) [SI].
             armature: rotor inertias (joints,) [kg m^2], if known.
             scale_std: relative standard deviations of the joints' torque constants (joints,), if known.

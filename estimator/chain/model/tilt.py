@@ -44,7 +44,7 @@ def tilted(gravity: Array, x: float, y: float) -> Array:
 
 
 def tilt_slopes(gravity: Array, x: float, y: float) -> Array:
-    """Return the derivatives of `tilted` by both angles (2, 3) [m/s^2 per rad]."""
+    """Return the derivatives of `tilted` with respect to both angles (2, 3) [m/s^2 per rad]."""
     by_x = tilted(gravity, x + _STEP, y) - tilted(gravity, x - _STEP, y)
     by_y = tilted(gravity, x, y + _STEP) - tilted(gravity, x, y - _STEP)
     return np.stack((by_x, by_y)) / (2.0 * _STEP)

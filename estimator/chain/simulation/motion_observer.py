@@ -61,11 +61,20 @@ class ChainObserver:
     covariance: of `mean`.
     largest: largest planned torque of each joint (joints,) [N m].
     interval: sampling interval [s].
+    frictions: the same scale of torque is at least this multiple of dry friction, as far as it is known.
 
     Raises ValueError for arrays of other shapes.
     """
 
-    def __init__(self, base: BaseParameters, mean: Array, covariance: Array, largest: Array, interval: float) -> None:
+    def __init__(
+        self,
+        base: BaseParameters,
+        mean: Array,
+        covariance: Array,
+        largest: Array,
+        interval: float,
+        frictions: float = 0.0,
+    ) -> None:
         n = base.chain.joints
         count = base.count + 3 * n
         if mean.shape != (count,) or covariance.shape != (count, count) or largest.shape != (n,):
@@ -76,13 +85,15 @@ class ChainObserver:
         self._theta, self._covariance = np.array(mean), np.array(covariance)
         self._memory = np.zeros((TIMES_OF_ALL + 1, max(n, 2)))
         self._rests = standstill.memory(n, count)
-        self._first = np.array((FIRST_NOISE_SHARE * largest) ** 2)
+        dry = np.maximum(mean[base.count + n : base.count + 2 * n], 0.0)
+        first = np.maximum(largest, frictions * dry)
+        self._first = np.array((FIRST_NOISE_SHARE * first) ** 2)
         self._memory[NOISE, :n] = self._first
         drift = LEAST_DRIFT**2 * np.diag(covariance)
-        # A joint that has moved one way only does not tell dry friction from an offset, so what may hold it at rest is
+        # Motion in one direction only cannot separate dry friction from an offset, so what may hold a joint at rest is
         # never taken as less than the friction that was expected.
-        expected = np.maximum(mean[base.count + n : base.count + 2 * n], 0.0)
-        self._constants = FLOOR_SHARE * largest, (0.01 * largest) ** 2, drift, interval, expected
+        floors = FLOOR_SHARE * np.stack((largest, first)), FLOOR_SHARE * frictions
+        self._constants = *floors, (0.01 * first) ** 2, drift, interval, dry
         self._chain = base.chain.arrays, places(n, base.columns), base.count
         self._work = room(n), np.zeros((n, base.count + 1)), np.zeros(count), np.zeros(count), np.zeros((n, 10))
         self._joints = n
@@ -139,7 +150,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
     is_free: Any,
     support: Any,
 ) -> int:
-    floor, least_noise, drift, interval, expected = constants
+    floors, of_friction, least_noise, drift, interval, expected = constants
     arrays, column, base = chain
     rooms, Y, row, gain, _ = work
     n, count = q.size, theta.size
@@ -206,7 +217,9 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
             left_open += row[i] * total
         memory[LACKING, j] = lacking
         friction = base + n + j
-        dry = max(theta[friction] + math.sqrt(max(covariance[friction, friction], 0.0)), expected[j])
+        learnt = theta[friction] + math.sqrt(max(covariance[friction, friction], 0.0))
+        dry = max(learnt, expected[j])
+        floor = max(floors[0, j], min(floors[1, j], of_friction * learnt))
         static = max(STATIC * dry, _withstood(rests[j]))
         stands = min(max(memory[STANDS, j], 0.0), 1.0)
         holds = static * stands
@@ -221,7 +234,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         if lacking * support[j] > 0.0:
             beyond = 0.0
         limit = TIMES * math.sqrt(spread)
-        share = beyond / max(limit, quiet * floor[j])
+        share = beyond / max(limit, quiet * floor)
         if share <= 1.0:
             memory[HELD, j] = memory[SAMPLES, j] = 0.0
         else:
@@ -237,7 +250,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
             variance = 2.0 * quiet * quiet * memory[NOISE, j]
             if abs(distance) > 2.0 * static:  # otherwise it does not matter, and would take time
                 variance += _variance(rests[j], distance, row, covariance)
-            tolerance = max(TIMES * math.sqrt(variance), quiet * floor[j])
+            tolerance = max(TIMES * math.sqrt(variance), quiet * floor)
             momentum = VISIBLE_RAD_S * abs(_own_inertia(rooms, column, theta, base, j))
             held = abs(lacking) - CERTAIN * math.sqrt(left_open)
             if _blocked(rests[j], distance, held, static, tolerance, momentum, FILTER_S, dt):

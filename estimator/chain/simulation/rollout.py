@@ -49,6 +49,12 @@ class ChainArms:
         """Return the first `count` arms."""
         return ChainArms(self.base, self.rigid[:count], self.drive[:count])
 
+    def and_more(self, others: "ChainArms") -> "ChainArms":
+        """Return these arms, followed by others of the same chain."""
+        return ChainArms(
+            self.base, np.concatenate((self.rigid, others.rigid)), np.concatenate((self.drive, others.drive))
+        )
+
     def chosen(self, arms: Any) -> "ChainArms":
         """Return the arms with these indices."""
         return ChainArms(self.base, self.rigid[arms], self.drive[arms])

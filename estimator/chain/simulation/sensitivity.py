@@ -24,7 +24,7 @@ class ChainRun:
     torque: Array
     """Mean motor torque over each step after each sample, unscaled (samples, steps, joints) [N m]."""
     slopes: Array
-    """Derivatives of `torque` by delay and by lag (samples, steps, 2, joints) [N m/s]."""
+    """Derivatives of `torque` with respect to delay and lag (samples, steps, 2, joints) [N m/s]."""
     measured: Array
     """Measured angles (samples, joints) [rad]; NaN where a sample is missing."""
     step: float
@@ -42,7 +42,8 @@ class Simulation:
     parameters: by name [SI].
     start: state at the first sample (2, joints) [rad, rad/s].
     gain: gains of the observer per sample (2, joints) [1, 1/s].
-    names: parameters by which to differentiate, followed by the initial angles and velocities; no derivatives if empty.
+    names: parameters with respect to which to differentiate, followed by the initial angles and velocities; no
+    derivatives if empty.
     """
 
     def __init__(
@@ -99,7 +100,8 @@ class Simulation:
         """Simulate the next `piece` of the samples.
 
         Returns the angles (samples, joints) [rad], None if the motion diverges, and their derivatives (samples, joints,
-        causes). In place of that by a `lag_ratio` is the one by this joint's own lag, which that by `lag` excludes.
+        causes). The column of a `lag_ratio` holds the derivative with respect to that joint's own lag, which the column
+        of `lag` excludes.
         """
         torque, measured = run_.torque[piece], run_.measured[piece]
         position = np.empty(measured.shape)

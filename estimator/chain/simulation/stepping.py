@@ -1,4 +1,4 @@
-"""The compiled motion of a chain under given motor torques, and its derivatives by parameters and initial state.
+"""The compiled motion of a chain under given motor torques, and its derivatives (parameters, initial state).
 
 Friction and drive are those of `hil.estimator.simulation.arm`. Each step uses that module's Rosenbrock method ROS2,
 with the second stage written so that both stages need the regressor at one acceleration only. With f the torques minus
@@ -65,10 +65,11 @@ def _direct(
     by: Any,
     row: Any,
 ) -> None:
-    """Compute the direct derivatives of joint j's step equation by the drive's parameters, and by v into `by`.
+    """Compute the direct derivatives of joint j's step equation with respect to the drive's parameters; those with
+    respect to v go to `by`.
 
-    left: see `_left`. slopes: derivatives of the torque by delay and by lag. times: columns of the delay and the
-    lag of each joint. ghk: gamma h times the stage's acceleration.
+    left: see `_left`. slopes: derivatives of the torque with respect to delay and lag. times: columns of the delay and
+    the lag of each joint. ghk: gamma h times the stage's acceleration.
     """
     scale, width, fading = p[SCALE, j], p[WIDTH, j], p[FADING, j]
     motor = scale * t
@@ -193,7 +194,7 @@ def _follow(
     by: Any,
     direct: Any,
 ) -> None:
-    """Compute the derivatives of a solved stage's equation by q and v (in `work`) and parameters (in `direct`)."""
+    """Differentiate a solved stage's equation with respect to q and v (`work`) and the parameters (`direct`)."""
     base, at, times, tilts, falls = columns
     total = solve[5]
     accelerate(links[1], chain[3], v, total, work)

@@ -19,7 +19,9 @@ _VALUE, _LIMITS, _HEALTH = 7, 12, 14  # columns of a value, of a gauge's two lim
 
 @dataclass(frozen=True)
 class Layout:
-    """What fits into the terminal. gauge: columns of a gauge; gauges: how many of position and goal have one."""
+    """What fits into the terminal. gauge: columns of a gauge; gauges: how many of the two quantities, position and
+    goal, have a gauge.
+    """
 
     gauge: int
     gauges: int

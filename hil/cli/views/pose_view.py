@@ -6,7 +6,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from hil.config.chain import described_arm
+from hil.config.chain import base_up, described_arm
 from hil.config.schema import Config
 from hil.description.motion import moves
 from hil.printing import print_fitting, result_console
@@ -23,7 +23,7 @@ def print_pose(config: Config, pose: Pose) -> None:
         low, high = joint.position_limit
         name, angle = escape(joint.name), pose.angles[index]
         cells = f"{angle:+.3f}", f"{np.degrees(angle):+.1f}", f"{low:g} to {high:g}"
-        table.add_row(name, str(joint.id), *cells, moves(arm, angles, index))
+        table.add_row(name, str(joint.id), *cells, moves(arm, angles, index, base_up(config)))
     console = result_console()
     print_fitting(console, table)
     x, y, z = pose.end

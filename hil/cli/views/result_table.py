@@ -57,7 +57,7 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
         compared = (
             "the simplest model"
             if choice.chosen == choice.plainest
-            else f"with an error {_times(_inverse(choice.error_divided_by))} compared with the simplest model's"
+            else f"whose error is {_times(_inverse(choice.error_divided_by))} compared with the simplest model's"
         )
         print(f"Chosen on held-out segments: {choice.chosen}, {compared}.")
     if result.physical is not None:
@@ -121,18 +121,21 @@ def _may_be_absent(name: str, entry: Quantity) -> bool:
 
 def _constant_std(result: SettledResult, name: str) -> float:
     """Relative standard error of the joint's torque constant, with which the parameter scales; 0 where it does not."""
+    known = [
+        each.torque_per_goal_std / each.torque_per_goal if each.torque_per_goal else 0.0 for each in result.arm.joints
+    ]
+    # Where the ratios of the torque constants were identified, every value scales with that of the first joint.
+    has_ratios = any(kind_of(each) == RATIO for each in result.extra)
     if kind_of(name) not in TERMS:  # a base parameter of a spatial arm, to which several joints' torques contribute
-        return 0.0
+        return known[0] if has_ratios else max(known, default=0.0)
     joint = joint_of(name) or 1
-    if not term_of(name).of_torque or joint > len(result.arm.joints):
+    if not term_of(name).of_torque or joint > len(known):
         return 0.0
-    # Where the ratio of the torque constants was identified, every value scales with that of the first joint.
-    facts = result.arm.joints[0 if f"{RATIO}_{joint}" in result.extra else joint - 1]
-    return facts.torque_per_goal_std / facts.torque_per_goal if facts.torque_per_goal else 0.0
+    return known[0 if f"{RATIO}_{joint}" in result.extra else joint - 1]
 
 
 def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
-    """counted: standard error with which an error is compared, including that of the torque constant."""
+    """Return the cells of a parameter. counted: its standard error, including that of the torque constant."""
     value, std = entry.value, entry.std
     cells = [f"{value:.5g}", f"{std:.1e}"]
     if truth is not None:
@@ -169,10 +172,14 @@ def _choice(result: SettledResult) -> list[str]:
     cost = choice.standard_errors_times
     if choice.chosen == choice.plainest:
         return [f"Model chosen from {among}: {choice.chosen}, which has the fewest parameters of them."]
-    return [
-        f"Model chosen from {among}: {choice.chosen}. Compared with {choice.plainest}, its prediction error is "
-        f"{_times(_inverse(choice.error_divided_by))} and its standard errors are {_times(cost)}."
-    ]
+    if choice.error_divided_by <= 1.0 + _ALIKE:
+        return [
+            f"Model chosen from {among}: {choice.chosen}. It predicts about as well as {choice.plainest}, but what it "
+            "adds is significant in the fitted motion."
+        ]
+    smaller = f"its prediction error is {_times(_inverse(choice.error_divided_by))}"
+    wider = "" if cost is None else f" and its standard errors are {_times(cost)}"
+    return [f"Model chosen from {among}: {choice.chosen}. Compared with {choice.plainest}, {smaller}{wider}."]
 
 
 def _inverse(ratio: float) -> float | None:
@@ -224,6 +231,6 @@ def _is_useless(result: Result) -> bool:
 
 
 def _usual_format(result: Result) -> str:
-    """A format that can hold this arm: MJCF needs the length of link 1, which only gravity determines."""
+    """A format that can hold this arm: MJCF needs the length of link 1, which can only be determined with gravity."""
     flat = result.chain is None and result.arm is not None and not result.arm.gravity
     return "toml" if flat else "mjcf"

@@ -116,7 +116,7 @@ def print_changes(changes: Sequence[Change], port: str) -> None:
         if change.written:
             print(f"{change.register}: {change.before} -> {change.after}, read back.")
         elif change.before == change.after:
-            print(f"{change.register}: is already {change.after}.")
+            print(f"{change.register} is already {change.after}.")
         else:
             print(f"{change.register}: left at {change.before}.")
     print(next_step("scan", port))

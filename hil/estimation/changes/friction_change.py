@@ -92,14 +92,14 @@ def _of_joint(
     together = float(chi2.sf(difference @ pushed, len(names)))
     change = float(pushed[best] / sharp[best] * scale[best])
     stds = dict(zip(names, (scale / np.sqrt(sharp)).tolist(), strict=True))
-    # As many questions were asked as there are terms, and one more (Bonferroni).
+    # One hypothesis per term was tested, and one about all of them (Bonferroni).
     p = min(1.0, (len(names) + 1) * min(alone, together))
     level = float(before[best])
     return FrictionChange(joint, names[best], level, level + change, stds[names[best]], float(z[best]), p, stds)
 
 
 def _comparable(models: Sequence[ArmModel], name: str) -> bool:
-    """Whether both models have the term, or one does and the other is the same model with a zero in its place."""
+    """Whether both models have the term, or one has it and its absence from the other is the same as a value of 0."""
     having = [name in model.values for model in models]
     return all(having) or (any(having) and TERMS[name.rpartition("_")[0]].absent == 0.0 and "velocity" not in name)
 

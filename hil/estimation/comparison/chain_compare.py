@@ -35,8 +35,8 @@ Array = NDArray[np.float64]
 
 
 def compare_chain(run: RunFolder, mujoco: bool) -> tuple[Mapping[str, float] | None, dict[str, Peer], "Judge"]:
-    """Apply every method to the settled period of `run`; return the truth, if known, the results, and the judge of
-    their predictions.
+    """Apply every method to the settled period of `run`; return the true parameters, if known, the results, and the
+    object that evaluates their predictions.
 
     Raises HilError, EstimationError.
     """
@@ -94,9 +94,11 @@ def worst_chain_error(parameters: Mapping[str, float], truth: Mapping[str, float
 
 def _methods(config: Config, period: SettledPeriod, judge: Judge) -> Iterator[Peer]:
     model, prior = judge.model, known_chain(config).prior
-    fit = choose_chain if config.model.friction == "auto" else identify_chain
     began = time.perf_counter()
-    ours = fit(period, model, prior)
+    if config.model.friction == "auto":
+        ours = choose_chain(period, model, prior).estimate
+    else:
+        ours = identify_chain(period, model, prior)
     seconds = time.perf_counter() - began
     yield Peer("hil", ours.parameters, _by_name(ours.names, ours.std), seconds, ours.model.description, 1)
     began = time.perf_counter()

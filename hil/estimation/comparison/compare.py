@@ -26,7 +26,7 @@ from hil.runs.run_folder import RunFolder, write_json
 SCHEMA = 1
 OURS = "hil"
 OURS_PLAIN = "hil_coulomb"
-"""The estimate of hil with the friction model that mujoco.sysid has too, for a fair comparison of computing times."""
+"""hil's own estimate with the friction model that mujoco.sysid has too, for a fair comparison of computing times."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def _compare_chain(run: RunFolder, config: str, mujoco: bool) -> Comparison:
 def all_methods(
     config: Config, period: SettledPeriod, truth: Mapping[str, float] | None, mujoco: bool, seed: int
 ) -> Iterator[Peer]:
-    """Yield the estimate of hil, then those of the other methods."""
+    """Yield hil's own estimate, then those of the other methods."""
     ours = _ours(period, OURS, wanted_model(config.model, period.joints, voltage_driven(config)))
     yield ours
     length = link_length(config)

@@ -23,26 +23,45 @@ FEWEST = 200  # samples
 
 def jump_warnings(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> list[str]:
     """One sentence per joint whose position jumped."""
-    begin = float(samples["deadline"][0]) if len(samples) else 0.0
     found = []
-    for index, joint in enumerate(config.joints):
-        step = facts.position_step[index]
-        jumps = position_jumps(
-            samples["deadline"] - begin,
-            samples["position"][:, index].astype(np.float64),
-            samples["velocity"][:, index].astype(np.float64),
-            step,
-        )
+    for index, jumps in enumerate(_jumps(config, facts, samples)):
         if not jumps:
             continue
         time, size = max(jumps, key=lambda jump: abs(jump[1]))
         others = f" ({len(jumps)} jumps in all)" if len(jumps) > 1 else ""
         found.append(
-            f"{joint.name}: the position jumped by {size:+.3f} rad ({abs(size) / step:.0f} encoder steps) at "
-            f"{time:.2f} s{others}, which the velocity before and after does not explain: everything after "
-            "it is shifted. Check the horn's screws, the encoder's magnet and the cable, then record again."
+            f"{config.joints[index].name}: the position jumped by {size:+.3f} rad "
+            f"({abs(size) / facts.position_step[index]:.0f} encoder steps) at {time:.2f} s{others}, which the velocity "
+            "before and after does not explain: everything after it is shifted. Check the horn's screws, the encoder's "
+            "magnet and the cable, then record again."
         )
     return found
+
+
+def jump_disturbances(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tuple[str, ...]:
+    """A sentence for the verdict that names the joints whose position jumped, if any."""
+    found = zip(config.joints, _jumps(config, facts, samples), strict=True)
+    names = [joint.name for joint, jumps in found if jumps]
+    if not names:
+        return ()
+    return (
+        f"The position of {' and '.join(names)} jumped during the recording (see the warning), so angles before and "
+        "after the jump do not belong together: the values may be wrong by more than their standard errors.",
+    )
+
+
+def _jumps(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> list[list[tuple[float, float]]]:
+    """Jumps of each joint, as in `position_jumps`, with times from the first sample."""
+    begin = float(samples["deadline"][0]) if len(samples) else 0.0
+    return [
+        position_jumps(
+            samples["deadline"] - begin,
+            samples["position"][:, index].astype(np.float64),
+            samples["velocity"][:, index].astype(np.float64),
+            facts.position_step[index],
+        )
+        for index in range(len(config.joints))
+    ]
 
 
 def position_jumps(time: Array, position: Array, velocity: Array, step: float) -> list[tuple[float, float]]:

@@ -1,6 +1,7 @@
-"""A joint that came to rest elsewhere than where it had rested before the run: its horn or encoder may have slipped.
+"""A joint that came to rest at a different angle than before the run: its horn or encoder may have slipped.
 
-A horn that slips smoothly leaves no jump in the readings. What remains is that the arm hangs at another angle.
+A horn that slips smoothly leaves no jump in the readings. The only trace is that the arm then hangs at a different
+angle.
 """
 
 import numpy as np
@@ -16,16 +17,16 @@ LEAST_RAD = 0.1
 """Smallest shift that is reported [rad]."""
 
 _FRICTION_TIMES = 2.0
-"""Multiple of the servo's typical friction, with breakaway, that may hold a joint away from where it would hang."""
+"""Multiple of the servo's typical breakaway friction that may hold a joint away from where it would hang."""
 
 _STILL_RAD = 0.02
 """Range of positions within which an arm counts as resting [rad]."""
 
 
 def rest_shift_warnings(config: Config, samples: NDArray[np.void], result: SettledResult) -> list[str]:
-    """One sentence per joint that rests farther from where it had rested than friction usually holds it.
+    """One sentence per joint whose rest angle changed by more than friction usually explains.
 
-    Nothing is reported of a trusted model, of a flat arm, or of one that a stabiliser held.
+    Nothing is reported for a trusted model, for a horizontal arm, or for one held by a stabiliser.
     """
     trusted = result.verdict is not None and result.verdict.trust == "yes"
     if trusted or config.arm.gravity == 0.0 or config.stabiliser is not None or config.is_chain:
@@ -41,9 +42,9 @@ def rest_shift_warnings(config: Config, samples: NDArray[np.void], result: Settl
         held = _FRICTION_TIMES * friction.coulomb.median * (1.0 + friction.stribeck_rise.median)
         if abs(shift) > LEAST_RAD and more > held:
             found.append(
-                f"{joint.name}: it came to rest {shift:+.2f} rad from where it had rested before the run, where "
-                f"gravity pulls it by {more:.2g} N m more. If friction does not hold it there, its horn slipped on the "
-                "shaft, or its encoder moved: tighten the screws, set zero_ticks again, and record again."
+                f"{joint.name}: it came to rest {shift:+.2f} rad from where it had rested before the run, where the "
+                f"torque of gravity differs by {more:.2g} N m. If friction does not hold it there, its horn slipped on "
+                "the shaft, or its encoder moved: tighten the screws, set zero_ticks again, and record again."
             )
     return found
 

@@ -1,4 +1,4 @@
-"""Spatial arms from other tools' recordings: what the estimator found, checked on the last part, as a result."""
+"""Spatial arms estimated from other tools' recordings, and checked on the last part of each, as a result."""
 
 import time
 from collections.abc import Sequence
@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.config.chain import doubted_inertias
 from hil.config.csv_columns import RecordingConfig
 from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
+from hil.estimation.chain_estimate import vague
+from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.geometry import Chain
@@ -33,8 +36,9 @@ UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "ca
 
 @dataclass(frozen=True)
 class ChainEstimated:
-    """result: complete except for what the caller adds. predicted: positions per recording (joints, samples) [rad];
-    NaN: no prediction.
+    """An estimate from recordings. result: complete except for what the caller adds. predicted: positions per recording
+    (joints, samples) [rad]; NaN: no
+    prediction.
     """
 
     result: ShootingResult
@@ -85,6 +89,7 @@ def estimate_chain_recordings(
             residual_over_floor=tuple(found.residual_over_noise.tolist()) if found.simulated else None
         ),
         verdict=_verdict(found, arm, foretold, prior),
+        warnings=doubted_inertias(arm),
         timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),
         chain=ChainFacts(
             urdf=Path(config.arm.urdf or "").name,
@@ -160,6 +165,14 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         joint = arm.joints[int(np.argmax(found.residual_over_noise))].name
         sentences.append(f"The residual of {joint} is the largest: {worst:.2f} times the noise of its angle.")
         trust = trust if worst <= EXPLAINED else "with care"
+        if found.systematic > SYSTEMATIC:
+            trust = "with care"
+            sentences.append(
+                f"Part of the residual repeats with the motion, which increases the standard errors "
+                f"{found.systematic:.1f} times, and some values may be wrong by more than these say. An effect is "
+                "missing from the model: torque ripple or cogging, play or elasticity of the gears, a cable, friction "
+                "that depends on load or changes with time, or torques that were not those of the commands."
+            )
     else:
         trust = "with care"
         sentences.append(
@@ -181,6 +194,9 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         sentences.append(
             f"The recordings hardly determine {', '.join(found.from_prior)}: these values come from the URDF."
         )
+    if said := vague(prior, names, found.std, found.from_prior):
+        trust = "with care" if trust == "yes" else trust
+        sentences.append(said)
     if not found.reached:
         trust = "with care" if trust == "yes" else trust
         sentences.append(

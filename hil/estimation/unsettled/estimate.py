@@ -37,8 +37,9 @@ NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 
 @dataclass(frozen=True)
 class Estimated:
-    """result: complete except for what the caller adds. predicted: positions per recording (joints, samples) [rad];
-    NaN: no prediction.
+    """An estimate from recordings. result: complete except for what the caller adds. predicted: positions per recording
+    (joints, samples) [rad]; NaN: no
+    prediction.
     """
 
     result: ShootingResult

@@ -1,4 +1,6 @@
-"""Section on friction versus speed: the model's curve with its interval, and the torque left by the measured motion."""
+"""Section on friction versus speed: the model's curve with its interval, and the torque that remains after inertia and
+gravity are subtracted.
+"""
 
 import numpy as np
 

@@ -12,10 +12,10 @@ from hil.runs.period_file import PlayedPeriod
 
 _COLOURS = (BLUE, ORANGE)
 _KINDS = {
-    "excited": "driven",
-    "odd": "odd, not driven (friction, gravity)",
-    "even": "even, not driven (offsets, direction)",
-    "other": "not driven",
+    "excited": "excited",
+    "odd": "odd, not excited (friction, gravity)",
+    "even": "even, not excited (offsets, direction)",
+    "other": "not excited",
 }
 _BEYOND = 3.0  # highest frequency shown, relative to the highest excited line
 

@@ -159,10 +159,15 @@ def test_wrong_torque_constants_are_found(setup: bench.Setup, period: SettledPer
 
 def test_auto_adds_what_the_recording_shows(setup: bench.Setup, period: SettledPeriod) -> None:
     """An encoder whose zero is off is found; a recording that is explained keeps the plain model."""
-    assert choose_chain(period, ChainModel(setup.base), setup.prior).model == ChainModel(setup.base)
+    plain = choose_chain(period, ChainModel(setup.base), setup.prior)
+    assert plain.estimate.model == ChainModel(setup.base)
+    assert len(plain.trials) == 1
     shifted = period.position.copy()
     shifted[1] -= 0.06
-    found = choose_chain(replace(period, position=shifted), ChainModel(setup.base), setup.prior)
+    choice = choose_chain(replace(period, position=shifted), ChainModel(setup.base), setup.prior)
+    assert choice.gained > 1.02
+    assert choice.trials[0].model == ChainModel(setup.base)
+    found = choice.estimate
     assert found.model.zeros
     assert found.parameters["zero_2"] == pytest.approx(0.06, abs=0.01)
 
@@ -173,7 +178,7 @@ def test_a_tilted_base_is_found(setup: bench.Setup) -> None:
     tilted_period = bench.record(bench.BENCHES[4], real, path)
     base = BaseParameters.of(setup.base.chain, tilts=True)
     prior = Prior.of(base, setup.arm.description.parameters)
-    found = choose_chain(tilted_period, ChainModel(base, base_tilt=True), prior)
+    found = choose_chain(tilted_period, ChainModel(base, base_tilt=True), prior).estimate
     assert found.model == ChainModel(base, base_tilt=True)  # nothing else is taken for the tilt
     truth = dict(zip(TILT, tilt_between(setup.base.chain.gravity, real.arm.gravity_vector), strict=True))
     for name, true in truth.items():

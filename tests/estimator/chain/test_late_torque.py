@@ -13,9 +13,11 @@ from hil.estimator.chain.fit import stage2
 from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.fit.resolved_widths import resolved_widths
 from hil.estimator.chain.fit.stage1 import fit_lines
+from hil.estimator.chain.fit.uncertainty import neglected_covariance
 from hil.estimator.chain.identify import identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
-from hil.estimator.chain.model.late_torque import as_moving, lags_of
+from hil.estimator.chain.model.dynamics import mass_matrix
+from hil.estimator.chain.model.late_torque import MOST_LOST, as_moving, complete, lags_of, lost_inertia
 from hil.estimator.chain.simulation.sensitivity import Simulation
 from hil.estimator.data.settled_period import SettledPeriod
 
@@ -112,3 +114,59 @@ def test_a_lagging_back_emf_makes_a_joint_move_like_a_lighter_one(setup: bench.S
     plain = 1.0 / (s * (inertia * s + rest + generated) * (longer * s + 1.0))
     assert np.abs(equivalent / exact - 1.0).max() < 0.02
     assert np.abs(plain / exact - 1.0).max() > 0.04
+
+
+def by_voltage(setup: bench.Setup, lag: float, joints: tuple[int, ...] = (1, 4)) -> dict[str, float]:
+    """The four-joint arm's true parameters, with voltage-driven joints."""
+    parameters = dict(zip(setup.base.names, setup.truth.tolist(), strict=True)) | {"lag": lag}
+    for joint in joints:
+        parameters |= {f"back_emf_{joint}": 0.9, f"viscous_{joint}": 0.2}
+    return parameters
+
+
+def test_no_lag_takes_more_than_half_of_a_joints_inertia(setup: bench.Setup) -> None:
+    """Parameters far from the minimum, such as the initial guess of a long lag, still leave an arm that can move."""
+    base = setup.base
+    parameters = by_voltage(setup, 0.5)
+    moving = as_moving(base, parameters)
+    for pose in np.random.default_rng(8).uniform(-2.0, 2.0, (20, 4)):
+        heavy, light = (
+            mass_matrix(base.chain, base.as_all(np.array([each[name] for name in base.names])), pose)
+            for each in (parameters, moving)
+        )
+        left = 1.0 / np.diag(np.linalg.inv(light)) / (1.0 / np.diag(np.linalg.inv(heavy)))
+        assert np.linalg.eigvalsh(light)[0] > 0.0
+        assert left.min() > 0.8 * MOST_LOST
+    names = (*base.names, "viscous_1", "lag")
+    derivative = np.random.default_rng(9).standard_normal((3, 4, len(names)))
+    changed = derivative.copy()
+    complete(base, parameters, names, changed)
+    np.testing.assert_array_equal(changed, derivative)  # what is at its limit does not change with its causes
+    complete(base, by_voltage(setup, 1e-3), names, changed)
+    assert np.abs(changed - derivative)[:, :, -2:].min() > 0.0
+
+
+def test_standard_errors_include_what_a_late_back_emf_neglects(setup: bench.Setup, period: SettledPeriod) -> None:
+    base, parameters = setup.base, by_voltage(setup, 2e-3, (4,))
+
+    def std(parameters: dict[str, float]) -> dict[str, float]:
+        names = (*base.names, "lag")
+        problem = SimpleNamespace(
+            model=SimpleNamespace(base=base, joints=4),
+            periods=[period],
+            count=len(names),
+            parameters=lambda _: parameters,
+        )
+        found = neglected_covariance(cast("ChainProblem", problem), np.zeros(1))
+        return dict(zip(names, np.sqrt(np.diag(found)).tolist(), strict=True))
+
+    lost = lost_inertia(base, parameters)[3]
+    assert lost == pytest.approx(0.9 * 0.2 * 2e-3)
+    inertia = min(
+        1.0 / np.linalg.inv(mass_matrix(base.chain, base.as_all(setup.truth), q))[3, 3]
+        for q in period.position.T[::100]
+    )
+    found = std(parameters)
+    assert found["armature_4"] == pytest.approx(lost**2 / inertia, rel=1e-3)
+    assert sum(found.values()) == found["armature_4"]
+    assert sum(std(parameters | {"lag": 0.0}).values()) == 0.0

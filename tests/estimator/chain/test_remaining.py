@@ -71,9 +71,11 @@ def test_an_unfinished_fit_is_said_covers_the_truth_and_blames_no_prior(
 
 def test_a_finished_fit_leaves_less_than_a_standard_error(setup: bench.Setup) -> None:
     covariance, missing = np.diag([4.0, 9.0]), np.array([1.0, 0.0])
-    fit = stage2.ChainFit(np.zeros(2), covariance, missing, covariance, (), (), 0, 1.0, 1, 1.0, 0.9)
+    fit = stage2.ChainFit(
+        np.zeros(2), covariance, missing, covariance, (), (), 0, 1.0, 1, 1.0, 0.9, np.diag([0.0, 7.0])
+    )
     assert fit.reached and not replace(fit, remaining=1.1).reached
-    np.testing.assert_allclose(fit.total_covariance, [[5.0, 0.0], [0.0, 9.0]])
+    np.testing.assert_allclose(fit.total_covariance, [[5.0, 0.0], [0.0, 16.0]])
 
 
 def test_the_prior_is_named_by_what_the_data_determine(setup: bench.Setup, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,6 +106,7 @@ def estimate_of(setup: bench.Setup, monkeypatch: pytest.MonkeyPatch, std: float,
         iterations=1,
         softness=1.0,
         remaining=0.0,
+        neglected=np.zeros_like(covariance),
     )
     monkeypatch.setattr(identify, "_best_fit", lambda *_: fit)
     return identify_chain(period, model, setup.prior)

@@ -110,6 +110,7 @@ def fit_of(setup: bench.Setup, period: SettledPeriod, width: float, off: float) 
         iterations=1,
         softness=1.0,
         remaining=0.0,
+        neglected=nothing,
     )
 
 

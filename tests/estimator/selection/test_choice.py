@@ -98,6 +98,20 @@ def test_motion_that_is_fast_for_the_sample_rate_is_no_outlier(ideal_period: Set
     assert without_spikes(slow).valid.all()
 
 
+def test_reversals_at_a_low_rate_are_no_outliers_but_wild_readings_are(ideal_period: SettledPeriod) -> None:
+    every = 8  # 50 Hz
+    slow = replace(ideal_period, position=ideal_period.position[:, ::every], torque=ideal_period.torque[:, ::every])
+    slow = replace(slow, rate=ideal_period.rate / every)
+    fast = np.abs(np.diff(slow.position, 2, axis=1)).max(axis=1) / slow.position_step
+    assert np.all(fast > 10.0), "reversals must stand out from the median of their neighbours"
+    assert without_spikes(slow).valid.all()
+    wild = slow.position.copy()
+    wild[0, 77], wild[1, [5, 6]], wild[1, 0] = wild[0, 77] + 0.5, wild[1, [5, 6]] - 0.4, np.nan
+    left_out = ~without_spikes(replace(slow, position=wild)).valid
+    assert left_out[0, 77] and left_out[1, [0, 5, 6]].all()
+    assert left_out.sum() <= 8
+
+
 def test_two_runs_together_tell_more_than_one(
     ideal_arm: Arm, ideal_period: SettledPeriod, recorded: Recorder, wave: Wave
 ) -> None:

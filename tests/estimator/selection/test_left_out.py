@@ -11,7 +11,7 @@ from hil.estimator.excitation.multisine import Multisine
 from hil.estimator.identify import identify
 from hil.estimator.models.model import Model
 from hil.estimator.selection.candidates import candidates, colour, considered
-from hil.estimator.selection.drift import friction_change
+from hil.estimator.selection.drift import Drift, friction_change, torque_change
 from hil.estimator.selection.settled import choose
 from hil.estimator.selection.validation import validate
 from hil.estimator.selection.verdict import Evidence, judge
@@ -127,6 +127,62 @@ def test_friction_that_fell_is_told(
     assert "which warming up does not explain" in sentence and "experiment.warm_up" not in sentence
     same = friction_change(recorded(ideal_arm, wave(2, PEAKS)), estimate, 30.0)
     assert not same.is_seen
+
+
+def test_a_torque_that_only_acts_in_the_held_out_motion_is_not_called_friction(
+    ideal_arm: Arm, ideal_period: SettledPeriod, recorded: Recorder, wave: Wave
+) -> None:
+    estimate = identify(ideal_period, PLAIN)
+    first, second = ideal_arm.drives
+    pulled = second.model_copy(update={"offset": second.offset - 0.03})
+    later = recorded(ideal_arm.model_copy(update={"drives": (first, pulled)}), wave(2, PEAKS))
+    torque, drift = torque_change(later, estimate), friction_change(later, estimate, 30.0)
+    assert torque.change == pytest.approx([0.0, -0.03], abs=1e-3)
+    assert torque.is_seen.tolist() == [False, True]
+    assert torque.explains_better_than(drift)
+    (said,) = [
+        each
+        for each in judge(estimate, validate(ideal_period, estimate), Evidence(torque=torque)).sentences
+        if "held-out motion but not" in each
+    ]
+    assert "+0.03 N m on joint 2 acted" in said and "joint 1" not in said
+
+
+def test_friction_that_fell_is_not_called_a_torque(
+    ideal_arm: Arm, ideal_period: SettledPeriod, recorded: Recorder, wave: Wave
+) -> None:
+    estimate = identify(ideal_period, PLAIN)
+    drives = tuple(drive.model_copy(update={"coulomb": 0.92 * drive.coulomb}) for drive in ideal_arm.drives)
+    later = recorded(ideal_arm.model_copy(update={"drives": drives}), wave(2, PEAKS))
+    drift = friction_change(later, estimate, 30.0)
+    assert drift.is_seen
+    assert not torque_change(later, estimate).explains_better_than(drift)
+
+
+def test_after_a_jump_of_a_position_nothing_else_is_blamed(ideal_period: SettledPeriod) -> None:
+    estimate = identify(ideal_period, PLAIN)
+    late = ideal_period.position.copy()
+    late[1, ideal_period.samples // 2 :] += 10.0 * ideal_period.position_step[1]
+    jumped = replace(ideal_period, position=late)
+    estimate = identify(jumped, PLAIN, coarse=True)
+    validation = validate(jumped, estimate)
+    drift = Drift(np.array([0.0, -0.05]), np.full(2, 1e-3), 13.0)
+    evidence = Evidence(held_out=np.array([0.002, 0.002]), drift=drift)
+    assert "grease" in " ".join(judge(estimate, validation, evidence).sentences)
+    verdict = judge(estimate, validation, replace(evidence, disturbances=("The position of elbow jumped.",)))
+    said = " ".join(verdict.sentences)
+    assert verdict.trust == "with care"
+    assert "The position of elbow jumped." in said
+    for cause in ("grease", "looks most like", "No available term", 'friction = "auto"', "detection"):
+        assert cause not in said
+
+
+def test_errors_beyond_the_motion_itself_are_readable_and_said_once(ideal_period: SettledPeriod) -> None:
+    estimate = identify(ideal_period, PLAIN)
+    validation = validate(ideal_period, estimate)
+    evidence = Evidence(held_out=np.array([0.1, 4.2]), held_out_as_fitted=np.array([0.1, 4.2001]))
+    (said,) = [each for each in judge(estimate, validation, evidence).sentences if "held-out" in each]
+    assert said.count("420 %") == 1 and "e+" not in said
 
 
 def test_a_prediction_that_takes_friction_from_the_held_out_motion_says_so(ideal_period: SettledPeriod) -> None:

@@ -3,6 +3,7 @@
 import termios
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import serial
@@ -20,11 +21,12 @@ from hil.drivers.packet import (
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.bus.faults import FAULTS, Fault, FaultKind, parse_fault
-from hil.fakes.description import DescriptionError, load_fake
-from hil.fakes.plants.plant import PlantError
+from hil.fakes.description import DescriptionError, FakeArm, load_fake, make_bus
+from hil.fakes.plants.plant import CheckedPlant, PlantError
 from hil.fakes.protocol_fake import open_fake
 from hil.fakes.servo.registers import load_model
 from hil.fakes.servo.servo import BOOT_S, EmulatedServo
+from tests.fakes.conftest import FreeInertia
 from tests.support.paths import CONFIGS
 
 CONFIG = CONFIGS / "fake_two_link.toml"
@@ -242,6 +244,15 @@ def test_a_plant_that_cannot_jam_says_so(bench: Any) -> None:
     with pytest.raises(PlantError, match="FreeInertia has no jam"):
         bench.wait(0.1)
         bench.bus.advance(bench.clock.now())
+
+
+def test_a_plant_that_cannot_jam_is_refused_before_it_moves() -> None:
+    fake = load_fake(CONFIG)
+    stuck = fake.model_copy(update={"faults": (Fault(kind="stuck_joint", at=5.0),)})
+    with patch.object(FakeArm, "make_plant", lambda _: CheckedPlant(FreeInertia(2), "free:make")):
+        make_bus(fake, VirtualClock())
+        with pytest.raises(PlantError, match="has no jam"):
+            make_bus(stuck, VirtualClock())
 
 
 def test_by_chance_or_not_at_all(bench: Any) -> None:

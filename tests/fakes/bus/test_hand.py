@@ -8,9 +8,10 @@ import pytest
 
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.bus.hand import Move, parse_move
-from hil.fakes.description import FakeArm, make_bus
-from hil.fakes.plants.plant import PlantError
+from hil.fakes.description import FakeArm, load_fake, make_bus
+from hil.fakes.plants.plant import CanBeHeld, PlantError
 from tests.fakes.conftest import Bench
+from tests.support.paths import CONFIGS
 
 LINK = {"length": 0.15, "mass": 0.2, "centre": 0.08, "inertia": 5e-4}
 DRIVE = {"mass": 0.08, "rotor_inertia": 8e-8, "gear_ratio": 353.5, "torque_constant": 1.8, "coulomb": 0.05}
@@ -142,3 +143,34 @@ def test_moves_as_text(text: str, move: Move) -> None:
 def test_moves_that_cannot_be_read(text: str) -> None:
     with pytest.raises(ValueError, match="move"):
         parse_move(text)
+
+
+def test_the_joints_of_a_spatial_arm_are_moved_held_and_released() -> None:
+    bench = on_bench(load_fake(CONFIGS / "fake_viperx_300.toml"))
+    bus = bench.bus
+    servo = next(number for number, each in bus.servos.items() if each.connected)
+    before = bus.plant.position[0]
+    bus.hand.move(Move(servo=servo, to=before + 0.4, duration=0.5))
+    bench.wait(2.0)
+    bus.advance(bench.clock.now())
+    assert bus.plant.position[0] == pytest.approx(before + 0.4, abs=0.02)
+    assert abs(bus.plant.velocity[0]) < 0.01
+    assert bus.hand.holds
+    bus.hand.release()
+    bench.wait(0.1)
+    assert not bus.hand.holds
+
+
+def test_a_spatial_arm_falls_when_it_is_released() -> None:
+    bus = on_bench(load_fake(CONFIGS / "fake_viperx_300.toml")).bus
+    plant = bus.plant
+    assert isinstance(plant, CanBeHeld)
+    plant.advance(1.0, [0.0] * 6)
+    shoulder = plant.position[1]
+    plant.hold(1, 0.4)
+    plant.advance(2.0, [0.0] * 6)
+    lifted = plant.position[1]
+    assert abs(lifted - shoulder) > 0.1  # the weight drags at the hand
+    plant.hold(1, None)
+    plant.advance(4.0, [0.0] * 6)
+    assert plant.position[1] != pytest.approx(lifted, abs=0.05)

@@ -176,6 +176,28 @@ def test_reverse_mode_turns_positions_and_by_series_all_else(make_bench: Make, m
     assert bench.servo().motor_current_a == pytest.approx(sign * 100 * load_model(model).current_unit_a)
 
 
+def test_a_goal_beyond_a_limit_that_was_lowered_later_is_limited(bench: Any) -> None:
+    bench.arm(goal_ticks=500)
+    assert bench.write(1, 64, 0) == 0
+    assert bench.write(1, 38, 100, 2) == 0
+    assert bench.write(1, 64, 1) == 0
+    assert bench.read(1, 102, 2, signed=True) == 500
+    assert bench.servo().motor_current_a == pytest.approx(100 * bench.servo().model.current_unit_a)
+
+
+def test_reverse_mode_mirrors_the_turns_too(make_bench: Make) -> None:
+    bench = make_bench({"model": load_model("XM430-W350"), "zero_ticks": 2048})
+    bench.plant.position[0] = 10.0
+    assert bench.ask(1, Instruction.REBOOT).error == 0
+    bench.wait(BOOT_S)
+    within = bench.read(1, 132, 4, signed=True)
+    assert within == 8567 - 2 * 4096
+    assert bench.write(1, 10, 1) == 0
+    assert bench.read(1, 132, 4, signed=True) == 4096 - within
+    assert bench.write(1, 10, 0) == 0
+    assert bench.read(1, 132, 4, signed=True) == within
+
+
 @pytest.mark.parametrize("mode", [3, 4, 5])
 def test_a_reversed_servo_moves_to_its_goal(make_bench: Make, mode: int) -> None:
     bench = make_bench({"registers": {"Drive Mode": 1, "Operating Mode": mode}, "zero_ticks": 2048})

@@ -113,7 +113,7 @@ def test_the_run_folder_is_named_after_time_and_arm(arm_file: ArmFile) -> None:
     [
         (("rate = 400.0", "rate = -1"), 2, "arm.toml: experiment.rate = -1: must be at least 20"),
         (('"fake://" ', '"/dev/no-such-port" '), 2, "Cannot open port '/dev/no-such-port'"),
-        (('"fake://" ', '"fake://elsewhere.toml" '), 2, "elsewhere.toml: cannot be read"),
+        (('"fake://" ', '"fake://elsewhere.toml" '), 2, "elsewhere.toml cannot be read"),
         (("id = 2", "id = 7"), 1, "'elbow' (ID 7, XM430-W350) does not answer"),
         (('model = "XM430-W350"', 'model = "XM540-W270"'), 2, "answers at ID 1"),
         (("[-3.1, 3.1]", "[-0.5, 0.5]"), 1, "outside its position limit"),
@@ -135,7 +135,7 @@ def test_a_failure_is_one_message_and_an_exit_code(
 
 def test_bad_arguments_and_files(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
     assert hil("identify", "nowhere.toml") == 2
-    assert "nowhere.toml: cannot be read: No such file" in capsys.readouterr().err
+    assert "nowhere.toml cannot be read: No such file" in capsys.readouterr().err
     assert hil("identify") == 2
     assert hil("estimate", "nowhere") == 2
     assert "nowhere is not a run folder: it has no config.toml" in capsys.readouterr().err

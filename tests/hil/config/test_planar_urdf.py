@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.config.schema import Config, load_config
+from hil.config.schema import Config, load_config, parse_config
 from hil.errors import ConfigError
 from tests.support.paths import CONFIGS
 
@@ -57,3 +57,10 @@ def test_any_other_is_an_arm_in_space(text: str, tmp_path: Path) -> None:
 def test_joints_that_the_file_does_not_know_are_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match='has no joint "elbow"; the rotating joints are shoulder, forearm'):
         config(tmp_path, urdf(elbow="forearm"))
+
+
+def test_lengths_beside_the_description_of_a_spatial_arm_are_refused() -> None:
+    text = (CONFIGS / "leg.toml").read_text(encoding="utf-8")
+    twice = text.replace("rest_pose =", "link_lengths = [0.1, 0.1, 0.1]\nrest_pose =", 1)
+    with pytest.raises(ConfigError, match=r"arm\.link_lengths: a spatial arm has its lengths from arm\.urdf"):
+        parse_config(twice, CONFIGS / "leg.toml")

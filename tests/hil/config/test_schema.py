@@ -16,6 +16,12 @@ def change(old: str, new: str) -> str:
     return REALISTIC.replace(old, new, 1)
 
 
+def test_a_path_is_text_or_a_path() -> None:
+    path = CONFIGS / "fake_two_link.toml"
+    assert load_config(str(path)) == load_config(path)
+    assert load_config("fake_two_link").joints == load_config(path).joints
+
+
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.stem)
 def test_every_ready_file_is_right(path: Path) -> None:
     config = load_config(path)
@@ -99,11 +105,11 @@ def test_a_real_port_needs_no_fake_arm() -> None:
 
 
 def test_an_absent_file_and_one_that_is_no_text(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"nowhere\.toml: cannot be read: No such file"):
+    with pytest.raises(ConfigError, match=r"nowhere\.toml cannot be read: No such file"):
         load_config(tmp_path / "nowhere.toml")
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match=r"binary\.toml: cannot be read: it is not UTF-8"):
+    with pytest.raises(ConfigError, match=r"binary\.toml cannot be read: it is not UTF-8"):
         load_config(binary)
     with pytest.raises(ConfigError, match=r"cannot be read: it is a folder; did you mean .*binary\.toml\?$"):
         load_config(tmp_path)

@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from hil.description.arm import ArmFileError
+from hil.config.chain import doubted_inertias
+from hil.description.arm import ArmFileError, Body
 from hil.description.urdf import read_urdf
 from tests.support.chains import random_urdf
 from tests.support.paths import CONFIGS
@@ -70,11 +71,26 @@ def test_a_gripper_is_held_and_counted_in_its_link(tmp_path: Path) -> None:
     assert arm.held == ("grip", "grip_2")
     assert arm.joints[1].body.mass == pytest.approx(0.4)
     assert arm.joints[1].fixed == ("finger", "other")
+    assert set(arm.joints[1].movable) == {"finger", "other"} and not arm.joints[0].movable
+    whole = arm.joints[1].body
+    for each in arm.joints[1].movable.values():
+        assert each.mass == pytest.approx(0.1)
+        whole = whole.joined(Body(-each.mass, each.centre, -each.inertia))
+    alone = read_urdf(written(tmp_path, TWO + "</robot>"), ["shoulder", "elbow"]).joints[1].body
+    np.testing.assert_allclose(whole.parameters, alone.parameters, atol=1e-12)
+
+
+def test_a_negative_moment_of_inertia_is_named(tmp_path: Path) -> None:
+    odd = TWO.replace('iyy="1e-3"', 'iyy="-1e-3"', 1)
+    with pytest.raises(ArmFileError, match=r'link "upper": its iyy is -0\.001'):
+        read_urdf(written(tmp_path, odd + "</robot>"))
 
 
 def test_an_inertia_that_no_body_has_is_a_doubt(tmp_path: Path) -> None:
     odd = TWO.replace('ixx="1e-3"', 'ixx="9e-3"', 1)
-    assert "upper" in read_urdf(written(tmp_path, odd + "</robot>")).doubts[0]
+    arm = read_urdf(written(tmp_path, odd + "</robot>"))
+    (warning,) = doubted_inertias(arm)
+    assert warning == f"{arm.path.name}: {arm.doubts[0]}." and "upper" in warning
 
 
 @pytest.mark.parametrize(
@@ -124,5 +140,5 @@ def test_what_is_wrong_is_named(text: str, joints: list[str] | None, message: st
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ArmFileError, match=r"none\.urdf: cannot be read"):
+    with pytest.raises(ArmFileError, match=r"none\.urdf cannot be read"):
         read_urdf(tmp_path / "none.urdf")

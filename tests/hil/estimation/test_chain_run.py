@@ -10,9 +10,11 @@ from xml.etree import ElementTree as ET
 import mujoco
 import numpy as np
 import pytest
+from rich.console import Console
 
 import hil
 from hil.chain_model import ChainArmModel
+from hil.cli.views.result_table import print_result
 from hil.config.schema import Config, load_config, parse_config
 from hil.description.urdf import read_urdf
 from hil.errors import ConfigError
@@ -31,6 +33,7 @@ from hil.export.posterior import draw_arms
 from hil.export.source import Source
 from hil.plan.chain_model import known_chain
 from hil.plan.chain_plan import make_chain_plan
+from hil.results.parts import Quantity
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
@@ -78,6 +81,28 @@ def test_residual_prediction_and_verdict(result: SettledResult) -> None:
     assert result.validation.held_out_rms is not None
     assert max(result.validation.held_out_rms) < 0.01
     assert result.verdict.trust in ("yes", "with care")
+
+
+def test_the_error_column_counts_the_first_torque_constant_in_every_row(
+    run: RunFolder, result: SettledResult, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All values of a spatial arm scale with it, inertias as well as friction."""
+    rows = ("inertia_zz_1", "moment_z_2", "viscous_1", "coulomb_3")
+
+    def in_std(std: float) -> dict[str, float]:
+        first, *others = result.arm.joints
+        joints = (replace(first, torque_per_goal_std=std * first.torque_per_goal), *others)
+        ratios = {f"torque_scale_{joint}": Quantity(1.0, 1e-3, "1") for joint in (2, 3, 4)}
+        known = {name: replace(each, value=1.02 * each.value) for name, each in result.parameters.items()}
+        changed = replace(result, parameters=known, extra={**result.extra, **ratios})
+        changed = replace(changed, arm=replace(result.arm, joints=joints))
+        print_result(changed, run.load_config(), run.path, Console(width=200))
+        lines = (line.split() for line in capsys.readouterr().out.splitlines())
+        return {words[0]: abs(float(words[-1])) for words in lines if words and words[0] in rows}
+
+    known, unknown = in_std(0.0), in_std(0.1)
+    for name in rows:
+        assert unknown[name] < 0.4 < known[name], name
 
 
 def test_a_joint_that_hardly_moves_is_named(run: RunFolder) -> None:
@@ -279,7 +304,7 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
     known = known_chain(config)
     explained = 0.29 * np.ones(4)
     estimate: Any = SimpleNamespace(
-        **{"std": 0.01 * known.prior.std, "residual_steps": explained, "systematic": 0.8},
+        **{"std": 0.01 * known.prior.std, "over_noise": np.ones(4), "noise_steps": explained, "systematic": 0.8},
         **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base)},
     )
     verdicts = []
@@ -287,7 +312,27 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
         verdicts.append(_verdict(config, estimate, known, np.full(4, 1e-3), []))
     assert [verdict.trust for verdict in verdicts] == ["yes", "with care"]
     assert "stopped short of its minimum" in verdicts[1].sentences[-1]
-    estimate.reached, estimate.systematic = True, 3.0
+    estimate.reached = True
+    jumped = _verdict(config, estimate, known, np.full(4, 1e-3), [], ("The position of joint3 jumped.",))
+    assert jumped.trust == "with care" and "The position of joint3 jumped." in jumped.sentences
+    estimate.systematic = 3.0
     hidden = _verdict(config, estimate, known, np.full(4, 1e-3), [])
     assert hidden.trust == "with care"
     assert "part of it repeats with the motion" in hidden.sentences[0]
+
+
+def test_a_value_less_certain_than_the_description_is_trusted_with_care(run: RunFolder) -> None:
+    """Errors of the model may make a standard error exceed the prior's, although white noise would not."""
+    config = run.load_config()
+    known = known_chain(config)
+    std = 0.01 * known.prior.std
+    std[2] = 1.1 * known.prior.std[2]
+    estimate: Any = SimpleNamespace(
+        **{"std": std, "over_noise": np.ones(4), "noise_steps": 0.29 * np.ones(4), "systematic": 0.8},
+        **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base)},
+    )
+    verdict = _verdict(config, estimate, known, np.full(4, 1e-3), [])
+    assert verdict.trust == "with care"
+    assert known.base.names[2] in verdict.sentences[-1]
+    estimate.from_prior = (known.base.names[2],)  # named once is enough
+    assert len(_verdict(config, estimate, known, np.full(4, 1e-3), []).sentences) == len(verdict.sentences)

@@ -202,6 +202,18 @@ def test_lost_torque_is_measured_against_what_the_configuration_plans(arm: Arm) 
     assert look(Guard(arm()), *[off] * 14) is Cause.NOT_FOLLOWING
 
 
+@pytest.mark.parametrize(("carried", "said"), [(0.0, "Its torque is off"), (0.9, "another program"), (-0.6, "another")])
+def test_a_current_that_does_not_follow_is_off_or_that_of_another(arm: Arm, carried: float, said: str) -> None:
+    guard = Guard(arm())
+    wrong = STILL._replace(goal_current=(0.3, 0.0), current=(carried, 0.0))
+    with pytest.raises(SafetyStop) as stop:
+        for number in range(40):
+            guard.look(at(number, wrong))
+    assert stop.value.cause is Cause.NOT_FOLLOWING
+    assert said in str(stop.value)
+    assert ("torque is off" in str(stop.value)) == (carried == 0.0)
+
+
 def test_late_deadlines_and_a_gap_that_trips_watchdogs(arm: Arm) -> None:
     guard = Guard(arm())
     for _ in range(20):

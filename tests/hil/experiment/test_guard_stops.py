@@ -140,8 +140,8 @@ def test_settings_that_another_program_changed_are_the_cause_that_is_named(
 ) -> None:
     happens = once(lambda: rewritten(ports, register, value))
     stop, _ = run_until_stopped(arm(), tmp_path / "run", happens, plan)
-    assert str(stop).startswith("Another program has changed the settings of a servo during the run (joint 'elbow'")
-    assert f"{register} is {value} and was 0" in str(stop) and "What was seen: " in str(stop)
+    assert str(stop).startswith("Another program changed the settings of a servo during the run (joint 'elbow'")
+    assert f"{register} is {value} and was 0" in str(stop) and "Symptom: " in str(stop)
     assert_stopped(ports[0])
 
 

@@ -3,6 +3,7 @@
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from hil.errors import ExperimentError, SafetyStop, StopRequested
 from hil.experiment.lowering import Lowering
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress
-from hil.runs.recording import Phase, load_samples
+from hil.fakes.protocol_fake import FakeSerial
+from hil.runs.recording import Phase, Recorder, load_samples
 from hil.runs.run_folder import RunFolder
 from tests.support.paths import CONFIGS
 
@@ -92,6 +94,28 @@ def test_a_joint_that_stays_held_ends_the_lowering(tmp_path: Path) -> None:
     error, samples = play(tmp_path, with_fault(TEXT, f'kind = "stuck_joint"\nservo = 2\nat = {AT_S}'))
     assert any("off its path down" in note for note in error.__notes__)
     assert (samples["phase"] == Phase.LOWERING).any()
+
+
+def test_an_arm_dropped_by_its_watchdogs_is_not_said_to_be_lowered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The program is stopped for a second, as by SIGSTOP."""
+    keep, stalled = Recorder.keep, []
+
+    def stall(self: Recorder, deadline: float, *more: Any) -> None:
+        keep(self, deadline, *more)
+        if self.count == AT_S * 400 and not stalled:
+            stalled.append(deadline)
+            ports[0].clock._now += 1.0
+
+    ports: list[Any] = []
+    opened = FakeSerial.open
+    monkeypatch.setattr(FakeSerial, "open", lambda self: (opened(self), ports.append(self))[0])
+    monkeypatch.setattr(Recorder, "keep", stall)
+    error, samples = play(tmp_path, TEXT)
+    assert stalled and not (samples["phase"] == Phase.LOWERING).any()
+    notes = " ".join(error.__notes__)
+    assert "watchdogs had already acted, so it fell" in notes and "deadlines in a row" not in notes
 
 
 def test_a_lost_torque_is_cut_at_once(tmp_path: Path) -> None:

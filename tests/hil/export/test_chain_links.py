@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from hil.config.schema import load_config
+from hil.description.urdf import read_urdf
+from hil.drivers.servo_model import servo_model
+from hil.drivers.servo_prior import servo_prior
 from hil.errors import ExportError
 from hil.estimator.chain.model.base_parameters import BaseParameters
-from hil.export.chain_links import _same_groups, chain_links
+from hil.export import chain_files
+from hil.export.chain_links import ChainLinks, _rotor, _same_groups, chain_links
 from hil.plan.chain_model import known_chain
 from tests.support.paths import CONFIGS
 
@@ -22,6 +26,61 @@ def base() -> BaseParameters:
 
 def groups_of(base: BaseParameters) -> dict[str, str]:
     return dict(zip(base.names, base.groups, strict=True))
+
+
+GRIPPER = (
+    '<joint name="tool" type="fixed"><parent link="{tip}"/><child link="palm"/><origin xyz="0 0 0.02"/></joint>'
+    '<link name="palm"><inertial><mass value="0.03"/>{small}</inertial></link>'
+    '<joint name="grip" type="prismatic"><parent link="palm"/><child link="finger"/><origin xyz="0 0.01 0"/>'
+    '<axis xyz="0 1 0"/><limit lower="0" upper="0.02" velocity="1" effort="1"/></joint>'
+    '<link name="finger"><inertial><mass value="{mass}"/>{small}</inertial></link>'
+    '<joint name="pad_joint" type="fixed"><parent link="finger"/><child link="pad"/><origin xyz="0 0 0.01"/></joint>'
+    '<link name="pad"><inertial><mass value="0.004"/>{small}</inertial></link></robot>'
+)
+
+
+@pytest.mark.parametrize(("mass", "whole"), [(0.01, True), (5.0, False)])
+def test_a_gripper_keeps_its_inertia_and_the_arm_its_dynamics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mass: float, whole: bool
+) -> None:
+    """Its joints still move in the exported URDF, so their links need inertia; all together are what was identified."""
+    config = load_config(CONFIGS / "leg.toml")
+    text = (CONFIGS / "leg.urdf").read_text(encoding="utf-8")
+    tip = read_urdf(CONFIGS / "leg.urdf").joints[-1].link
+    small = '<inertia ixx="2e-6" iyy="2e-6" izz="2e-6" ixy="0" ixz="0" iyz="0"/>'
+    gripper = GRIPPER.format(tip=tip, mass=mass, small=small)
+    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", gripper), encoding="utf-8")
+    arm = read_urdf(tmp_path / "arm.urdf", [joint.name for joint in config.joints])
+    identified = arm if whole else read_urdf(CONFIGS / "leg.urdf")  # too light for a gripper of 5 kg
+    bodies = tuple(joint.body for joint in identified.joints)
+    links = ChainLinks(tmp_path / "arm.urdf", arm, bodies, (0.01,) * 3, ())
+    monkeypatch.setattr(chain_files, "chain_links", lambda *_: links)
+    monkeypatch.setattr(chain_files, "add_actuators", lambda *_: None)
+    values = {f"{name}_{joint}": 0.02 for name in ("viscous", "coulomb") for joint in (1, 2, 3)}
+    model: Any = SimpleNamespace(values=values, stds=values, groups={}, joints=config.joints, base_gravity=np.ones(3))
+    chain_files.export_chain_urdf(cast("Any", None), model, tmp_path / "out.urdf")
+    again = read_urdf(tmp_path / "out.urdf", [joint.name for joint in config.joints])
+    for one, other in zip(again.joints, bodies, strict=True):
+        np.testing.assert_allclose(one.body.parameters, other.parameters, rtol=1e-9, atol=1e-12)
+    assert {"finger", "pad"} == set(again.joints[-1].movable)
+    for name, each in again.joints[-1].movable.items():
+        assert each.mass > 0.0 and np.trace(each.inertia) > 0.0
+        assert (each.mass == pytest.approx(mass if name == "finger" else 0.004)) is whole
+    left = chain_files.export_chain_mjcf(cast("Any", None), model, tmp_path / "out.xml")
+    assert any("grip, which were held" in each and tip in each for each in left)
+
+
+def test_an_unknown_rotor_is_that_of_its_servo() -> None:
+    """A rotor that is part of a sum must not be taken for a tiny one, which makes the link too heavy instead."""
+    joints = [
+        SimpleNamespace(servo="XM430-W350"),
+        SimpleNamespace(servo="unknown"),
+        SimpleNamespace(servo="XL430-W250"),
+    ]
+    model: Any = SimpleNamespace(joints=joints, values={"armature_3": 0.004})
+    rotors = [_rotor(model, number) for number in (1, 2, 3)]
+    assert rotors == pytest.approx([servo_prior(servo_model("XM430-W350")).armature.median, 0.01, 0.004])
+    assert rotors[0] > 5e-3
 
 
 def test_groups_that_differ_by_rounding_are_the_same(base: BaseParameters) -> None:

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from hil import load_model
+from hil.errors import ExportError
 from hil.export.columns import columns
 from hil.export.formats import export
 from hil.export.source import Recorded
+from hil.runs.run_folder import RunFolder
 
 
 @pytest.fixture
@@ -30,6 +32,19 @@ def test_parameters(run: Path, name: str) -> None:
     written = export(run, name)
     assert written.left_out == []
     assert load_model(written.path) == load_model(run)
+
+
+def test_an_export_never_replaces_a_file_of_the_run(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = (run / "result.json").read_bytes()
+    with pytest.raises(ExportError, match=r"result\.json belongs to the run"):
+        export(run, "json", run / "result.json")
+    assert (run / "result.json").read_bytes() == before
+    own = RunFolder(run).own_files()
+    assert {"config.toml", "samples.npy", "result.json", "run.json"} <= own
+    (run / "arm.urdf").write_text("the user's own", encoding="utf-8")
+    monkeypatch.setattr(RunFolder, "own_files", lambda _: own | {"arm.urdf"})  # as if [arm] urdf named it
+    assert export(run, "urdf").path == run / "identified_arm.urdf"
+    assert (run / "arm.urdf").read_text(encoding="utf-8") == "the user's own"
 
 
 def test_an_infinite_error_bar_stays_infinite(run: Path) -> None:

@@ -11,7 +11,7 @@ from hil.dry_run.chain_prediction import loop_of
 from hil.estimator.chain.simulation.rollout import inertias, roll_out, weights
 from hil.pilot.chain_belief import SIMULATED, ChainBelief, _poses
 from hil.pilot.chain_paths import Paths, chain_config
-from hil.pilot.chain_search import step_config
+from hil.pilot.chain_shares import step_config
 from hil.runs.recording import Phase
 from tests.support.paths import CONFIGS
 

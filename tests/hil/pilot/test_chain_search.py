@@ -10,13 +10,16 @@ import hil
 from hil.config.schema import Config, load_config, parse_config
 from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
-from hil.dry_run.chain_summary import unsafe
+from hil.dry_run.chain_summary import chain_dry_run_lines, unsafe
 from hil.errors import Cause, ConfigError, DidNotMove, NoSafeTorque, NotSettled, SafetyStop
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.estimator.chain.excitation.path_design import Design
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import RESERVE, Paths, Reserve, chain_config
-from hil.pilot.chain_search import ChainSearch, Found, step_config
+from hil.pilot.chain_rehearsal import rehearse
+from hil.pilot.chain_search import ChainSearch
+from hil.pilot.chain_shares import PILOT_SHARES, Found, SafeShares, step_config
+from hil.pilot.steps import Say
 from hil.plan.chain_model import known_chain
 from hil.runs.recording import load_samples
 from tests.support.paths import CONFIGS
@@ -120,7 +123,7 @@ def test_learning_moves_the_arms_to_what_was_seen(found: hil.Identification) -> 
 def test_only_a_limit_takes_amplitude_away_not_a_joint_that_friction_holds() -> None:
     config = chain_config(load_config(LEG))
     belief = ChainBelief.prior(config)
-    search = ChainSearch(config, cast("Any", None), LEG, cast("Any", None), print, belief, cast("Any", None))
+    search = searching(config, belief, cast("Any", None), print)
     played = Found(0.3, cast("Any", None), cast("Any", None))
     search.limit_after(DidNotMove("knee moved by 0 rad"), played)
     search.limit_after(NotSettled("still drifts"), played)
@@ -129,9 +132,13 @@ def test_only_a_limit_takes_amplitude_away_not_a_joint_that_friction_holds() -> 
     assert search.cap == pytest.approx(0.21)
 
 
+def searching(config: Config, belief: ChainBelief, paths: Paths, say: Say) -> ChainSearch:
+    return ChainSearch(config, belief, paths, say, run=cast("Any", None), shown_path=LEG, watch=cast("Any", None))
+
+
 def search_of(config: Config, belief: ChainBelief, said: list[str]) -> ChainSearch:
     paths = Paths.of(config, ChainBelief.prior(config).torque)
-    return ChainSearch(config, cast("Any", None), LEG, cast("Any", None), said.append, belief, paths)
+    return searching(config, belief, paths, said.append)
 
 
 def heavier(belief: ChainBelief, times: float) -> ChainBelief:
@@ -242,3 +249,40 @@ def test_another_path_starts_with_no_more_amplitude_than_the_one_it_replaces(mon
     assert tried == [(0.5, 0.25), (pytest.approx(0.125), pytest.approx(0.0625))]
     assert found.share == pytest.approx(0.125)
     assert search.last == pytest.approx(0.05) and search.cap == pytest.approx(0.2)
+
+
+def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    for place in ("chain_shares.SEARCH_ARMS", "chain_shares.ARMS", "chain_rehearsal.ARMS"):
+        monkeypatch.setattr(f"hil.pilot.{place}", 4 if "SEARCH" in place else 12)
+    text = LEG.read_text(encoding="utf-8").replace("period = 10.0", "period = 5.0")
+    config, told = parse_config(text, LEG), list[int]()
+    first = rehearse(config, 4, tell=lambda _, of: told.append(of))
+    assert (told.count(4), told.count(12)) == (4, 2 * 12)  # also while it searches
+    pilot = ChainSearch.of(config, cast("Any", None), LEG, cast("Any", None), lambda _: None)
+    found = pilot.safe(step_config(pilot.config), PILOT_SHARES)
+    assert (first.share, first.is_safe(first.config)) == (found.share, True)
+    np.testing.assert_array_equal(first.prediction.values[:12], found.foreseen.peaks.values)
+
+    # More arms than the pilot looks at may add a doubt, which the dry run tells but does not decide by.
+    with monkeypatch.context() as patch:
+        patch.setattr("hil.dry_run.chain_summary.unsafe", lambda *_: "joint 'knee' reaches speed 9")
+        assert first.is_safe(first.config)
+        assert any("'knee' reaches speed 9" in line for line in chain_dry_run_lines(first))
+
+    # Where no share is safe, both refuse, for the same reason.
+    monkeypatch.setattr(SafeShares, "_largest", lambda *_: (None, "shank and floor: 2 mm", 0.0))
+    monkeypatch.setattr("hil.pilot.chain_shares.REDESIGNS", 0)
+    with pytest.raises(NoSafeTorque) as refused:
+        pilot.safe(step_config(pilot.config), PILOT_SHARES)
+    monkeypatch.setattr(Paths, "of", lambda *_: pilot.paths)
+    again = rehearse(config, 4)
+    assert again.why_not(again.config) == str(refused.value)
+    assert not again.is_safe(again.config)
+
+
+def test_a_dry_run_of_more_arms_than_the_prior_has_draws_further_ones() -> None:
+    belief = ChainBelief.prior(chain_config(load_config(LEG)))
+    arms = belief.at_least(belief.arms.size + 3)
+    assert arms.size == belief.arms.size + 3
+    np.testing.assert_array_equal(arms.rigid[:5], belief.at_least(5).rigid)
+    assert not (arms.rigid[-2:] == arms.rigid[1:3]).all(axis=1).any()

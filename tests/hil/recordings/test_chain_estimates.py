@@ -4,6 +4,8 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ import pytest
 import hil as api
 from benchmarks import chain as bench
 from hil.errors import ConfigError
+from hil.estimation.unsettled.chain_recordings import _verdict
+from hil.estimator.chain.model.chain_model import ChainModel
 from tests.support.command_line import hil
 
 SAMPLES = 2600  # of a period of 4000
@@ -66,6 +70,22 @@ def test_commanded_torque_gives_the_likelihood(setup: bench.Setup, capsys: pytes
     assert hil("estimate", "commanded", "--json") == 0  # again, from what the folder keeps
     again = json.loads(capsys.readouterr().out)
     assert again["parameters"]["viscous_1"]["value"] == pytest.approx(found.parameters["viscous_1"].value)
+
+
+def test_errors_that_repeat_with_the_motion_are_trusted_with_care(setup: bench.Setup) -> None:
+    arm = SimpleNamespace(joints=tuple(SimpleNamespace(name=name) for name in setup.arm.joints))
+    found: Any = SimpleNamespace(
+        **{"model": ChainModel(setup.base), "std": 0.01 * setup.prior.std, "simulated": True, "from_prior": ()},
+        **{"residual_over_noise": np.ones(4), "reached": True, "systematic": 0.9},
+    )
+    well = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
+    assert well.trust == "yes"
+    found.systematic = 3.0
+    hidden = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
+    assert hidden.trust == "with care"
+    assert "repeats with the motion" in hidden.sentences[1]
+    found.systematic, found.std = 0.9, 1.1 * setup.prior.std
+    assert _verdict(found, arm, np.full(4, 0.01), setup.prior).trust == "with care"  # type: ignore[arg-type]
 
 
 def test_measured_torque_gives_the_regression_and_says_so(setup: bench.Setup) -> None:

@@ -168,5 +168,5 @@ def test_runs_that_are_not_whole_are_named(identified: Path, tmp_path: Path) -> 
     spoil("samples.npy", "no npy")
     spoil("run.json", '{"schema": 99}')
     spoil("events.jsonl", "no json\n{}\n")
-    with pytest.raises(ResultError, match="nowhere: cannot be read"):
+    with pytest.raises(ResultError, match="nowhere cannot be read"):
         RunData.load(tmp_path / "nowhere")

@@ -8,9 +8,9 @@ import pytest
 from typer.testing import CliRunner
 
 from hil.cli.app import app
-from hil.config.chain import described_arm
+from hil.config.chain import base_up, described_arm
 from hil.config.schema import load_config
-from hil.description.motion import end_point, moves
+from hil.description.motion import _towards, end_point, moves
 from hil.setup.by_hand import MOVED, Moved, guided, judge
 from tests.support.paths import CONFIGS
 
@@ -60,6 +60,24 @@ def test_words_are_those_of_the_motion() -> None:
         if "about its own axis" not in told:
             main = int(np.argmax(np.abs(way)))
             assert f"({'+' if way[main] > 0 else '-'}{'xyz'[main]})" in told
+
+
+@pytest.mark.parametrize(
+    ("base", "told"),
+    [
+        ((0.0, 0.0, 0.0), ("up (+z)", "down (-z)", "forwards (+x)", "to the left (+y)")),
+        ((0.2, -0.3, 1.0), ("up (+z)", "down (-z)", "forwards (+x)", "to the left (+y)")),
+        ((np.pi, 0.0, 0.0), ("down (+z)", "up (-z)", "forwards (+x)", "to the right (+y)")),  # from the ceiling
+        ((0.0, np.pi / 2, 0.0), ("forwards (+z)", "backwards (-z)", "down (+x)", "to the left (+y)")),  # on a wall
+        ((np.pi / 2, 0.0, 0.0), ("to the right (+z)", "to the left (-z)", "forwards (+x)", "up (+y)")),  # on its side
+    ],
+)
+def test_up_is_opposite_to_gravity_however_the_base_is_mounted(
+    base: tuple[float, float, float], told: tuple[str, ...]
+) -> None:
+    up = base_up(ARM.model_copy(update={"arm": ARM.arm.model_copy(update={"base": list(base)})}))
+    ways = np.array([[0.1, 0, 1], [0, 0.1, -1], [1, 0.1, 0], [0, 1, 0.1]])
+    assert tuple(_towards(way, up) for way in ways) == told
 
 
 def test_every_joint_is_asked_for_and_waited_for() -> None:

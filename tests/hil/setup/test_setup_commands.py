@@ -1,6 +1,7 @@
 """scan, check and setup on the fake bus: findings, changes, and what must stay unchanged."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 
 from hil import fakes
 from hil.cli.app import app
-from hil.config.schema import Config
+from hil.config.schema import Config, load_config
 from hil.drivers.errors import NoReply, WrongSetting
 from hil.drivers.port import Port, open_port
 from hil.fakes.bus.bus import FakeBus
@@ -19,6 +20,7 @@ from hil.fakes.bus.faults import Fault
 from hil.setup.preflight import Finding, Level, check_arm
 from hil.setup.scan import Asking, scan
 from hil.setup.servo_settings import open_servo, set_up
+from tests.support.paths import CONFIGS
 
 Arm = Callable[..., Config]
 ArmFile = Callable[..., Path]
@@ -111,6 +113,20 @@ def test_a_healthy_arm_is_ready(arm: Arm) -> None:
     assert "400 Hz wanted, 900 Hz possible with Fast Sync Read, one write" in found["bus", "rate"].found
 
 
+def test_a_rest_pose_inside_the_floor_is_found_by_the_check(tmp_path: Path) -> None:
+    urdf = "open_manipulator_x_like.urdf"
+    (tmp_path / urdf).write_bytes((CONFIGS / urdf).read_bytes())
+    text = (CONFIGS / "fake_open_manipulator_x.toml").read_text(encoding="utf-8")
+    (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
+    found = look(load_config(tmp_path / "arm.toml"))
+    assert found["arm", "rest pose"].level is Level.OK
+    high = re.sub(r'(?m)^floor = "none".*$', "floor = 0.2", text)
+    assert high != text
+    (tmp_path / "arm.toml").write_text(high, encoding="utf-8")
+    wrong = look(load_config(tmp_path / "arm.toml"))["arm", "rest pose"]
+    assert wrong.level is Level.STOP and "arm.rest_pose puts" in wrong.fix
+
+
 @pytest.mark.parametrize(
     ("change", "what", "level", "fix"),
     [
@@ -120,7 +136,11 @@ def test_a_healthy_arm_is_ready(arm: Arm) -> None:
         ((SERVO_2, SERVO_2 + 'registers = { "Shutdown" = 0 }\n'), "shuts down on", Level.WARNING, "factory value"),
         ((SERVO_2, SERVO_2 + "temperature_c = 79.0\n"), "temperature", Level.WARNING, "cool down"),
         ((SERVO_2, SERVO_2 + "input_voltage_v = 5.0\n"), "voltage", Level.STOP, "supply"),
-        ((SERVO_2, SERVO_2 + "input_voltage_v = 5.0\n"), "hardware error", Level.STOP, "rebooted"),
+        ((SERVO_2, SERVO_2 + "input_voltage_v = 5.0\n"), "hardware error", Level.STOP, "power-cycle"),
+        (
+            (SERVO_2, SERVO_2 + 'input_voltage_v = 5.0\nregisters = { "Shutdown" = 53 }\n'),
+            *("hardware error", Level.STOP, "stays without torque until rebooted"),
+        ),
         ((SERVO_2, SERVO_2 + "firmware = 38\n"), "firmware", Level.OK, ""),
         ((SERVO_2, SERVO_2.replace("2048", "3000")), "pose", Level.STOP, "zero_ticks = 3000"),
         (("id = 2", "id = 7"), "answers", Level.STOP, "hil scan"),

@@ -1,0 +1,92 @@
+"""Noise of the angles from the difference between two passes of the same periodic motion.
+
+Whatever repeats with the motion cancels: the motion itself, however fast, and the error of any model of it. What is
+left of a rounded angle depends on its noise. Without noise, both passes are rounded alike and nothing is left; the more
+noise there is before rounding, the more of the rounding error differs as well. With independent Gaussian noise of
+standard deviation s and angles spread evenly over the steps, half the mean square of the difference is
+
+    s^2 + 1/12 - sum over k of exp(-(2 pi k s)^2) / (2 pi^2 k^2)   [steps^2],
+
+where the sum is the part of the rounding error's power 1/12 that repeats (Fourier series of the rounding error; B.
+Widrow and I. Kollar, Quantization Noise, 2008). Solved for s, this gives the error of one reading, s^2 + 1/12. Passes
+that differ for other reasons make it larger, so it is an upper bound.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.data.fourier import white_noise
+
+__all__ = ["agreed_noise", "repeated_noise"]
+
+FEWEST = 32  # samples of a pass
+ROUNDING = 1.0 / 12.0  # steps^2
+AGREE = 2.0  # standard errors
+_LINES = 8.0  # samples of a period per line that its noise is measured by
+_LINE_ERROR = 0.72  # relative standard error of the noise from the median power of one line
+_STD = np.linspace(0.0, 1.0, 401)
+_ORDERS = np.arange(1, 30)[:, None]
+_REPEATS = np.sum(np.exp(-((2.0 * np.pi * _ORDERS * _STD) ** 2)) / (2.0 * np.pi**2 * _ORDERS**2), axis=0)
+_REPEATS *= ROUNDING / _REPEATS[0]  # the series is truncated
+_DIFFERS = _STD**2 + ROUNDING - _REPEATS
+"""Half the mean square of the difference at each of `_STD` [steps^2]; beyond, the whole rounding error differs."""
+
+
+def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> Array | None:
+    """Return the standard deviation of one mean sample's error (joints,) [rad], rounding included.
+
+    Args:
+        passes: angles (joints, samples) [rad] of successive passes of the same motion; NaN where a sample is missing.
+        step: encoder step of each joint (joints,) [rad].
+        averaged: number of passes whose mean is the sample.
+
+    Returns:
+        None for fewer than two passes, or short ones.
+    """
+    if len(passes) < 2 or passes[0].shape[1] < FEWEST:
+        return None
+    differs: Array = 0.5 * np.mean([_power(later - former) for former, later in pairwise(passes)], axis=0) / step**2
+    repeats = np.interp(differs, _DIFFERS, _REPEATS)
+    noise: Array = step * np.sqrt(differs / averaged + repeats)
+    return noise
+
+
+def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:
+    """Return the noise (joints,) [rad] from two upper bounds of it: their mean where they agree, else the smaller.
+
+    Each is the median of a few lines and so has an error of its own; the smaller of two would be too small.
+
+    Args:
+        white: from the fastest lines of a period of `samples` samples (joints,) [rad].
+        repeated: from the difference of two halves of such periods (joints,) [rad], if known.
+        samples: number of samples of the period.
+    """
+    if repeated is None:
+        return white
+    lines = samples / _LINES
+    apart = np.abs(np.log(np.maximum(white, 1e-300) / np.maximum(repeated, 1e-300)))
+    agree = apart < AGREE * _LINE_ERROR * np.sqrt(3.0 / lines)
+    mean = np.sqrt((2.0 * white**2 + repeated**2) / 3.0)  # the difference has half as many lines
+    noise: Array = np.where(agree, mean, np.minimum(white, repeated))
+    return noise
+
+
+def _power(difference: Array) -> Array:
+    """Return the power of the white noise (joints,) [rad^2]; samples that are filled in contribute none."""
+    received = np.maximum(np.mean(np.isfinite(difference), axis=1), 1.0 / difference.shape[1])
+    power: Array = np.square(white_noise(_filled(difference))) / received
+    return power
+
+
+def _filled(difference: Array) -> Array:
+    """Replace missing samples by interpolation between their neighbours; by zero where all are missing."""
+    index = np.arange(difference.shape[1])
+    filled = np.zeros_like(difference)
+    for row, known in zip(filled, difference, strict=True):
+        valid = np.isfinite(known)
+        if valid.any():
+            row[:] = np.interp(index, index[valid], known[valid])
+    return filled

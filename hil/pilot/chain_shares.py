@@ -1,0 +1,149 @@
+"""The largest share of a spatial arm's designed paths that is safe for every arm that it may be.
+
+`hil identify` and `hil dry-run` both decide in this way, on the same arms, so that they agree.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hil.config.schema import Config
+from hil.dry_run.chain_prediction import ChainPrediction, Tell, predict_chain
+from hil.dry_run.chain_stop import foreseen_stops
+from hil.dry_run.chain_summary import unsafe
+from hil.errors import NoSafeTorque
+from hil.pilot.chain_belief import ChainBelief
+from hil.pilot.chain_paths import Paths
+from hil.pilot.steps import Say
+from hil.plan.chain_model import limit_names
+from hil.plan.chain_plan import NoHeadroom
+from hil.plan.plan import Plan
+
+SEARCH_ARMS, ARMS = 24, 72
+"""Number of arms simulated while searching for a share, and to confirm the one found."""
+
+PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
+SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4, 0.28, 0.18)
+SMALL = 0.5
+"""Fraction of the wanted share below which other paths, with more reserve, are designed."""
+
+REDESIGNS = 2
+
+
+@dataclass(frozen=True)
+class Found:
+    """A safe share of the amplitude, with its plan and the predicted motion."""
+
+    share: float
+    plan: Plan
+    foreseen: ChainPrediction
+
+
+@dataclass
+class SafeShares:
+    """The current belief about the arm, and the paths designed for it.
+
+    last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are shares of `paths`,
+    and are converted when these are replaced. tell: called with the progress of each simulation of the arms.
+    """
+
+    given: Config
+    belief: ChainBelief
+    paths: Paths
+    say: Say
+    cap: float = 1.0
+    last: float = np.inf
+    tell: Tell | None = None
+
+    @property
+    def config(self) -> Config:
+        """The configuration with a stabiliser suited to the current ensemble."""
+        return self.belief.with_stabiliser(self.given)
+
+    def safe(self, config: Config, shares: tuple[float, ...], most: float = np.inf) -> Found:
+        """Find the first of the `shares` of the designed path that is safe for all simulated arms.
+
+        most: largest share; for other paths, the share with the same amplitude. The shares are scaled to it.
+
+        If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
+        kept. Raises NoSafeTorque if no share of any path is safe.
+        """
+        most = min(most, self.cap) if self.cap < 1.0 else most
+        found, why, shortage = self._largest(config, _up_to(most, shares))
+        reserve = self.paths.reserve
+        for _ in range(REDESIGNS):
+            if found is not None and found.share >= SMALL * min(most, shares[0]):
+                break
+            former, reserve = self.paths, reserve.larger(shortage)
+            try:
+                self.paths = Paths.of(self.given, self.belief.torque, reserve)
+            except NoSafeTorque:
+                break
+            times = self.paths.amplitude_over(former)
+            other, other_why, shortage = self._largest(config, _up_to(most / times, shares))
+            if other is None or (found is not None and self._worth(former, found) <= self._worth(self.paths, other)):
+                self.paths = former
+            else:
+                found = other
+                most, self.last = most / times, self.last / times
+                self.cap = min(self.cap / times, 1.0) if self.cap < 1.0 else 1.0
+                self.say("Designed another path, which stays farther from the limits.")
+            why = why if other is not None else other_why
+        if found is None:
+            raise NoSafeTorque(
+                f"{config.path}: no motion is safe for all arms consistent with what is known, not even "
+                f"{100 * shares[-1]:.0f} % of the designed path: {why}. {_remedy(config)}"
+            )
+        return found
+
+    def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
+        """The first safe share of the paths, why a larger one is not, and how much clearance that one lacks [m]."""
+        why, shortage = "", 0.0
+        for share in shares:
+            try:
+                plan = self.paths.plan(config, self.belief.torque, share)
+            except NoHeadroom as error:  # the arm is heavier than the paths were designed for
+                why = str(error)
+                continue
+            for count in (SEARCH_ARMS, ARMS):
+                foreseen = predict_chain(config, plan, self.belief.arms.first(count), self.tell)
+                not_safe = unsafe(config, foreseen)
+                shortage = max(shortage, -float(foreseen.rooms.min()))
+                if not_safe:
+                    break
+            not_safe = not_safe or self._unsafe_stop(config, plan)
+            if not not_safe:
+                return Found(share, plan, foreseen), why, shortage
+            why = not_safe
+        return None, why, shortage
+
+    def _worth(self, paths: Paths, found: Found) -> float:
+        """Worst relative standard error of the base parameters after the found share of a path."""
+        return paths.designer.worth(paths.designer.scaled(paths.identify, found.share))[0]
+
+    def _unsafe_stop(self, config: Config, plan: Plan) -> str:
+        """Explain why a stop would not lower the arm safely; "" if it would."""
+        return "" if config.safety.stop == "cut" else foreseen_stops(config, plan, self.belief.arms.first(ARMS)).unsafe
+
+
+def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the shares, scaled so that the first is at most `most`."""
+    return tuple(min(1.0, most / shares[0]) * share for share in shares)
+
+
+def _remedy(config: Config) -> str:
+    """Return the changes with which a user may make a path safe."""
+    spread = 0.3 if config.arm.prior is None else config.arm.prior.spread
+    return (
+        "Depending on the reason, these changes help: a rest_pose farther from limits and obstacles; a wider "
+        "position_limit; more room in [clearance] (floor, boxes, margin), if there is more; a larger "
+        f"{limit_names(config)} or velocity_limit; or masses in the URDF that are known better, with [arm.prior] "
+        f"spread below {spread:g}."
+    )
+
+
+def step_config(config: Config) -> Config:
+    """The configuration of a step: one path, run for two periods whether or not it settles."""
+    update: dict[str, Any] = {"held_out": False, "max_settling_periods": 1, "periods": 1, "settle_within": 0.99}
+    return config.model_copy(update={"experiment": config.experiment.model_copy(update=update)})

@@ -1,0 +1,63 @@
+"""Noise from the difference between two passes of one motion, rounding included."""
+
+import numpy as np
+import pytest
+
+from hil.estimator.data.fourier import white_noise
+from hil.estimator.data.repeated_noise import agreed_noise, repeated_noise
+
+STEP = np.array([1.5e-3, 1.5e-3])
+SAMPLES = 4000
+
+
+def fast_motion() -> np.ndarray:
+    """A motion with corners, sampled so slowly that its lines reach the Nyquist frequency [steps]."""
+    order = np.arange(1, SAMPLES // 2)
+    lines = np.exp(2j * np.pi * np.random.default_rng(5).random((2, order.size))) / order**1.5
+    return SAMPLES * np.fft.irfft(np.pad(300.0 * lines, ((0, 0), (1, 0))), SAMPLES)
+
+
+def passes(std: float, count: int = 2) -> list[np.ndarray]:
+    rng = np.random.default_rng(3)
+    motion = fast_motion()
+    return [np.round(motion + std * rng.standard_normal(motion.shape)) * STEP[:, None] for _ in range(count)]
+
+
+@pytest.mark.parametrize("std", [0.0, 0.05, 0.13, 0.2, 0.34, 0.56, 1.5])
+def test_noise_is_measured_whatever_the_motion(std: float) -> None:
+    found = repeated_noise(passes(std), STEP)
+    assert found is not None
+    np.testing.assert_allclose(found / STEP, np.sqrt(1.0 / 12.0 + std**2), rtol=0.08)
+
+
+def test_a_single_period_takes_the_corners_of_the_motion_for_noise() -> None:
+    """Otherwise the test above would pass without any difference being taken."""
+    assert np.all(white_noise(passes(0.0)[0]) > 0.35 * STEP)
+
+
+def test_the_mean_of_several_passes_is_less_noisy_but_rounded_alike() -> None:
+    for std in (0.0, 0.13, 0.8):
+        several = passes(std, 5)
+        found = repeated_noise(several, STEP, averaged=4)
+        assert found is not None
+        error = np.mean(several[1:], axis=0) / STEP[:, None] - fast_motion()
+        np.testing.assert_allclose(found / STEP, np.sqrt(np.mean(error**2, axis=1)), rtol=0.1)
+
+
+def test_missing_samples_are_bridged_and_single_passes_say_nothing() -> None:
+    one, other = passes(0.34)
+    one[0, 100:140] = np.nan
+    one[0, ::50] = np.nan
+    found = repeated_noise([one, other], STEP)
+    assert found is not None
+    np.testing.assert_allclose(found / STEP, np.sqrt(1.0 / 12.0 + 0.34**2), rtol=0.12)
+    assert repeated_noise([one], STEP) is None
+    assert repeated_noise([one[:, :20], other[:, :20]], STEP) is None
+
+
+def test_two_measurements_are_averaged_where_they_agree() -> None:
+    white, repeated = np.array([1.0, 3.0, 1.0]), np.array([1.05, 1.0, 3.0])
+    found = agreed_noise(white, repeated, SAMPLES)
+    assert 1.0 < found[0] < 1.05
+    np.testing.assert_allclose(found[1:], 1.0)
+    np.testing.assert_allclose(agreed_noise(white, None, SAMPLES), white)
