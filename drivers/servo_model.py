@@ -22,6 +22,7 @@ __all__ = [
     "VOLTAGE_UNIT",
     "WATCHDOG_UNIT",
     "Mode",
+    "NoLoad",
     "Published",
     "ServoModel",
     "Stall",
@@ -42,6 +43,13 @@ VOLTAGE_UNIT = 0.1
 
 FULL_PWM_TICKS = 885
 """Goal PWM that applies the whole supply voltage to the motor [ticks]."""
+
+LEAST_SUPPLY = 0.6
+"""Lowest voltage across a motor that counts as that of its supply, relative to the lowest one published: supplies sag,
+and resistance and no-load speed differ by tens of percent from servo to servo."""
+
+HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
+"""Fraction of the goal below which a current may as well be that of a servo without torque, and the same ratio then."""
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Baud rates by the value of the register Baud Rate. The 330 models only go up to 4 MBd."""
@@ -66,6 +74,13 @@ class Stall(NamedTuple):
     torque: float
 
 
+class NoLoad(NamedTuple):
+    """The e-Manual's no-load speed: voltage [V], speed of the output shaft [rad/s]."""
+
+    voltage: float
+    speed: float
+
+
 class Published(NamedTuple):
     """A torque constant as published: the median of the figures, and the lowest and highest of them.
 
@@ -85,6 +100,7 @@ class ServoModel:
     current_unit: current per tick of Goal and Present Current [A]; None if the model has neither current mode nor
     sensor.
     stalls: the e-Manual's stall figures.
+    no_load: the e-Manual's no-load speed at the nominal voltage.
     other_constants: further published torque constants [N m/A].
     position_steps: ticks of Present Position per turn.
     min_voltage: supply voltage below which it shuts down with factory settings (Min Voltage Limit) [V].
@@ -97,6 +113,7 @@ class ServoModel:
     name: str
     current_unit: float | None
     stalls: tuple[Stall, ...]
+    no_load: NoLoad
     other_constants: tuple[float, ...] = ()
     position_steps: int = 4096
     min_voltage: float = 9.5
@@ -118,6 +135,26 @@ class ServoModel:
     def resistance(self) -> float:
         """Resistance between the motor's terminals [Ohm]: the lowest value among the stall figures."""
         return min(stall.voltage / stall.current for stall in self.stalls)
+
+    @property
+    def back_emf(self) -> float:
+        """Back-EMF per velocity of the output shaft [V s/rad]."""
+        return self.no_load.voltage / self.no_load.speed
+
+    def is_out_of_voltage(self, goal: float, carried: float, velocity: float) -> bool:
+        """Whether a current stays behind its goal because the supply cannot drive more through the turning motor.
+
+        It is taken for the cause if the motor turns in the direction of its goal and the voltage across its terminals,
+        that of its winding and its back-EMF, is about that of a supply. A servo without torque has the back-EMF alone.
+
+        goal, carried: commanded and measured current [A]. velocity: of the output shaft [rad/s].
+        """
+        if goal == 0.0 or velocity * goal <= 0.0 or not abs(carried) < abs(goal):
+            return False
+        along = max(0.0, math.copysign(1.0, goal) * carried)
+        across = self.resistance * along + self.back_emf * abs(velocity)
+        least = LEAST_SUPPLY if along > HARDLY_ANY * abs(goal) else LEAST_SUPPLY_AT_NO_LOAD
+        return across >= least * min(stall.voltage for stall in self.stalls)
 
     @property
     def torque_per_ampere(self) -> Published:
@@ -142,22 +179,54 @@ def _spread(values: list[float]) -> Published:
 _WORKBENCH_XM430 = 1 / (149.795 * 2.69e-3)
 # From ROBOTIS' dynamixel-workbench: 149.795 ticks per N m for the whole XM family, hence 2.48 N m/A.
 
+
+def _no_load(voltage: float, rpm: float) -> NoLoad:
+    return NoLoad(voltage, rpm * 2 * math.pi / 60)
+
+
 _MODELS = (
     ServoModel(
         "XM430-W350",
         2.69e-3,
         (Stall(11.1, 2.1, 3.8), Stall(12.0, 2.3, 4.1), Stall(14.8, 2.7, 4.8)),
+        _no_load(12.0, 46.0),
         (_WORKBENCH_XM430,),
     ),
-    ServoModel("XM430-W210", 2.69e-3, (Stall(11.1, 2.1, 2.7), Stall(12.0, 2.3, 3.0), Stall(14.8, 2.7, 3.7))),
-    ServoModel("XH430-W350", 2.69e-3, (Stall(11.1, 1.2, 3.1), Stall(12.0, 1.3, 3.4), Stall(14.8, 1.5, 4.2))),
-    ServoModel("XH430-W210", 2.69e-3, (Stall(11.1, 1.2, 2.2), Stall(12.0, 1.3, 2.5), Stall(14.8, 1.5, 3.1))),
-    ServoModel("XM540-W270", 2.69e-3, (Stall(11.1, 4.2, 10.0), Stall(12.0, 4.4, 10.6), Stall(14.8, 5.5, 12.9))),
-    ServoModel("XM540-W150", 2.69e-3, (Stall(11.1, 4.2, 6.9), Stall(12.0, 4.4, 7.3), Stall(14.8, 5.5, 8.9))),
+    ServoModel(
+        "XM430-W210",
+        2.69e-3,
+        (Stall(11.1, 2.1, 2.7), Stall(12.0, 2.3, 3.0), Stall(14.8, 2.7, 3.7)),
+        _no_load(12.0, 77.0),
+    ),
+    ServoModel(
+        "XH430-W350",
+        2.69e-3,
+        (Stall(11.1, 1.2, 3.1), Stall(12.0, 1.3, 3.4), Stall(14.8, 1.5, 4.2)),
+        _no_load(12.0, 30.0),
+    ),
+    ServoModel(
+        "XH430-W210",
+        2.69e-3,
+        (Stall(11.1, 1.2, 2.2), Stall(12.0, 1.3, 2.5), Stall(14.8, 1.5, 3.1)),
+        _no_load(12.0, 50.0),
+    ),
+    ServoModel(
+        "XM540-W270",
+        2.69e-3,
+        (Stall(11.1, 4.2, 10.0), Stall(12.0, 4.4, 10.6), Stall(14.8, 5.5, 12.9)),
+        _no_load(12.0, 30.0),
+    ),
+    ServoModel(
+        "XM540-W150",
+        2.69e-3,
+        (Stall(11.1, 4.2, 6.9), Stall(12.0, 4.4, 7.3), Stall(14.8, 5.5, 8.9)),
+        _no_load(12.0, 53.0),
+    ),
     ServoModel(
         "XL330-M288",
         1.0e-3,
         (Stall(3.7, 1.11, 0.42), Stall(5.0, 1.47, 0.52), Stall(6.0, 1.74, 0.60)),
+        _no_load(5.0, 103.0),
         min_voltage=3.5,
         fast_sync_read_firmware=46,
     ),
@@ -165,6 +234,7 @@ _MODELS = (
         "XL330-M077",
         1.0e-3,
         (Stall(3.7, 1.11, 0.180), Stall(5.0, 1.47, 0.215), Stall(6.0, 1.74, 0.228)),
+        _no_load(5.0, 383.0),
         min_voltage=3.5,
         fast_sync_read_firmware=46,
     ),
@@ -173,12 +243,17 @@ _MODELS = (
         "XC330-T288",
         1.0e-3,
         (Stall(9.0, 0.61, 0.76), Stall(11.1, 0.80, 0.92), Stall(12.0, 0.88, 1.00)),
+        _no_load(12.0, 65.0),
         min_voltage=5.5,
         fast_sync_read_firmware=46,
         senses_supply=True,
     ),
     ServoModel(
-        "XL430-W250", None, (Stall(9.0, 1.0, 1.0), Stall(11.1, 1.3, 1.4), Stall(12.0, 1.4, 1.5)), min_voltage=6.0
+        "XL430-W250",
+        None,
+        (Stall(9.0, 1.0, 1.0), Stall(11.1, 1.3, 1.4), Stall(12.0, 1.4, 1.5)),
+        _no_load(11.1, 57.0),
+        min_voltage=6.0,
     ),
 )
 

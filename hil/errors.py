@@ -55,6 +55,7 @@ class Cause(Enum):
     LATE = "missed deadlines"
     JUMP = "encoder jump"
     NOT_FOLLOWING = "current does not follow"
+    OUT_OF_VOLTAGE = "supply too low for this speed"
     TORQUE_OFF = "torque lost"
     WATCHDOG = "servo's watchdog"
     GOALS_LOST = "goals not accepted"
@@ -71,7 +72,7 @@ class Cause(Enum):
     @property
     def allows_braking(self) -> bool:
         """Whether the measured velocity and the commanded current can still be trusted."""
-        return self in {Cause.POSITION, Cause.VELOCITY, Cause.TEMPERATURE, Cause.VOLTAGE}
+        return self in {Cause.POSITION, Cause.VELOCITY, Cause.OUT_OF_VOLTAGE, Cause.TEMPERATURE, Cause.VOLTAGE}
 
     @property
     def allows_lowering(self) -> bool:

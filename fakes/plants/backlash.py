@@ -5,16 +5,19 @@ stops. The links are attached to the output shafts, as are the servos' encoders.
 between the two; at a flank the gears act as a spring and a damper that can push but not pull.
 
 The contact is stiff, so the time steps are short: such an arm takes about ten times as long to simulate as one without
-backlash.
+backlash, and longer if its links are very light.
 """
 
 from collections.abc import Sequence
-from math import ceil, cos, sin
+from math import ceil, cos, isfinite, sin, sqrt
+from typing import NoReturn
 
 from hil.fakes.plants.arm import Arm, Drive, Link, armature
 from hil.fakes.plants.motor import Motor
 
-STEP = 50e-6  # s: short compared with the period of the gears' vibration
+STEP = 50e-6  # s: short compared with the period of the gears' vibration, unless the links are very light
+_PER_RADIAN = 0.3  # largest step, relative to the time in which that vibration advances by 1 rad
+_PER_DAMPING = 0.5  # the same, relative to the time constant of its damping
 
 
 class GearedArm:
@@ -24,6 +27,16 @@ class GearedArm:
         self._rotors = [_Rotor(drive, angle) for drive, angle in zip(arm.drives, arm.start, strict=True)]
         self._links = _Links(arm)
         self._time = 0.0
+        self.step = self._longest_step(arm)
+        """Longest time step [s]."""
+
+    def _longest_step(self, arm: Arm) -> float:
+        """The longest step [s] with which the stiffest contact between gears and links is integrated stably."""
+        lightness = self._links.lightness + 1.0 / min(armature(drive) for drive in arm.drives)
+        stiffness = max(drive.gear_stiffness for drive in arm.drives)
+        damping = max(drive.gear_damping for drive in arm.drives)
+        vibration = _PER_RADIAN / sqrt(stiffness * lightness)
+        return min(STEP, vibration, _PER_DAMPING / (damping * lightness) if damping else STEP)
 
     @property
     def joints(self) -> int:
@@ -62,8 +75,25 @@ class GearedArm:
             rotor.motor.warm_up(self._time)
         self._time = until
         links = self._links
-        steps = ceil(remaining / STEP)
-        step = remaining / steps
+        steps = ceil(remaining / self.step)
+        try:
+            self._move(steps, remaining / steps, current)
+        except ValueError:  # the cosine of an infinite angle
+            self._diverged()
+        if not all(map(isfinite, (*links.angle, *links.velocity))):
+            self._diverged()
+
+    def _diverged(self) -> NoReturn:
+        from hil.fakes.plants.plant import PlantError  # which imports this module
+
+        raise PlantError(
+            f"The arm with backlash became unstable in simulation at {self._time:g} s, with a time step of "
+            f"{1e6 * self.step:.2g} us: lower gear_stiffness, gear_damping or stop_stiffness, or give its links more "
+            "inertia"
+        ) from None
+
+    def _move(self, steps: int, step: float, current: Sequence[float]) -> None:
+        links = self._links
         for _ in range(steps):
             contact = [
                 rotor.contact(angle, velocity)
@@ -123,6 +153,18 @@ class _Links:
             self._second = _about_joint(second)
             self._swing = second.mass * first.length * second.centre
             self._weight_second = second.mass * second.centre * arm.weight
+
+    @property
+    def lightness(self) -> float:
+        """Bound of the acceleration per torque at the joints in any pose [1/(kg m^2)]: trace over determinant."""
+        if len(self.angle) == 1:
+            return 1.0 / self._first
+        bound = 0.0
+        for cosine in (-1.0, 0.0, 1.0):
+            m22, m12 = self._second, self._second + self._swing * cosine
+            m11 = self._first + self._swing * cosine + m12
+            bound = max(bound, (m11 + m22) / (m11 * m22 - m12 * m12))
+        return bound
 
     def move(self, step: float, torque: Sequence[float]) -> None:
         acceleration = self._one(torque[0]) if len(torque) == 1 else self._two(*torque)

@@ -6,10 +6,13 @@ def exit_code(error: Exception) -> int | None:
     from hil.drivers import errors as driver
     from hil.errors import HilError
     from hil.estimator.errors import EstimationError
+    from hil.fakes.plants.plant import PlantError
 
     if isinstance(error, HilError):
         return error.exit_code
-    if isinstance(error, driver.UnknownModel | driver.PortNotOpened | driver.WrongModel | driver.WrongSetting):
+    if isinstance(
+        error, driver.UnknownModel | driver.PortNotOpened | driver.WrongModel | driver.WrongSetting | PlantError
+    ):
         return 2
     return 1 if isinstance(error, driver.DriverError | EstimationError) else None
 

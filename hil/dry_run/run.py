@@ -11,6 +11,7 @@ from hil.dry_run.ensemble import Ensemble, prior_ensemble, result_ensemble
 from hil.dry_run.prediction import predict
 from hil.dry_run.stopping_distance import stopping_distance
 from hil.dry_run.summary import DryRun
+from hil.dry_run.supply_speed import lowered, within_supply
 from hil.model_file import read_result
 from hil.plan.plan import make_plan
 from hil.setup.idle_bus import quiet_stream
@@ -34,6 +35,8 @@ def dry_run(
     only_planar(config, "a dry run")
     ensemble = ensemble_of(config, result, arms)
     said = quiet_stream(config) if servos else ()
+    given, config = config, within_supply(config)
+    said += lowered(given, config)
     plan = None if config.experiment.peak_torque is None else make_plan(config)
     asked = None if plan is None else predict(config, plan, ensemble, shown=SHOWN, executor=executor)
     largest = largest_amplitude(config, ensemble, executor=executor)

@@ -35,6 +35,9 @@ JUMP_FACTOR = 1.5
 EARLY_MOTION_RAD = 0.05
 """Largest motion allowed while resting before the start [rad]."""
 
+BELOW_VOLTAGE = 0.9
+"""Speed that is proposed as a limit, relative to one at which the supply could not drive the commanded current."""
+
 NONE_HEARD = "No servo was heard"
 """Beginning of the message of a stop because all replies are missing."""
 
@@ -65,6 +68,10 @@ class Guard:
         self._seconds = [[second.id for second in joint.joint.seconds] for joint in config.joints]
         self._names = [str(joint.joint) for joint in config.joints]
         self._safety = safety
+        currents = (joint.drive_mode is Mode.CURRENT for joint in config.joints)
+        self._models = [
+            joint.joint.servo if by_current else None for joint, by_current in zip(config.joints, currents, strict=True)
+        ]
         # A pilot lowers the torque itself after such a stop.
         lower = "" if config.experiment.pilot else f" Lower experiment.peak_torque. {how_to_find_torque(config)}"
         self._lower_torque = lower
@@ -238,6 +245,15 @@ class Guard:
 
     def _not_followed(self, index: int, state: State) -> NoReturn:
         carried, commanded, joint = state.current[index], state.goal_current[index], self._joints[index]
+        velocity, model = state.velocity[index], self._models[index]
+        if model is not None and model.is_out_of_voltage(commanded, carried, velocity):
+            self._stop(
+                index,
+                Cause.OUT_OF_VOLTAGE,
+                f"carries {carried:.3f} A instead of the commanded {commanded:.3f} at {velocity:.2f} rad/s: at that "
+                f"speed its supply cannot drive more current against the back-EMF. Lower velocity_limit to "
+                f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s, or raise the supply voltage.{self._lower_torque}",
+            )
         away = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
         is_driven = away > abs(commanded) + joint["following"]["allowed"] or away < -joint["following"]["allowed"]
         if is_driven:

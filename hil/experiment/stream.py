@@ -39,7 +39,9 @@ from hil.setup.servo_session import has_moved
 
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
-_BY_OTHER_GOALS = {Cause.NOT_FOLLOWING, Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY}
+_BY_OTHER_GOALS = {
+    *(Cause.NOT_FOLLOWING, Cause.OUT_OF_VOLTAGE, Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY)
+}
 """Causes of a stop that another program's goals may have."""
 
 _FORGETS = 0.98

@@ -6,6 +6,7 @@ from hil.dry_run.chain_prediction import Tell, predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import ChainDryRun
+from hil.dry_run.supply_speed import lowered, within_supply
 from hil.errors import NoSafeTorque
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.pilot.chain_belief import ChainBelief
@@ -27,6 +28,8 @@ def rehearse(config: Config, arms: int, servos: bool = False, tell: Tell | None 
     """
     check_rest_pose(config)
     said = quiet_stream(config) if servos else ()
+    given, config = config, within_supply(config)
+    said += lowered(given, config)
     if not config.experiment.pilot:
         plan = make_chain_plan(config)
         drawn = prior_arms(config, known_chain(config), arms)

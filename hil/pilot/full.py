@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
+from hil.dry_run.supply_speed import lowered, within_supply
 from hil.errors import DidNotMove, ExperimentError
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.stop_request import StopRequest
@@ -32,6 +33,9 @@ def identify_in_steps(
 
     Raises what a run raises, and ExperimentError if a joint does not move at its current limit.
     """
+    given, config = config, within_supply(config)
+    for sentence in lowered(given, config):
+        say(sentence)
     if config.is_chain:
         return identify_chain_in_steps(config, run, shown_path, watch, say)
     # A stop request in one step also cancels all later ones. Servo settings are saved and restored once for all steps,

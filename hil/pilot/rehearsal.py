@@ -15,6 +15,7 @@ from hil.dry_run.prediction import predict
 from hil.dry_run.run import SHOWN, ensemble_of
 from hil.dry_run.stopping_distance import stopping_distance
 from hil.dry_run.summary import DryRun, FirstRun
+from hil.dry_run.supply_speed import lowered, within_supply
 from hil.errors import NoSafeTorque
 from hil.model_file import read_result
 from hil.pilot.search import Search
@@ -34,6 +35,8 @@ def rehearse_in_steps(
     only_planar(config, "a dry run")
     ensemble = ensemble_of(config, result, arms)
     said = quiet_stream(config) if servos else ()
+    given, config = config, within_supply(config)
+    said += lowered(given, config)
     earlier = None if result is None else read_result(result)
     # Nothing is run, so the folder and the player are never used.
     player = Player(config.path, lambda _: None, lambda _: None)

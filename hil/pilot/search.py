@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude, largest_amplitude, most_torque, with_peaks
 from hil.dry_run.prediction import GUARDED, predict
+from hil.dry_run.supply_speed import lowered, slower
 from hil.dry_run.waves import designed_plan, roomy_plan, roomy_plans
 from hil.errors import ExperimentError, NoSafeTorque
 from hil.estimator.models.parameters import Physics
@@ -113,6 +114,7 @@ class Search:
         swing = played.step.seen[1] - played.step.seen[0] if played.seen is None else played.seen.swing
         self.swing = swing if self.swing is None else np.fmax(self.swing, swing)
         self._slow_down(played)
+        self._stay_within_supply(played)
         if played.seen is None:
             return
         self.belief = self.belief.after(config, played.seen)
@@ -124,6 +126,14 @@ class Search:
         self.fast = played.passed_velocity_limit & ~self.moved & (played.step.seen[2] > limit)
         calmer = self.options.torque_after_limit * played.step.peak_torque
         self.calm = np.where(self.fast, np.minimum(calmer, self.calm), self.calm)
+
+    def _stay_within_supply(self, played: Played) -> None:
+        """Keep joints from speeds at which their supply cannot drive the commanded current."""
+        if played.delivered is None:
+            return
+        former, self.config = self.config, slower(self.config, played.delivered.tolist())
+        for sentence in lowered(former, self.config):
+            self.player.say(sentence)
 
     @property
     def moved(self) -> NDArray[np.bool_]:

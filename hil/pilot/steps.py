@@ -17,6 +17,7 @@ from hil.experiment.stream import Watch
 from hil.pilot.belief import MOVED_STEPS
 from hil.pilot.punctual import punctual
 from hil.pilot.seen import Seen, seen_of
+from hil.pilot.supply import delivered_speed
 from hil.results.parts import PlayedStep
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
@@ -24,7 +25,7 @@ from hil.runs.run_folder import RunFolder
 Array = NDArray[np.float64]
 Say = Callable[[str], None]
 
-_AT_A_LIMIT = (Cause.POSITION, Cause.VELOCITY)
+_AT_A_LIMIT = (Cause.POSITION, Cause.VELOCITY, Cause.OUT_OF_VOLTAGE)
 
 
 _BESIDE = 2
@@ -86,6 +87,7 @@ class Played:
     seen: Seen | None
     torque: str
     error: ExperimentError | None
+    delivered: Array | None = None
 
     @property
     def passed_limit(self) -> bool:
@@ -147,7 +149,9 @@ class Player:
                 f"{name}: measured peaks exceed those of 99 % of the simulated arms; the arm differs from the "
                 "assumptions."
             )
-        return Played(step, seen_of(config, samples), torque, error)
+        limited = isinstance(error, SafetyStop) and error.cause is Cause.OUT_OF_VOLTAGE
+        delivered = delivered_speed(config, samples) if limited else None
+        return Played(step, seen_of(config, samples), torque, error, delivered)
 
 
 def tells_of_the_arm(error: ExperimentError) -> bool:

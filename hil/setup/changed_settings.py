@@ -18,6 +18,7 @@ EXPLAINED = frozenset(
         Cause.VELOCITY,
         Cause.JUMP,
         Cause.NOT_FOLLOWING,
+        Cause.OUT_OF_VOLTAGE,
         Cause.FROZEN,
         Cause.UNEXPECTED,
         Cause.UNLIKE_BEFORE,

@@ -10,6 +10,7 @@ from hil.drivers.servo_prior import stall_torque
 
 STANDARD_GRAVITY = 9.81
 _OF_STALL = 0.3  # of the stall current or the supply voltage; initial limit
+_FASTEST = 10.0  # rad/s, initial limit of servos that could turn faster
 _USUAL_STALL = 4.1  # N m, stall torque of an XM430
 _CYCLE_BYTES = 39  # on the wire per servo: goal, request and reply
 RATES = (400, 300, 250, 200, 160, 125, 100, 80, 64, 50, 40, 32, 25, 20)
@@ -21,7 +22,7 @@ class JointAnswers:
     """Answers about one joint.
 
     rest: angle at rest [rad]. swing: allowed deviation from it to either side [rad]. length: distance from this joint
-    to the next one, or to the tip [m].
+    to the next one, or to the tip [m]. voltage: its supply [V]; None if it was not read.
     """
 
     name: str
@@ -32,6 +33,7 @@ class JointAnswers:
     direction: int = 1
     swing: float = math.pi / 2
     length: float = 0.12
+    voltage: float | None = None
 
     @property
     def joint(self) -> Joint:
@@ -134,7 +136,7 @@ def _joint(answers: JointAnswers) -> list[str]:
             "all values of the joint scale with it",
         ),
         _line(f"position_limit = {_list(ends, 2)}", "rad"),
-        _line("velocity_limit = 10.0", "rad/s"),
+        _line(f"velocity_limit = {_velocity_limit(answers):g}", "rad/s"),
         _line(f"{limit} = {_goal_limit(answers):.2g}", f"{unit}: {_OF_STALL * 100:.0f} % of stall"),
     ]
 
@@ -142,6 +144,14 @@ def _joint(answers: JointAnswers) -> list[str]:
 def _spread(published: Published) -> float:
     """Standard deviation of a published constant: half the range of published values, at least a tenth of the value."""
     return max(0.1 * published.value, (published.high - published.low) / 2)
+
+
+def _velocity_limit(answers: JointAnswers) -> float:
+    """Initial velocity limit [rad/s]: at most the no-load speed at the supply voltage."""
+    servo = servo_model(answers.model)
+    volts = servo.no_load.voltage if answers.voltage is None else answers.voltage
+    fastest = volts / servo.back_emf
+    return min(_FASTEST, math.floor(10.0 * fastest) / 10.0)
 
 
 def _goal_limit(answers: JointAnswers) -> float:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from hil.drivers.control_table import load_control_table
 from hil.drivers.port import Port
@@ -62,7 +63,8 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
         length = 1e-3 * _number(f"Length from {name} to {beyond} in mm", usual, _LENGTHS_MM, ask, say)
         question = f"How far may {name} swing from there to either side, in degrees"
         swing = math.radians(_number(question, "90", (5.0, _MOST_SWING), ask, say))
-        joints.append(JointAnswers(name, found.id, str(found.model), zero, rest, directions[number], swing, length))
+        answers = JointAnswers(name, found.id, str(found.model), zero, rest, directions[number], swing, length)
+        joints.append(replace(answers, voltage=found.voltage))
     head = (
         "Written by hil init. Before the first run: read each line, then `hil check` this file.\n"
         "NOT yet run on this arm: the limits are conservative guesses from the servo models."

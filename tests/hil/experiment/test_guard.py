@@ -372,3 +372,26 @@ def test_an_arm_that_a_run_left_beyond_either_limit_may_start_a_little_outside(
         assert look(guard, outside) is Cause.POSITION
     else:
         guard.look(outside)
+
+
+@pytest.mark.parametrize(
+    ("carried", "velocity", "cause"),
+    [
+        (0.1, 4.6, Cause.OUT_OF_VOLTAGE),
+        (0.0, 4.8, Cause.OUT_OF_VOLTAGE),
+        (0.0, 2.9, Cause.NOT_FOLLOWING),  # the supply could drive this current: its torque is off
+        (0.1, 1.0, Cause.NOT_FOLLOWING),
+        (-0.6, 4.6, Cause.NOT_FOLLOWING),
+    ],
+)
+def test_a_current_behind_its_goal_near_no_load_speed_is_the_supplys(
+    arm: Arm, carried: float, velocity: float, cause: Cause
+) -> None:
+    fast = STILL._replace(goal_current=(0.0, 0.3), current=(0.0, carried), velocity=(0.0, velocity))
+    states = [at(n, fast._replace(position=(-1.57, velocity * n / 400))) for n in range(40)]
+    guard = Guard(arm())
+    with pytest.raises(SafetyStop) as stop:
+        for state in states:
+            guard.look(state)
+    assert stop.value.cause is cause
+    assert ("Lower velocity_limit" in str(stop.value)) == (cause is Cause.OUT_OF_VOLTAGE)

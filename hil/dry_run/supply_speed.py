@@ -1,0 +1,51 @@
+"""The speed that the supply allows: near no-load speed, a motor cannot carry the commanded current in either direction.
+
+A run whose currents stay behind their goals determines nothing, so a dry run and the pilot keep joints below this
+speed, whatever velocity_limit says. In PWM mode the back-EMF is part of the model, and no such limit is needed.
+"""
+
+from hil.config.joint import JointConfig
+from hil.config.schema import Config
+from hil.drivers.servo_model import Mode
+
+_SHARE = 0.85
+"""Fraction of the no-load speed that is used; the rest of the voltage drives the current."""
+
+
+def within_supply(config: Config) -> Config:
+    """The configuration with each velocity_limit at most what the servo's supply allows [rad/s].
+
+    Nominal supply voltages are assumed. A fake servo whose motor is not limited by its supply has no such limit.
+    """
+    return slower(config, [_allowed(config, joint) for joint in config.joints])
+
+
+def slower(config: Config, speed: list[float]) -> Config:
+    """The configuration with each velocity_limit lowered to `speed` (joints,) [rad/s] where that is less."""
+    joints = [
+        joint if each >= joint.velocity_limit else joint.model_copy(update={"velocity_limit": float(f"{each:.2g}")})
+        for joint, each in zip(config.joints, speed, strict=True)
+    ]
+    return config.model_copy(update={"joints": joints})
+
+
+def lowered(before: Config, after: Config) -> tuple[str, ...]:
+    """One sentence that names the joints whose velocity_limit was lowered; none if there is no such joint."""
+    pairs = zip(before.joints, after.joints, strict=True)
+    now = [f"{new.name} {new.velocity_limit:g}" for old, new in pairs if old.velocity_limit != new.velocity_limit]
+    if not now:
+        return ()
+    return (
+        f"At higher speeds the supply cannot drive the commanded current, so this speed limit applies instead of "
+        f"velocity_limit: {', '.join(now)} rad/s.",
+    )
+
+
+def _allowed(config: Config, joint: JointConfig) -> float:
+    if joint.drive_mode is not Mode.CURRENT:
+        return float("inf")
+    if config.is_fake and config.fake is not None:
+        limited = {servo.id for servo in config.fake.servos if servo.voltage_limited}
+        if not limited.intersection(joint.ids):
+            return float("inf")
+    return _SHARE * joint.joint.servo.no_load.speed
