@@ -17,7 +17,8 @@ from hil.fakes.bus.supply import Supply
 from hil.fakes.names import arm_names, find_arm
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.chain_arm import ChainArm
-from hil.fakes.plants.plant import Plant, PlantError, load_plant, make_chain, make_plant
+from hil.fakes.plants.errors import PlantError
+from hil.fakes.plants.plant import Plant, load_plant, make_chain, make_plant
 from hil.fakes.servo.encoder import PERFECT, Encoder
 from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model

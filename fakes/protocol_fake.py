@@ -27,7 +27,7 @@ from hil.drivers.clock import Clock, WallClock
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.description import DescriptionError, FakeArm, load_fake, make_bus
-from hil.fakes.plants.plant import PlantError
+from hil.fakes.plants.errors import PlantError
 
 SCHEME = "fake://"
 REAL_TIME = "?time=real"

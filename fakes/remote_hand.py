@@ -11,7 +11,7 @@ from pathlib import Path
 
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.hand import parse_move
-from hil.fakes.plants.plant import PlantError
+from hil.fakes.plants.errors import PlantError
 
 _MOST_BYTES = 4096
 _PATIENCE_S = 5.0

@@ -74,6 +74,8 @@ _PENDING = _COVARIANCE + _COUNT
 _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
 # Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration.
 _TAUGHT, _TEACHES = 0, 2
+# The constants: joints, interval, floors; from 4 drifts; then two least noises, the highest floors and their friction.
+_HIGHEST = 4 + _COUNT + 2
 
 
 class MomentumObserver:
@@ -83,9 +85,18 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
+    frictions: the same scale of torque is at least this multiple of dry friction, as far as it is known: near
+    standstill, friction behaves differently from the model.
     """
 
-    def __init__(self, mean: Mapping[str, float], covariance: Array, largest: Array, interval: float) -> None:
+    def __init__(
+        self,
+        mean: Mapping[str, float],
+        covariance: Array,
+        largest: Array,
+        interval: float,
+        frictions: float = 0.0,
+    ) -> None:
         joints = len(largest)
         if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
             raise ValueError(f"{joints} joints and a covariance of {covariance.shape}: 1 or 2, and 14 x 14, are needed")
@@ -93,12 +104,16 @@ class MomentumObserver:
         self._memory = np.zeros((_PENDING + 1, _COUNT))
         self._memory[_THETA] = [mean.get(name, 0.0) for name in NAMES]
         self._memory[_COVARIANCE:_PENDING] = covariance
-        self._memory[_SINGLE, _NOISE : _NOISE + joints] = (_FIRST_NOISE_SHARE * largest) ** 2
-        floor = np.zeros(2)
-        floor[:joints] = FLOOR_SHARE * largest
+        expected = frictions * np.array([mean.get(f"coulomb_{number}", 0.0) for number in (1, 2)][:joints])
+        first = np.maximum(largest, expected)
+        self._memory[_SINGLE, _NOISE : _NOISE + joints] = (_FIRST_NOISE_SHARE * first) ** 2
+        floor, highest = np.zeros(2), np.zeros(2)
+        floor[:joints], highest[:joints] = FLOOR_SHARE * largest, FLOOR_SHARE * first
         self._rests = standstill.memory(joints, _COUNT)
         drift = _LEAST_DRIFT**2 * np.diag(covariance)
-        self._constants = np.concatenate(([joints, interval, *floor], drift, (_FIRST_NOISE_SHARE * 0.1 * floor) ** 2))
+        least_noise = (_FIRST_NOISE_SHARE * 0.1 * highest) ** 2
+        friction = [FLOOR_SHARE * frictions]
+        self._constants = np.concatenate(([joints, interval, *floor], drift, least_noise, highest, friction))
         self._loop: Callable[..., int] = _observe
         self.observe(
             (0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf
@@ -220,10 +235,12 @@ def _is_blocked(
     """
     if distance == 0.0:
         return False
-    variance = _variance(rest, distance, row, m[_COVARIANCE:_PENDING]) + 2.0 * noise
+    friction = _static_friction(m, rest, j)
+    variance = 2.0 * noise
+    if abs(distance) > 2.0 * friction:  # otherwise it does not matter, and would take time
+        variance += _variance(rest, distance, row, m[_COVARIANCE:_PENDING])
     tolerance = max(TIMES * math.sqrt(variance), floor)
     momentum = _VISIBLE * math.sqrt(rounding) * FILTER_S
-    friction = _static_friction(m, rest, j)
     return bool(_blocked(rest, distance, held, friction, tolerance, momentum, FILTER_S, dt))
 
 
@@ -279,6 +296,12 @@ def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> Non
     for_later[_TAUGHT + j] = for_later[_TEACHES + j] = 0.0
 
 
+def _floor(m: Any, k: Any, j: int) -> float:
+    """Return the smallest torque that may raise an alarm: lower for a joint whose friction turns out to be small."""
+    dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
+    return float(max(k[2 + j], min(k[_HIGHEST + j], k[_HIGHEST + 2] * dry)))
+
+
 def _observe_loop(
     m: Any, rests: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, dt: float
 ) -> int:
@@ -312,15 +335,15 @@ def _observe_loop(
         stands = min(max(single[_STANDS + j], 0.0), 1.0)
         holds, rounding = stands * _static_friction(m, rests[j], j), _of_rounding(m, j, slope, math.cos(q2))
         quiet = 1.0 - (1.0 - _STANDING_NOISE) * stands
-        noise = quiet * quiet * single[_NOISE + j]
+        noise, floor = quiet * quiet * single[_NOISE + j], _floor(m, k, j)
         spread = left_open + rounding + noise
         beyond = max(abs(lacking) - holds, 0.0)
         is_beyond = beyond > TIMES * math.sqrt(spread)
-        if _alarms(single, j, beyond / max(TIMES * math.sqrt(spread), quiet * k[2 + j]), dt):
+        if _alarms(single, j, beyond / max(TIMES * math.sqrt(spread), quiet * floor), dt):
             alarm = j
         distance = _look_at_rest(rests[j], q1 if j == 0 else q2, stands, single[_TORQUE + j], row, m[_THETA])
         held = abs(lacking) - _CERTAIN * math.sqrt(left_open)
-        if _is_blocked(m, rests[j], j, distance, row, held, quiet * k[2 + j], noise, rounding, dt):
+        if _is_blocked(m, rests[j], j, distance, row, held, quiet * floor, noise, rounding, dt):
             alarm = j
         taught = min(beyond * beyond - left_open - rounding, _CLIPPED * single[_NOISE + j])
         _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), dt * (1.0 - stands), single[_SAMPLES + j] > 0.0)
@@ -336,5 +359,5 @@ _withstood, _forget, _look_at_rest = standstill.withstood, standstill.forget, st
 _variance, _blocked, _is_suspect = standstill.variance, standstill.blocked, standstill.is_suspect
 _static_friction, _is_blocked = map(_inner, (_static_friction, _is_blocked))
 _second_moment, _of_rounding = map(_inner, (_second_moment, _of_rounding))
-_alarms, _teach_noise = map(_inner, (_alarms, _teach_noise))
+_alarms, _teach_noise, _floor = map(_inner, (_alarms, _teach_noise, _floor))
 _observe: Callable[..., int] = compiled(_observe_loop)

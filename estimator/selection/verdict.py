@@ -314,7 +314,8 @@ def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
     # If the model is incomplete, a reading far from it is not necessarily wrong.
     if not estimate.outliers or not explained:
         return ()
+    one = estimate.outliers == 1
+    counted = "1 sample is an outlier and was" if one else f"{estimate.outliers} samples are outliers and were"
     return (
-        f"{estimate.outliers} samples are outliers and were downweighted: a jolt, backlash, or late or damaged "
-        "readings; the report's residuals show where.",
+        f"{counted} downweighted: a jolt, backlash, or late or damaged readings; the report's residuals show where.",
     )

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 from hil.drivers.packet import HardwareError
 from hil.fakes.bus.faults import Fault, FaultKind, Faults
-from hil.fakes.plants.plant import CanJam, Plant, PlantError
+from hil.fakes.plants.errors import PlantError
+from hil.fakes.plants.plant import CanJam, Plant
 from hil.fakes.servo.servo import EmulatedServo
 
 if TYPE_CHECKING:

@@ -19,7 +19,8 @@ from typing import Annotated, Self
 from pydantic import Field, ValidationError, model_validator
 
 from hil.fakes.bus.joints import Joints
-from hil.fakes.plants.plant import CanBeHeld, Plant, PlantError
+from hil.fakes.plants.errors import PlantError
+from hil.fakes.plants.plant import CanBeHeld, Plant
 from hil.toml_errors import Described, describe
 
 __all__ = ["Hand", "Move", "parse_move"]

@@ -13,6 +13,7 @@ from math import ceil, cos, isfinite, sin, sqrt
 from typing import NoReturn
 
 from hil.fakes.plants.arm import Arm, Drive, Link, armature
+from hil.fakes.plants.errors import PlantError
 from hil.fakes.plants.motor import Motor
 
 STEP = 50e-6  # s: short compared with the period of the gears' vibration, unless the links are very light
@@ -84,8 +85,6 @@ class GearedArm:
             self._diverged()
 
     def _diverged(self) -> NoReturn:
-        from hil.fakes.plants.plant import PlantError  # which imports this module
-
         raise PlantError(
             f"The arm with backlash became unstable in simulation at {self._time:g} s, with a time step of "
             f"{1e6 * self.step:.2g} us: lower gear_stiffness, gear_damping or stop_stiffness, or give its links more "

@@ -18,8 +18,8 @@ from collections.abc import Sequence
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from hil.fakes.plants.arm import Arm
+from hil.fakes.plants.errors import PlantError
 from hil.fakes.plants.pendulum import Pendulum
-from hil.fakes.plants.plant import PlantError
 from hil.toml_errors import describe
 
 

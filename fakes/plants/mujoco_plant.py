@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.fakes.plants.plant import PlantError
+from hil.fakes.plants.errors import PlantError
 
 try:
     import mujoco

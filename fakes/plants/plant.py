@@ -16,12 +16,9 @@ from typing import Protocol, runtime_checkable
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.backlash import GearedArm
 from hil.fakes.plants.chain_arm import ChainArm
+from hil.fakes.plants.errors import PlantError
 from hil.fakes.plants.pendulum import Pendulum
 from hil.fakes.plants.two_link import TwoLink
-
-
-class PlantError(ValueError):
-    """A plant cannot be created, or returned an invalid state. The message says which one and what is required."""
 
 
 class Plant(Protocol):

@@ -6,7 +6,7 @@ def exit_code(error: Exception) -> int | None:
     from hil.drivers import errors as driver
     from hil.errors import HilError
     from hil.estimator.errors import EstimationError
-    from hil.fakes.plants.plant import PlantError
+    from hil.fakes.plants.errors import PlantError
 
     if isinstance(error, HilError):
         return error.exit_code

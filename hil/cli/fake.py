@@ -9,7 +9,7 @@ from hil.errors import ConfigError
 from hil.fakes.bus.faults import FAULTS, parse_fault
 from hil.fakes.bus.hand import parse_move
 from hil.fakes.description import DescriptionError, FakeArm, load_fake
-from hil.fakes.plants.plant import PlantError
+from hil.fakes.plants.errors import PlantError
 from hil.fakes.pty_server import Counts, LinkError, PtyServer
 from hil.fakes.remote_hand import NoHand, ask_hand
 from hil.next_step import command

@@ -42,7 +42,8 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
     if first is None or whole - first < experiment.periods:
         wanted = experiment.periods + 1
         raise RecordingCutShort(
-            f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole periods"
+            f"The recording holds {len(rows)} samples of the multisine for {role!r}, {whole} whole "
+            + ("period" if whole == 1 else "periods")
             + (
                 f": it ended too early. {wanted} periods, {wanted * count} samples, are needed. Record again."
                 if whole < wanted

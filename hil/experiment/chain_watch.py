@@ -54,12 +54,12 @@ class ChainWatch:
         mean, covariance = observed_parameters(arms)
         n = len(self._constants)
         # A light joint's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
-        largest = np.maximum(self._constants * np.array(planned), _FRICTIONS * mean[len(mean) - 2 * n : len(mean) - n])
+        largest = self._constants * np.array(planned)
         interval = 1.0 / config.experiment.rate if interval is None else interval
-        self._observer = ChainObserver(arms.base, mean, covariance, largest, interval)
+        self._observer = ChainObserver(arms.base, mean, covariance, largest, interval, _FRICTIONS)
         self._names = [joint.joint.title for joint in config.joints]
         self._rest = np.array(config.arm.rest_pose)
-        self._lowest, self._highest = np.zeros(n), np.zeros(n)
+        self._was_below, self._was_above = np.zeros((2, n), dtype=np.bool_)
         self._commanded: deque[tuple[float, Array]] = deque(maxlen=math.ceil(WINDOW_S / interval))
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
@@ -74,22 +74,25 @@ class ChainWatch:
             goal, seconds = state.goal_current, float("inf")
         position = np.array(state.position)
         away, velocity = position - self._rest, np.array(state.velocity)
-        self._lowest, self._highest = np.minimum(self._lowest, away), np.maximum(self._highest, away)
-        is_free = np.abs(away).max() > LYING_RAD
+        is_away = np.abs(away) > LYING_RAD
+        is_free = bool(is_away.any())
+        if is_free:
+            self._was_above |= away > LYING_RAD
+            self._was_below |= away < -LYING_RAD
+        support = self._support(is_away, velocity) if is_free and not is_away.all() else None
         torque = self._constants * goal
         self._commanded.append((self._seen_at, torque))
-        joint = self._observer.observe(position, velocity, torque, seconds, is_free, self._support(away, velocity))
+        joint = self._observer.observe(position, velocity, torque, seconds, is_free, support)
         if joint >= 0:
             self._raise(joint, state)
 
-    def _support(self, away: Array, velocity: Array) -> Array:
+    def _support(self, is_away: NDArray[np.bool_], velocity: Array) -> Array:
         """The direction in which a stop may prevent motion of each joint (joints,): 1, -1, or 0.
 
-        away: angles relative to the rest pose [rad].
+        is_away: whether each joint is away from its rest angle.
         """
-        is_home = (np.abs(away) <= LYING_RAD) & (np.abs(velocity) <= _STILL_RAD_S)
-        was_below, was_above = self._lowest < -LYING_RAD, self._highest > LYING_RAD
-        return np.asarray(is_home * (was_below * 1.0 - was_above * 1.0))
+        is_home = ~is_away & (np.abs(velocity) <= _STILL_RAD_S)
+        return np.asarray(is_home * (self._was_below * 1.0 - self._was_above * 1.0))
 
     def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]

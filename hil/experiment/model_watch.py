@@ -167,8 +167,7 @@ class ModelWatch:
         interval = 1.0 / config.experiment.rate if interval is None else interval
         # A pilot's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         is_described = arms is not None or config.arm.link_lengths is not None
-        dry = [_FRICTIONS * is_described * mean[f"coulomb_{number}"] for number in range(1, len(largest) + 1)]
-        self._observer = MomentumObserver(mean, covariance, np.maximum(largest, dry), interval)
+        self._observer = MomentumObserver(mean, covariance, largest, interval, _FRICTIONS * is_described)
         self._names = [joint.joint.title for joint in config.joints]
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0

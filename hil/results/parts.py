@@ -152,9 +152,9 @@ class Validation:
     held_out_rms: open-loop prediction error of a held-out multisine, relative to the motion's RMS; where friction has
     changed since the fitted multisine, with one factor per joint taken from the held-out motion itself.
     held_out_as_fitted_rms: the same with friction as it was in the fitted multisine; None where it has not changed.
-    free_run_rms: the same for the fitted multisine. residual_over_floor: residual relative to the effect of rounding
-    and scatter. correlated_lags: fraction of the residual's autocorrelations that exceed those of white noise.
-    condition: condition number of the scaled information matrix.
+    free_run_rms: the same for the fitted multisine. residual_over_floor: residual relative to the measured
+    noise, which is at least that of rounding. correlated_lags: fraction of the residual's autocorrelations that exceed
+    those of white noise. condition: condition number of the scaled information matrix.
     """
 
     held_out_rms: PerJoint | None = None

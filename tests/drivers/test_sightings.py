@@ -111,3 +111,15 @@ def test_the_longest_read_back_fades() -> None:
     assert back.longest == pytest.approx(0.0098)
     back.took(0.02)
     assert back.longest == 0.02
+
+
+def test_one_or_two_read_backs_of_goals_lie_between_two_of_modes() -> None:
+    back, counts, goals = read_back(), set(), 0
+    for number in range(200):
+        if reads_modes(back):
+            counts.add(goals)
+            goals = 0
+        else:
+            goals += 1
+        look(back, 0.01 * number)
+    assert counts == {0, 1, 2}, "none before the first"

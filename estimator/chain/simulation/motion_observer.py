@@ -61,11 +61,20 @@ class ChainObserver:
     covariance: of `mean`.
     largest: largest planned torque of each joint (joints,) [N m].
     interval: sampling interval [s].
+    frictions: the same scale of torque is at least this multiple of dry friction, as far as it is known.
 
     Raises ValueError for arrays of other shapes.
     """
 
-    def __init__(self, base: BaseParameters, mean: Array, covariance: Array, largest: Array, interval: float) -> None:
+    def __init__(
+        self,
+        base: BaseParameters,
+        mean: Array,
+        covariance: Array,
+        largest: Array,
+        interval: float,
+        frictions: float = 0.0,
+    ) -> None:
         n = base.chain.joints
         count = base.count + 3 * n
         if mean.shape != (count,) or covariance.shape != (count, count) or largest.shape != (n,):
@@ -76,23 +85,26 @@ class ChainObserver:
         self._theta, self._covariance = np.array(mean), np.array(covariance)
         self._memory = np.zeros((TIMES_OF_ALL + 1, max(n, 2)))
         self._rests = standstill.memory(n, count)
-        self._first = np.array((FIRST_NOISE_SHARE * largest) ** 2)
+        dry = np.maximum(mean[base.count + n : base.count + 2 * n], 0.0)
+        first = np.maximum(largest, frictions * dry)
+        self._first = np.array((FIRST_NOISE_SHARE * first) ** 2)
         self._memory[NOISE, :n] = self._first
         drift = LEAST_DRIFT**2 * np.diag(covariance)
         # Motion in one direction only cannot separate dry friction from an offset, so what may hold a joint at rest is
         # never taken as less than the friction that was expected.
-        expected = np.maximum(mean[base.count + n : base.count + 2 * n], 0.0)
-        self._constants = FLOOR_SHARE * largest, (0.01 * largest) ** 2, drift, interval, expected
+        floors = FLOOR_SHARE * np.stack((largest, first)), FLOOR_SHARE * frictions
+        self._constants = *floors, (0.01 * first) ** 2, drift, interval, dry
         self._chain = base.chain.arrays, places(n, base.columns), base.count
         self._work = room(n), np.zeros((n, base.count + 1)), np.zeros(count), np.zeros(count), np.zeros((n, 10))
         self._joints = n
+        self._unsupported = np.zeros(n)
         nothing = np.zeros(n)
         self.observe(nothing, nothing, nothing, math.inf, False)  # these calls compile the loop; the last one resets it
         self.observe(nothing, nothing, nothing, interval, False)
         self.observe(nothing, nothing, nothing, math.inf, False)
 
     def observe(
-        self, position: Any, velocity: Any, torque: Any, seconds: float, is_free: Any, support: Any = 0.0
+        self, position: Any, velocity: Any, torque: Any, seconds: float, is_free: Any, support: Array | None = None
     ) -> int:
         """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1 if there is none.
 
@@ -102,13 +114,14 @@ class ChainObserver:
             torque: torques commanded since the previous sample [N m].
             seconds: time since the previous sample [s].
             is_free: whether the motion of each joint can be judged; one value for all or one per joint.
-            support: 1 or -1 for a joint that may lie on a stop, which prevents motion in this direction; otherwise 0.
+            support: 1 or -1 for each joint that may lie on a stop, which prevents motion in this direction, otherwise 0
+                (joints,); None if there is none.
         """
         return _observe(
             *(self._memory, self._rests, self._theta, self._covariance, self._constants, self._chain, self._work),
             *(np.asarray(each, dtype=np.float64) for each in (position, velocity, torque)),
             *(seconds, np.broadcast_to(is_free, (self._joints,)).astype(np.bool_)),
-            np.broadcast_to(support, (self._joints,)).astype(np.float64),
+            self._unsupported if support is None else support,
         )
 
     @property
@@ -137,7 +150,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
     is_free: Any,
     support: Any,
 ) -> int:
-    floor, least_noise, drift, interval, expected = constants
+    floors, of_friction, least_noise, drift, interval, expected = constants
     arrays, column, base = chain
     rooms, Y, row, gain, _ = work
     n, count = q.size, theta.size
@@ -204,7 +217,9 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
             left_open += row[i] * total
         memory[LACKING, j] = lacking
         friction = base + n + j
-        dry = max(theta[friction] + math.sqrt(max(covariance[friction, friction], 0.0)), expected[j])
+        learnt = theta[friction] + math.sqrt(max(covariance[friction, friction], 0.0))
+        dry = max(learnt, expected[j])
+        floor = max(floors[0, j], min(floors[1, j], of_friction * learnt))
         static = max(STATIC * dry, _withstood(rests[j]))
         stands = min(max(memory[STANDS, j], 0.0), 1.0)
         holds = static * stands
@@ -219,7 +234,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
         if lacking * support[j] > 0.0:
             beyond = 0.0
         limit = TIMES * math.sqrt(spread)
-        share = beyond / max(limit, quiet * floor[j])
+        share = beyond / max(limit, quiet * floor)
         if share <= 1.0:
             memory[HELD, j] = memory[SAMPLES, j] = 0.0
         else:
@@ -232,8 +247,10 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
             continue
         distance = _look_at_rest(rests[j], q[j], stands, memory[TORQUE, j], row, theta)
         if distance != 0.0:
-            variance = _variance(rests[j], distance, row, covariance) + 2.0 * quiet * quiet * memory[NOISE, j]
-            tolerance = max(TIMES * math.sqrt(variance), quiet * floor[j])
+            variance = 2.0 * quiet * quiet * memory[NOISE, j]
+            if abs(distance) > 2.0 * static:  # otherwise it does not matter, and would take time
+                variance += _variance(rests[j], distance, row, covariance)
+            tolerance = max(TIMES * math.sqrt(variance), quiet * floor)
             momentum = VISIBLE_RAD_S * abs(_own_inertia(rooms, column, theta, base, j))
             held = abs(lacking) - CERTAIN * math.sqrt(left_open)
             if _blocked(rests[j], distance, held, static, tolerance, momentum, FILTER_S, dt):

@@ -172,6 +172,11 @@ def _choice(result: SettledResult) -> list[str]:
     cost = choice.standard_errors_times
     if choice.chosen == choice.plainest:
         return [f"Model chosen from {among}: {choice.chosen}, which has the fewest parameters of them."]
+    if choice.error_divided_by <= 1.0 + _ALIKE:
+        return [
+            f"Model chosen from {among}: {choice.chosen}. It predicts about as well as {choice.plainest}, but what it "
+            "adds is significant in the fitted motion."
+        ]
     smaller = f"its prediction error is {_times(_inverse(choice.error_divided_by))}"
     wider = "" if cost is None else f" and its standard errors are {_times(cost)}"
     return [f"Model chosen from {among}: {choice.chosen}. Compared with {choice.plainest}, {smaller}{wider}."]

@@ -22,7 +22,8 @@ from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.bus.faults import FAULTS, Fault, FaultKind, parse_fault
 from hil.fakes.description import DescriptionError, FakeArm, load_fake, make_bus
-from hil.fakes.plants.plant import CheckedPlant, PlantError
+from hil.fakes.plants.errors import PlantError
+from hil.fakes.plants.plant import CheckedPlant
 from hil.fakes.protocol_fake import open_fake
 from hil.fakes.servo.registers import load_model
 from hil.fakes.servo.servo import BOOT_S, EmulatedServo

@@ -9,7 +9,8 @@ import pytest
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.bus.hand import Move, parse_move
 from hil.fakes.description import FakeArm, load_fake, make_bus
-from hil.fakes.plants.plant import CanBeHeld, PlantError
+from hil.fakes.plants.errors import PlantError
+from hil.fakes.plants.plant import CanBeHeld
 from tests.fakes.conftest import Bench
 from tests.support.paths import CONFIGS
 

@@ -7,7 +7,7 @@ import pytest
 
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.backlash import STEP, GearedArm
-from hil.fakes.plants.plant import PlantError
+from hil.fakes.plants.errors import PlantError
 from tests.fakes.plants.test_plants import arm
 
 DRIVE = {"mass": 0.018, "rotor_inertia": 1e-8, "gear_ratio": 288.35, "torque_constant": 0.37, "current_lag": 1e-3}

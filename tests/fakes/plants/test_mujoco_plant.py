@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from hil.fakes.plants.arm import Arm
+from hil.fakes.plants.errors import PlantError
 from hil.fakes.plants.pendulum import Pendulum
-from hil.fakes.plants.plant import CanJam, PlantError, load_plant
+from hil.fakes.plants.plant import CanJam, load_plant
 
 FACTORY = "hil.fakes.plants.mujoco_plant:make_plant"
 MODEL = """

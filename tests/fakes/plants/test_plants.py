@@ -16,8 +16,9 @@ from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.description import DescriptionError, FakeArm, load_fake, make_bus
 from hil.fakes.plants.arm import Arm, base_parameters
 from hil.fakes.plants.backlash import GearedArm
+from hil.fakes.plants.errors import PlantError
 from hil.fakes.plants.pendulum import Pendulum
-from hil.fakes.plants.plant import PlantError, load_plant, make_plant
+from hil.fakes.plants.plant import load_plant, make_plant
 from hil.fakes.plants.two_link import TwoLink
 from hil.fakes.protocol_fake import FakeSerial
 

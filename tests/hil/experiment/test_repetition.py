@@ -190,3 +190,18 @@ def test_a_period_begins_without_a_doubt_from_the_one_before(count: int, unlike:
     for index in range(count):  # 30 ms are three samples
         repetition.add(index, [0.06])
     assert repetition.unlike == unlike
+
+
+def test_the_tolerance_of_the_third_period_is_that_of_two_whole_periods() -> None:
+    """The first half of the second period was the same, the second half differed by less than the floor."""
+    samples = 100
+    first, second, third = np.zeros((3, 1, samples))
+    second[0, samples // 2 :] = 0.04
+    third[0, samples // 2 :] = 0.04 + 0.2
+    repetition = Repetition(samples, 1, INTERVAL)
+    played(repetition, first)
+    played(repetition, second)
+    repetition.begin(samples)
+    for index, sample in enumerate(third.T.tolist()):
+        repetition.add(index, sample)
+        assert repetition.unlike is None, "0.2 rad is less than 0.05 rad plus ten times an RMS of 0.028 rad"

@@ -1,0 +1,47 @@
+"""Which cycles read the slow registers, how long a second reply is awaited, and what counts as a stranger's."""
+
+import pytest
+
+from hil.drivers.exchange import Exchange
+from hil.drivers.packet import encode_status
+from hil.drivers.servo_model import Mode
+from hil.drivers.state import spans
+from tests.drivers.test_exchange import XM430, Wire, answer, exchange
+
+FINE = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+
+
+def test_plain_sync_reads_are_the_default() -> None:
+    assert not Exchange(Wire(), [1], XM430["Goal Current"], spans(Mode.CURRENT, [XM430]), 0.0).fast
+
+
+def test_between_two_samples_the_slow_registers_are_never_read() -> None:
+    wire = Wire([FINE] * 50)
+    cycles = exchange(wire)
+    for _ in range(9):
+        assert cycles.cycle([0, 0]).span == 0
+    assert [cycles.cycle([0, 0], between=True).span for _ in range(30)] == [0] * 30
+    assert cycles.cycle([0, 0]).span == 1, "which were due all the time"
+
+
+def test_a_reply_behind_one_that_came_too_soon_is_awaited_until_the_usual_timeout() -> None:
+    class Paced(Wire):
+        """The second reply arrives after a tenth of a millisecond."""
+
+        def read(self, count: int, timeout: float) -> bytes:
+            if self.time > 1.0 and timeout < 1e-4:
+                return b""
+            return super().read(count, timeout)
+
+    former, present = FINE, answer(1, 7, 8, 9) + answer(2, 7, 8, 9)
+    wire = Paced([former + present])
+    wire.time = 1.0
+    assert exchange(wire).cycle([0, 0]).servos[0] == (0, 7, 8, 9)
+
+
+@pytest.mark.parametrize(("data", "strangers"), [(b"", 0), (b"\1", 1), (b"\1\2", 1)])
+def test_a_reply_with_data_that_this_program_did_not_ask_for_is_a_strangers(data: bytes, strangers: int) -> None:
+    wire = Wire([encode_status(9, 0, data) + FINE[:20]])
+    cycles = exchange(wire)
+    cycles.cycle([0, 0])
+    assert cycles.strangers == strangers

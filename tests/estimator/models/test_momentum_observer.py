@@ -1,0 +1,49 @@
+"""The momentum observer on one joint that turns in a horizontal plane."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hil.estimator.models.momentum_observer import NAMES, MomentumObserver
+
+INTERVAL, SUBSTEPS = 0.005, 10
+PEAK, INERTIA, VISCOUS = 0.22, 0.004, 0.02
+
+
+def alarm_after(push: float, friction: float, frictions: float, begins: float = 6.0) -> float:
+    """Time [s] from the beginning of a constant push [N m] to the alarm; infinite if there is none in 2 s."""
+    mean = {"inertia_1": INERTIA, "viscous_1": VISCOUS, "coulomb_1": 0.08}
+    std = {"inertia_1": 0.3 * INERTIA, "viscous_1": 0.5 * VISCOUS, "coulomb_1": 0.06, "offset_1": 0.04}
+    covariance = np.diag([std.get(name, 0.0) ** 2 for name in NAMES])
+    observer = MomentumObserver(mean, covariance, np.array([PEAK]), INTERVAL, frictions)
+    q = v = 0.0
+    torque = 0.0
+    tick = 2 * math.pi / 4096
+    for index in range(round((begins + 2.0) / INTERVAL)):
+        time = index * INTERVAL
+        found = observer.observe((tick * round(q / tick),), (0.024 * round(v / 0.024),), (torque,), INTERVAL)
+        if found >= 0:
+            assert time >= begins, "nothing was wrong yet"
+            return time - begins
+        torque = PEAK * (0.6 * math.sin(5.0 * time) + 0.4 * math.sin(13.0 * time))
+        for _ in range(SUBSTEPS):
+            step = INTERVAL / SUBSTEPS
+            free = v + step / INERTIA * (torque + (push if time >= begins else 0.0) - VISCOUS * v)
+            v = math.copysign(max(abs(free) - step / INERTIA * friction, 0.0), free)
+            q += step * v
+    return math.inf
+
+
+def test_a_push_is_found_where_friction_turned_out_smaller_than_expected() -> None:
+    assert alarm_after(0.12, friction=0.02, frictions=8.0) < 0.15
+
+
+def test_what_friction_may_explain_is_no_push() -> None:
+    """The same push, with friction as large as expected: near standstill the model knows too little."""
+    assert alarm_after(0.12, friction=0.08, frictions=8.0) > alarm_after(0.12, friction=0.02, frictions=8.0)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.02, 0.08, 0.15])
+def test_a_healthy_joint_is_never_stopped(friction: float) -> None:
+    assert alarm_after(0.0, friction, frictions=8.0) == math.inf
