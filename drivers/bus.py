@@ -1,7 +1,7 @@
 """The servos of one arm on one port: preparation, the control cycle, and torque off afterwards."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from hil.drivers.control_table import load_control_table, model_names
@@ -335,6 +335,11 @@ class ServoBus:
         return ""
 
     @property
+    def is_watched(self) -> bool:
+        """Whether the watchdog of some servo is armed."""
+        return bool(self._armed)
+
+    @property
     def commanded_by_another(self) -> str:
         """Which servo held a value that this program did not write, read back a moment ago; "" for none.
 
@@ -372,9 +377,11 @@ class ServoBus:
         try:
             error = self._servos[drive].hardware_error()
             cause = describe_error(error)
-            cuts = not error or shuts_down(self._servos[drive], error)
         except DriverError as problem:
             return fault_text(drive, f"unknown; it could not be read ({problem})")
+        cuts = True
+        with suppress(DriverError):
+            cuts = not error or shuts_down(self._servos[drive], error)
         return fault_text(drive, cause, shuts_down=cuts) if alone or error else ""
 
     @contextmanager

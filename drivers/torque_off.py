@@ -31,7 +31,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _INTERRUPTS_BORNE = 5
 """Attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
-_TRIP_S = WATCHDOG_UNIT + 5e-3
+TRIP_S = WATCHDOG_UNIT + 5e-3
 """Delay with which a watchdog may act after its timeout, since it counts in steps [s]."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
@@ -140,7 +140,7 @@ def cut_torque(
         for _ in range(_REPEATS):
             wait(_REPEAT_S)
             _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
-        wait(watchdog + _TRIP_S)
+        wait(watchdog + TRIP_S)
         confirm(dict(left), attempts=None)
     return tuple(joint for joint in servos if joint not in left), tuple((joint, _text(why[joint])) for joint in left)
 

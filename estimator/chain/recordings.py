@@ -15,7 +15,7 @@ from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.fit.regression import filtered_torque, fit_filtered
 from hil.estimator.chain.fit.stage1 import ChainLinear
 from hil.estimator.chain.fit.stage2 import fit_periods
-from hil.estimator.chain.identify import BELIEVED, median_ratio
+from hil.estimator.chain.identify import BELIEVED, largest_ratio
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.fourier import PeriodicMotion
@@ -150,7 +150,7 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
         cutoff,
         _from_prior(model, spread, prior),
         fit.reached,
-        median_ratio(np.sqrt(np.diag(fit.covariance))[:count], spread),
+        largest_ratio(np.sqrt(np.diag(fit.covariance))[:count], spread),
     )
 
 

@@ -106,7 +106,7 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
 def _trust(validation: Validation, evidence: Evidence) -> Trust:
     left = float(validation.residual_over_floor.max())
     doubtful = any(_is_weak(validation, name) for name in validation.relative_std)
-    doubtful = doubtful or bool(evidence.doubts or evidence.disturbances)
+    doubtful = doubtful or bool(evidence.doubts or evidence.disturbances or evidence.torque)
     if evidence.held_out is None:
         if left > MUCH_LEFT:
             return "no"
@@ -230,10 +230,9 @@ def _pushed(torque: TorqueChange | None) -> tuple[str, ...]:
         if seen
     )
     return (
-        f"A constant torque of {found} acted in the held-out motion but not in the fitted one, which explains the "
-        "difference better than a change of friction: something pushed or pulled the arm, a cable tightened, it "
-        "carried something, or its base tilted. The values are those of the fitted motion; remove the cause and record "
-        "again to validate them.",
+        f"Relative to the fitted motion, a constant torque of {found} acts in the held-out one, which explains the "
+        "difference better than a change of friction: in one of them something pushed or pulled the arm, a cable "
+        "tightened, it carried something, or its base tilted. Remove the cause and record again.",
     )
 
 

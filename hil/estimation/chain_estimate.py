@@ -60,6 +60,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
             predicted = predict(model, estimate.parameters, other)
             played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
+    beyond = None if held_out is None else _beyond_noise(played[HELD_OUT], estimate)
     seconds = round(time.perf_counter() - started, 3)
     linear = len(model.linear_names)
     result = SettledResult(
@@ -87,7 +88,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
             config,
             estimate,
             known,
-            held_out,
+            beyond,
             unmoved(config, period.position),
             jump_disturbances(config, facts, samples),
         ),
@@ -169,6 +170,12 @@ def unmoved(config: Config, position: NDArray[np.float64]) -> list[str]:
     """Names of the joints that move too little to be identified. position: (joints, samples) [rad]."""
     reach = np.ptp(np.where(np.isnan(position), np.nanmean(position, axis=1, keepdims=True), position), axis=1)
     return [joint.name for joint, each in zip(config.joints, reach, strict=True) if each < UNMOVED]
+
+
+def _beyond_noise(played: PlayedPeriod, estimate: ChainEstimate) -> NDArray[np.float64]:
+    """Relative prediction error of each joint without the noise of its encoder, which no model predicts (joints,)."""
+    noise = estimate.noise_steps * estimate.position_step / np.nanstd(played.position, axis=1)
+    return np.asarray(np.sqrt(np.maximum(played.relative_error**2 - noise**2, 0.0)))
 
 
 def _verdict(
@@ -261,7 +268,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     if over > EXPLAINED:
         return f"{said} the model is incomplete.{tried} Possible causes: {causes}."
     return (
-        f"{said} but part of it repeats with the motion, which increases the standard errors by a factor of "
-        f"{estimate.systematic:.1f}, and some values may be wrong by more than these indicate. A small effect is "
+        f"{said} but part of it repeats with the motion, which increases standard errors by a factor of "
+        f"up to {estimate.systematic:.1f}, and some values may be wrong by more than these indicate. A small effect is "
         f"missing from the model: {causes}.{tried}"
     )

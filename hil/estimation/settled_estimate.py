@@ -34,7 +34,7 @@ from hil.estimator.selection.settled import choose
 from hil.estimator.selection.steadied import steadied
 from hil.estimator.selection.trial import Choice
 from hil.estimator.selection.validation import validate
-from hil.estimator.selection.verdict import Evidence, judge
+from hil.estimator.selection.verdict import GOOD_PREDICTION, Evidence, judge
 from hil.estimator.simulation.back_emf import neglected
 from hil.plan.plan import HELD_OUT, IDENTIFY
 from hil.plan.stabiliser import stabiliser_share
@@ -73,11 +73,13 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     drift = None if other is None or between is None else friction_change(other, estimate, between)
     jumps = jump_disturbances(config, facts, samples)
     torque = _torque_instead(other, estimate, drift)
-    if jumps or torque is not None:
+    if jumps:
         drift = None  # what changed was not friction
     if drift is not None:
         left = drift.after_correction() if is_corrected else drift
         estimate = replace(estimate, covariance=drifting(period, estimate, left))
+    if torque is not None:
+        drift = None  # friction may have changed too, so the standard errors keep its share
     if other is not None:
         played[HELD_OUT] = _predicted(estimate, other, drift, is_corrected)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
@@ -139,7 +141,10 @@ def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tup
 
 def _torque_instead(other: SettledPeriod | None, estimate: Estimate, drift: Drift | None) -> TorqueChange | None:
     """The constant torque in the held-out period that explains it better than a change of friction; None if none."""
-    if other is None or drift is None or not drift.is_seen:
+    if other is None or drift is None:
+        return None
+    # A torque that friction cannot explain makes the change of friction uncertain, so that none is seen.
+    if not drift.is_seen and relative_error(other.position, predict_period(estimate, other)).max() <= GOOD_PREDICTION:
         return None
     torque = torque_change(other, estimate)
     return torque if torque.explains_better_than(drift) else None

@@ -21,6 +21,7 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
+from hil.drivers.torque_off import TRIP_S
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
 from hil.estimator.chain.simulation.rollout import ChainArms
@@ -40,7 +41,8 @@ from hil.setup.servo_session import has_moved
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
 _BY_OTHER_GOALS = {
-    *(Cause.NOT_FOLLOWING, Cause.OUT_OF_VOLTAGE, Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY)
+    *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.UNEXPECTED),
+    *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
 """Causes of a stop that another program's goals may have."""
 
@@ -370,10 +372,13 @@ class Stream:
         if state is None or any(state.missing) or any(state.error) or lowering.lies(state):
             return
         since = 0.0 if self._sent_at is None else self._clock.now() - self._sent_at
-        if since >= self._safety.watchdog:
+        if self._bus.is_watched and since >= self._safety.watchdog + TRIP_S:
             self._told(error, "The arm could not be lowered: the servos' watchdogs had already acted, so it fell.")
             return
         self._note(f"lowering the arm after: {error}")
+        # The deadlines missed so far are not those of the way down.
+        self._ticks = FixedRate(self._clock, self._plan.rate)
+        self._deadline, self._sent_at = None, self._clock.now()
         try:
             state = self._way_down(lowering, state)
         except (SafetyStop, StopRequested, DriverError) as ended:

@@ -30,19 +30,25 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
     root = parse_urdf(found.path)
     links = {element.get("name"): element for element in root.findall("link")}
     joints = {element.get("name"): element for element in root.findall("joint")}
+    reduced: list[str] = []
     for index, (joint, body) in enumerate(zip(found.arm.joints, found.bodies, strict=True)):
         link = links[joint.link]
         own, share = without_movable(joint, body)
         _replace_inertial(link, own)
-        merged = [name for name in joint.fixed if name not in joint.movable]
+        apart = joint.movable if share > 0.0 else ()
+        merged = [name for name in joint.fixed if name not in apart]
         if merged:
             comment(link, f"including {', '.join(merged)}, fixed to it and without separate inertia")
             for name in merged:
                 _remove(links[name], "inertial")
-        if joint.movable:
-            comment(link, f"without {', '.join(joint.movable)}, which held joints move: described, not identified")
+        if apart:
+            comment(link, f"without {', '.join(apart)}, which held joints move: described, not identified")
         if share < 1.0:
-            for name in joint.movable:
+            reduced.append(
+                f"{100 * share:.2g} % of the inertia that the description gives {', '.join(joint.movable)}: with all "
+                f"of it, no possible body would be left for {joint.link}"
+            )
+            for name in apart:
                 _scale_inertial(links[name], share)
         dynamics = joints[joint.name].find("dynamics")
         if dynamics is None:
@@ -50,7 +56,7 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
         dynamics.set("damping", numbers(model.values[f"viscous_{index + 1}"]))
         dynamics.set("friction", numbers(model.values[f"coulomb_{index + 1}"]))
     rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
-    left = [*rotors, *found.left_out]
+    left = [*rotors, *reduced, *found.left_out]
     _describe(root, model, found, left)
     write_text(path, to_text(root))
     return left

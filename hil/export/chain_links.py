@@ -73,7 +73,7 @@ def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
     """Separate a link from what its held joints move, such as a gripper's fingers, so that these keep their inertia.
 
     Their described masses may leave no possible body for the link itself; all of them then keep the largest fraction,
-    halved as often as needed, that does. Returns the link's body and that fraction.
+    halved as often as needed, that does, or nothing at all. Returns the link's body and that fraction.
     """
     share = 1.0
     for _ in range(HALVINGS):
@@ -83,7 +83,7 @@ def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
         if left.mass > LEAST_LEFT * body.mass and left.is_physical:
             return left, share
         share *= 0.5
-    raise ExportError(f"link {joint.link!r}: no part of what its held joints move can be separated from it")
+    return body, 0.0
 
 
 def _same_groups(base: BaseParameters, groups: Mapping[str, str]) -> bool:

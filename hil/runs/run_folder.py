@@ -34,7 +34,7 @@ from hil.config.chain import described_arm
 from hil.config.experiment import ExperimentConfig
 from hil.config.schema import Config, StabiliserConfig, parse_config
 from hil.description.kept_file import kept_bytes
-from hil.errors import RunFolderError
+from hil.errors import ConfigError, RunFolderError
 from hil.next_step import command, only_steps, steps_of
 from hil.plan.plan import Plan
 from hil.results.json_form import FormError, from_json, to_json
@@ -173,11 +173,11 @@ class RunFolder:
         return self.path / "config.toml"
 
     def own_files(self) -> frozenset[str]:
-        """Names of the files that make up the run: those written by a run, and the descriptions of its arm.
-
-        Raises RunFolderError, ConfigError.
-        """
-        return _OF_A_START | {"result.json", "lateness.json"} | {urdf.name for urdf in _urdfs(self.load_config())}
+        """Names of the files that make up the run: what a run or an estimate writes, and its arm's descriptions."""
+        own = _OF_A_START | {"result.json", "lateness.json", "recordings.npz"}
+        with suppress(RunFolderError, ConfigError):
+            own |= {urdf.name for urdf in _urdfs(self.load_config())}
+        return own | {path.name for path in self.path.glob("*.shapes.json")}
 
     @property
     def run_path(self) -> Path:

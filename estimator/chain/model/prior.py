@@ -29,7 +29,9 @@ class Prior:
 
     def surpassing(self, names: tuple[str, ...], std: Array) -> tuple[str, ...]:
         """Return the base parameters whose standard errors (base parameters or more,) exceed the prior's."""
-        return tuple(name for name, each, own in zip(names, std[: self.std.size], self.std, strict=True) if each > own)
+        return tuple(
+            name for name, each, own in zip(names, std[: self.std.size], self.std, strict=True) if not each <= own
+        )
 
     @classmethod
     def of(

@@ -168,7 +168,7 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         if found.systematic > SYSTEMATIC:
             trust = "with care"
             sentences.append(
-                f"Part of the residual repeats with the motion, which increases the standard errors "
+                "Part of the residual repeats with the motion, which increases standard errors by up to "
                 f"{found.systematic:.1f} times, and some values may be wrong by more than these say. An effect is "
                 "missing from the model: torque ripple or cogging, play or elasticity of the gears, a cable, friction "
                 "that depends on load or changes with time, or torques that were not those of the commands."

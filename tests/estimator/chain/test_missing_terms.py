@@ -16,10 +16,11 @@ NOISE = np.array([0.34, 0.0, 0.13, 0.5])
 """White noise of the encoders, as magnetic encoders have it [encoder steps]."""
 
 
-def identified(noise: float | np.ndarray = 0.0, **effect: float) -> ChainEstimate:
-    """Estimate of the four-joint arm with noisy encoders, and with an effect on all of its drives."""
+def identified(noise: float | np.ndarray = 0.0, first: int = 0, **effect: float) -> ChainEstimate:
+    """Estimate of the four-joint arm with noisy encoders, and with an effect on its drives from `first` on."""
     setup = bench.set_up(BENCH, 1)
-    drives = tuple(drive.model_copy(update=effect) for drive in setup.arm.drives)
+    every = setup.arm.drives
+    drives = (*every[:first], *(drive.model_copy(update=effect) for drive in every[first:]))
     real = replace(setup, arm=setup.arm.model_copy(update={"drives": drives}))
     period = bench.record(BENCH, real, bench.path_of(BENCH, setup, 101), noise)
     return identify_chain(period, ChainModel(setup.base, lags=True), setup.prior)
@@ -55,5 +56,12 @@ def test_noisy_encoders_are_no_missing_effect() -> None:
 
 def test_ripple_is_seen_through_the_noise_of_encoders() -> None:
     found = identified(NOISE, ripple=0.003)
+    assert found.systematic > SYSTEMATIC
+    assert not found.explained
+
+
+def test_an_effect_in_one_joint_is_seen_through_the_noise_of_its_encoder() -> None:
+    found = identified(np.array([0.1, 0.1, 0.1, 1.7]), first=3, load=0.045)
+    assert found.over_noise.max() < 1.15
     assert found.systematic > SYSTEMATIC
     assert not found.explained

@@ -96,26 +96,37 @@ def test_a_joint_that_stays_held_ends_the_lowering(tmp_path: Path) -> None:
     assert (samples["phase"] == Phase.LOWERING).any()
 
 
-def test_an_arm_dropped_by_its_watchdogs_is_not_said_to_be_lowered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The program is stopped for a second, as by SIGSTOP."""
-    keep, stalled = Recorder.keep, []
+def stalled(monkeypatch: pytest.MonkeyPatch, folder: Path, seconds: float) -> tuple[BaseException, NDArray[np.void]]:
+    """Run the arm with a program that is stopped once, as by SIGSTOP."""
+    keep, stalls, ports = Recorder.keep, [seconds], []
 
     def stall(self: Recorder, deadline: float, *more: Any) -> None:
         keep(self, deadline, *more)
-        if self.count == AT_S * 400 and not stalled:
-            stalled.append(deadline)
-            ports[0].clock._now += 1.0
+        if self.count == AT_S * 400:
+            ports[0].clock._now += stalls.pop()
 
-    ports: list[Any] = []
     opened = FakeSerial.open
     monkeypatch.setattr(FakeSerial, "open", lambda self: (opened(self), ports.append(self))[0])
     monkeypatch.setattr(Recorder, "keep", stall)
-    error, samples = play(tmp_path, TEXT)
-    assert stalled and not (samples["phase"] == Phase.LOWERING).any()
+    return play(folder, TEXT)
+
+
+def test_an_arm_dropped_by_its_watchdogs_is_not_said_to_be_lowered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error, samples = stalled(monkeypatch, tmp_path, 1.0)
+    assert not (samples["phase"] == Phase.LOWERING).any()
     notes = " ".join(error.__notes__)
     assert "watchdogs had already acted, so it fell" in notes and "deadlines in a row" not in notes
+
+
+def test_an_arm_is_lowered_after_a_stall_that_its_watchdogs_bore(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error, samples = stalled(monkeypatch, tmp_path, 0.06)
+    assert "deadlines in a row" in str(error)
+    assert any("lowered to its rest pose" in note for note in error.__notes__)
+    np.testing.assert_allclose(samples["position"][-1], rest_of(TEXT), atol=0.05)
 
 
 def test_a_lost_torque_is_cut_at_once(tmp_path: Path) -> None:
