@@ -79,7 +79,7 @@ def test_an_alert_is_seen_in_the_exchange(arm: tuple[ServoBus, FakeSerial]) -> N
 
 def test_a_pulled_servo_is_missing_and_its_torque_is_not_confirmed(arm: tuple[ServoBus, FakeSerial]) -> None:
     bus, port = arm
-    with pytest.raises(TorqueNotOff, match="elbow"), bus.torque(watchdog=0.1):
+    with pytest.raises(TorqueNotOff, match="ELBOW"), bus.torque(watchdog=0.1):
         port.bus.servos[2].connected = False
         assert bus.exchange((0.1, 0.1)).missing == (False, True)
     port.clock.wait_until(port.clock.now() + 0.1)

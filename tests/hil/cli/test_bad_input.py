@@ -161,7 +161,7 @@ CASES: list[tuple[str, int, str]] = [
     ("check swapped.toml", 2, "the first value must be the smaller one"),
     ("check negative.toml", 2, "must be greater than 0"),
     ("check id.toml", 2, "must be a whole number"),
-    ("check utf16.toml", 2, "not UTF-8"),
+    ("check utf16.toml", 2, "UTF-16 text"),
     ("identify millimetres.toml", 2, "If it is in mm"),
     ("estimate page.csv", 2, "page.csv"),
     ("estimate zip.csv", 2, "a binary one"),
