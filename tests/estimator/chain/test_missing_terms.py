@@ -1,11 +1,13 @@
 """Effects that no term of the model describes, and that are too small to show in the size of the residual."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
 from benchmarks import chain as bench
+from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.estimator.chain.identify import EXPLAINED_RESIDUAL, SYSTEMATIC, ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 
@@ -16,13 +18,20 @@ NOISE = np.array([0.34, 0.0, 0.13, 0.5])
 """White noise of the encoders, as magnetic encoders have it [encoder steps]."""
 
 
+@cache
+def ready() -> tuple[bench.Setup, Motion]:
+    """The four-joint arm and its path, whose design takes longer than the fit."""
+    setup = bench.set_up(BENCH, 1)
+    return setup, bench.path_of(BENCH, setup, 101)
+
+
 def identified(noise: float | np.ndarray = 0.0, first: int = 0, **effect: float) -> ChainEstimate:
     """Estimate of the four-joint arm with noisy encoders, and with an effect on its drives from `first` on."""
-    setup = bench.set_up(BENCH, 1)
+    setup, path = ready()
     every = setup.arm.drives
     drives = (*every[:first], *(drive.model_copy(update=effect) for drive in every[first:]))
     real = replace(setup, arm=setup.arm.model_copy(update={"drives": drives}))
-    period = bench.record(BENCH, real, bench.path_of(BENCH, setup, 101), noise)
+    period = bench.record(BENCH, real, path, noise)
     return identify_chain(period, ChainModel(setup.base, lags=True), setup.prior)
 
 
