@@ -4,7 +4,7 @@ A servo's answer is a plain tuple: the ERR byte followed by the register values 
 refused; None if it did not reply. ERR holds a StatusError in its low bits and Alert in bit 7.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from struct import Struct
 from typing import Protocol
@@ -219,12 +219,10 @@ class FastSyncRead:
         return [fields[at : at + width] for at in range(0, len(fields), width)]
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
-        at = received.find(self._front)
-        packet = received[at:] if at >= 0 else b""
+        packet = self._packet(received)
         answers: list[Answer] = []
-        for servo_id, start, end in self._parts:
-            whole = len(packet) >= end and packet[start + 1] == servo_id
-            if not whole or _crc(packet[: end - 2]) != int.from_bytes(packet[end - 2 : end], "little"):
+        for servo_id, start in self._intact(packet):
+            if packet[start + 1] != servo_id:
                 break
             answer = self._values[servo_id].unpack_from(packet, start)
             answers.append(answer[:1] if answer[0] & _ERROR_BITS else answer)
@@ -233,14 +231,20 @@ class FastSyncRead:
         return answers, len(packet) >= self.reply_size
 
     def senders(self, received: bytes) -> list[int]:
+        packet = self._packet(received)
+        return [packet[start + 1] for _, start in self._intact(packet)]
+
+    def _packet(self, received: bytes) -> bytes:
+        """The received bytes from the beginning of the status packet on."""
         at = received.find(self._front)
-        packet = received[at:] if at >= 0 else b""
-        found = []
-        for _, start, end in self._parts:
+        return received[at:] if at >= 0 else b""
+
+    def _intact(self, packet: bytes) -> Iterator[tuple[int, int]]:
+        """The parts before the first missing or damaged one: the ID that was asked, and where its part starts."""
+        for servo_id, start, end in self._parts:
             if len(packet) < end or _crc(packet[: end - 2]) != int.from_bytes(packet[end - 2 : end], "little"):
-                break
-            found.append(packet[start + 1])
-        return found
+                return
+            yield servo_id, start
 
 
 def _request(instruction: Instruction, ids: Sequence[int], span: Span) -> bytes:

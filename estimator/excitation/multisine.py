@@ -17,6 +17,7 @@ from scipy.fft import next_fast_len
 
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ExcitationError
+from hil.estimator.excitation.harmonics import harmonics_within
 from hil.estimator.excitation.lbfgs import descend
 
 Harmonics = npt.NDArray[np.int64]
@@ -74,14 +75,13 @@ def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tup
 
     Raises ExcitationError if the band has fewer lines than joints.
     """
-    first = max(1, math.ceil(band[0] * period - 1e-9))
-    last = math.floor(band[1] * period + 1e-9)
-    if last - first + 1 < joints:
+    lines = harmonics_within(period, *band)
+    if len(lines) < joints:
         raise ExcitationError(
-            f"the band {band[0]:g} to {band[1]:g} Hz contains {counted(max(0, last - first + 1), 'harmonic')} of a "
+            f"the band {band[0]:g} to {band[1]:g} Hz contains {counted(len(lines), 'harmonic')} of a "
             f"period of {period:g} s, but {joints} joints need one each: widen the band or lengthen the period"
         )
-    return tuple(tuple(range(first + joint, last + 1, joints)) for joint in range(joints))
+    return tuple(tuple(lines[joint::joints]) for joint in range(joints))
 
 
 def detecting_lines(period: float, band: tuple[float, float], joints: int, seed: int) -> tuple[tuple[int, ...], ...]:

@@ -38,6 +38,12 @@ _TRAPEZOID = 0x30
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 
 
+def obeyed_current(memory: Memory) -> int:
+    """Goal Current as the drive obeys it [ticks]: a goal from before Current Limit was lowered is limited too."""
+    goal, limit = memory.get("Goal Current"), memory.get("Current Limit")
+    return max(-limit, min(limit, goal))
+
+
 @dataclass(frozen=True, slots=True)
 class Goals:
     """The registers that the controller uses, in their own units."""
@@ -67,7 +73,7 @@ class Goals:
             mode=mode,
             pwm=value("Goal PWM"),
             pwm_limit=value("PWM Limit"),
-            current=max(-value("Current Limit"), min(value("Current Limit"), value("Goal Current"))),
+            current=obeyed_current(memory),
             velocity=value("Goal Velocity"),
             position=value("Goal Position"),
             profile_velocity=value("Profile Velocity"),

@@ -29,7 +29,7 @@ from random import Random
 
 from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError
 from hil.fakes.servo.backup import Backup, factory_reset
-from hil.fakes.servo.controller import CURRENT_MODE, POSITION_MODE, POSITION_MODES, Controller, Goals
+from hil.fakes.servo.controller import CURRENT_MODE, POSITION_MODE, POSITION_MODES, Controller, Goals, obeyed_current
 from hil.fakes.servo.encoder import PERFECT, Encoder, Reading
 from hil.fakes.servo.health import Health, Overload, Thermal
 from hil.fakes.servo.memory import Memory
@@ -227,9 +227,7 @@ class EmulatedServo(Powered):
 
     @property
     def goal_current_ticks(self) -> int:
-        """Goal Current as the drive obeys it: a goal from before Current Limit was lowered is limited too."""
-        goal, limit = self.memory.get("Goal Current"), self.memory.get("Current Limit")
-        return max(-limit, min(limit, goal))
+        return obeyed_current(self.memory)
 
     @property
     def watchdog_tripped(self) -> bool:

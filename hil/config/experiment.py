@@ -13,11 +13,6 @@ DRIFT = 5.0
 """Ratio of the accepted slow drift between periods to experiment.settle_within."""
 
 
-def lines_within(period: float, low: float, high: float) -> int:
-    """Number of multiples of 1 / `period` [s] from `low` to `high` [Hz]."""
-    return max(0, math.floor(high * period + 1e-9) - max(1, math.ceil(low * period - 1e-9)) + 1)
-
-
 class ExperimentConfig(Table):
     """`[experiment]`: the excitation and how it is streamed."""
 

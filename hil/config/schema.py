@@ -25,7 +25,7 @@ from hil import fakes
 from hil.config.bundled import bundled_configs, find_config, meant
 from hil.config.chain import MOST_JOINTS, chain_slips, describes_planar
 from hil.config.clearance import ClearanceConfig
-from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig, lines_within
+from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
 from hil.config.fake_url import FAKE_URL, url_from
 from hil.config.joint import JointConfig
 from hil.config.known_quantities import KnownConfig
@@ -34,6 +34,7 @@ from hil.config.table import Table, Turned
 from hil.drivers.bus import BusConfig
 from hil.drivers.servo_model import SERVO_MODELS, WATCHDOG_UNIT, Mode
 from hil.errors import ConfigError
+from hil.estimator.excitation.harmonics import harmonics_within
 from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import arm_names, find_arm
 from hil.next_step import command
@@ -251,7 +252,7 @@ class Config(Table):
         if experiment.band is None or self.is_chain:
             return
         low, high = experiment.band
-        lines = lines_within(experiment.period, low, high)
+        lines = len(harmonics_within(experiment.period, low, high))
         if lines < count:
             found = "no multiple" if lines == 0 else "only 1 multiple" if lines == 1 else f"only {lines} multiples"
             raise ValueError(

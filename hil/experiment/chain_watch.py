@@ -53,9 +53,9 @@ class ChainWatch:
         self._constants = np.array([joint.torque_per_goal for joint in config.joints])
         mean, covariance = observed_parameters(arms)
         n = len(self._constants)
-        # A light joint's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         largest = self._constants * np.array(planned)
         interval = 1.0 / config.experiment.rate if interval is None else interval
+        # A light joint's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         self._observer = ChainObserver(arms.base, mean, covariance, largest, interval, _FRICTIONS)
         self._names = [joint.joint.title for joint in config.joints]
         self._rest = np.array(config.arm.rest_pose)

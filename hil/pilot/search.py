@@ -10,13 +10,13 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config.experiment import lines_within
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude, largest_amplitude, most_torque, with_peaks
 from hil.dry_run.prediction import GUARDED, predict
 from hil.dry_run.supply_speed import lowered, slower
 from hil.dry_run.waves import designed_plan, roomy_plan, roomy_plans
 from hil.errors import ExperimentError, NoSafeTorque
+from hil.estimator.excitation.harmonics import harmonics_within
 from hil.estimator.models.parameters import Physics
 from hil.pilot.belief import MOVED_STEPS, Belief, earlier_belief, prior_belief
 from hil.pilot.breakaway import broke_free, narrowed, raised
@@ -375,7 +375,7 @@ def pilot_config(config: Config, options: PilotOptions = DEFAULTS) -> Config:
         period = samples / experiment.rate
         low, high = experiment.band
         each = _LINES_FOR_DETECTION if experiment.detection else 1
-        if lines_within(period, low, high) >= each * len(config.joints):
+        if len(harmonics_within(period, low, high)) >= each * len(config.joints):
             update |= {"period": period, "band": [max(low, 1 / period), high]}
     return config.model_copy(update={"experiment": experiment.model_copy(update=update)})
 
