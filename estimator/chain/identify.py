@@ -5,10 +5,12 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.fit.coordinates import ANGLES, kind_of
+from hil.estimator.chain.fit.held_zeros import HeldZeros
 from hil.estimator.chain.fit.stage1 import ChainLinear, fit_lines
 from hil.estimator.chain.fit.stage2 import DEFAULTS, ChainFit, ChainOptions, fit_periods
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -27,6 +29,11 @@ model error rather than noise.
 It is 0.6 to 0.9 for encoder rounding and noise. Torque ripple of 0.2 %, or load-dependent friction of 0.3 % of the
 torque, raises it to 2 or 3, while the residual still exceeds the noise by less than a tenth; friction of one joint that
 depends on its load, behind a noisy encoder, to 1.5 or more.
+"""
+
+SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005
+"""Significance level of encoder zeros that are held, and the smallest angle that is mentioned [rad]: three encoder
+steps, less than a zero is usually adjusted to.
 """
 
 BELIEVED = 0.5  # standard errors under white noise above this fraction of the prior's: values come from the prior
@@ -61,6 +68,10 @@ class ChainEstimate(FittedParameters):
     """Base parameters that the data hardly determine, so that their values come from the prior."""
     unseen: tuple[str, ...]
     """Zero errors and tilts that the data hardly determine, so that they are taken as zero."""
+    doubtful_zeros: tuple[tuple[int, float], ...]
+    """Joints, from 1, whose encoder zeros the model holds although the recording shows them to be off, and by how much
+    (true minus measured angle) [rad].
+    """
     noise_steps: Array
     """Noise of one sample of each angle, encoder rounding included (joints,) [encoder steps]; rounding alone is 0.2887.
     """
@@ -100,6 +111,7 @@ def identify_chain(
     count = model.base.count
     # The weight of the prior in the result; model errors or an unfinished fit widen the standard errors, not this.
     std = np.sqrt(np.diag(fit.white_covariance))
+    systematic = largest_ratio(np.sqrt(np.diag(fit.covariance))[:count], std[:count])
     wide = std[:count] > BELIEVED * prior.std
     return ChainEstimate(
         names=model.names,
@@ -117,7 +129,7 @@ def identify_chain(
         outliers=fit.outliers + spikes,
         white_std=np.sqrt(np.diag(fit.white_covariance)),
         correlation_time=fit.correlation_time,
-        systematic=largest_ratio(np.sqrt(np.diag(fit.covariance))[:count], std[:count]),
+        systematic=systematic,
         softness=fit.softness,
         reached=fit.reached,
         from_prior=tuple(name for name, open_ in zip(model.base.names, wide, strict=True) if open_),
@@ -126,8 +138,20 @@ def identify_chain(
             for name, each in zip(model.names, std, strict=True)
             if each > BELIEVED * ANGLES.get(kind_of(name), np.inf)
         ),
+        doubtful_zeros=doubtful_zeros(fit.held_zeros, systematic),
         noise_steps=used[0].noise / used[0].position_step,
     )
+
+
+def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int, float], ...]:
+    """Return the joints, from 1, whose held zeros are off by more than LARGE_ZERO, if that is significant.
+
+    A model error that widens the standard errors by the factor `systematic` can mimic zeros, so it raises the
+    threshold.
+    """
+    if held is None or held.gain <= max(systematic, 1.0) ** 2 * float(chi2.isf(SIGNIFICANCE, held.shift.size)):
+        return ()
+    return tuple((joint, float(each)) for joint, each in enumerate(held.shift, start=2) if abs(each) > LARGE_ZERO)
 
 
 def largest_ratio(one: Array, other: Array) -> float:

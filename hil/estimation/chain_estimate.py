@@ -201,6 +201,10 @@ def _verdict(
         joint = config.joints[int(np.argmax(held_out))].name
         sentences.append(f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst.")
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
+    if estimate.doubtful_zeros:
+        trust = "with care" if trust == "yes" else trust
+    if said := about_zeros(config, estimate):
+        sentences.append(said)
     if disturbances:
         trust = "with care" if trust == "yes" else trust
         sentences += disturbances
@@ -231,6 +235,23 @@ def _verdict(
             f"assumed to be zero within their standard errors."
         )
     return Verdict(trust, weakest, tuple(sentences))
+
+
+def about_zeros(config: Config, estimate: ChainEstimate) -> str:
+    """Say that encoder zeros were not fitted, and which ones the recording contradicts; empty if they were."""
+    if estimate.model.zeros or estimate.model.joints == 1:
+        return ""
+    held = "The encoder zeros were taken from the configuration and not identified"
+    if not estimate.doubtful_zeros:
+        return (
+            f"{held}: an error of a zero that this motion does not reveal makes the values of links wrong, although "
+            "their torques are right. `hil pose` shows the angles for a check by hand."
+        )
+    off = ", ".join(f"{config.joints[joint - 1].name} by about {by:.2g} rad" for joint, by in estimate.doubtful_zeros)
+    return (
+        f"{held}, but the recording contradicts them: {off} (true minus measured angle). The values of these links are "
+        "wrong: correct zero_ticks, or identify the zeros with [model] zeros = true."
+    )
 
 
 def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_prior: tuple[str, ...]) -> str:

@@ -3,16 +3,25 @@
 The observer starts stiff, so that the simulation can follow the motion with stage 1's parameters, and is softened as
 the fit improves. Most iterations use coarse integration steps; the last ones use fine steps. The noise level of each
 joint is itself estimated before the final iterations, in which outliers are downweighted (Huber).
+
+Where joints often stick, stage 1 can be far off in friction, and hence in the links and torque scales that share a
+joint's torque with it. While the shape of friction is held, softening the observer then leads the fit into another
+minimum, a curved valley in which it stops short. So if the motion is not explained when the observer is soft, a second
+start is made from the prior's links, with the shape of friction free as soon as the stiffest observer follows, and the
+better one is continued.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.coordinates import ChainCoordinates, kind_of
+from hil.estimator.chain.fit.held_zeros import HeldZeros, held_zeros
 from hil.estimator.chain.fit.objective import ChainProblem
+from hil.estimator.chain.fit.remaining import remaining
 from hil.estimator.chain.fit.resolved_widths import resolved_widths
 from hil.estimator.chain.fit.stage1 import ChainLinear
 from hil.estimator.chain.fit.uncertainty import coloured_covariance, neglected_covariance
@@ -20,7 +29,6 @@ from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
-from hil.estimator.fit.bounded_step import bounded_step
 from hil.estimator.fit.covariance import (
     by_parameters,
     correlation_time,
@@ -65,6 +73,8 @@ class ChainOptions:
     """Initial width of the smoothed Coulomb step [rad/s]."""
     other_initial_widths: tuple[float, ...] = (0.005, 0.001)
     """Initial widths of further fits, tried as long as no fit explains the motion [rad/s]."""
+    poor: float = 1.2
+    """Root of the mean weighted squared residual above which a second start is made: 1 is noise alone."""
     min_initial_lag: float = 5e-4
     """Minimum initial guess of the lag [s]."""
     reach: float = 0.3
@@ -127,6 +137,8 @@ class ChainFit:
     """Decrease of the sum of squares that is expected from one more step, the one that would reach the minimum."""
     neglected: Array
     """Covariance due to what the model of voltage-driven joints neglects (parameters, parameters) [SI]."""
+    held_zeros: HeldZeros | None = None
+    """What the recording says about encoder zeros that the model holds; None if it fits them or has one joint."""
 
     @property
     def total_covariance(self) -> Array:
@@ -161,17 +173,12 @@ def fit_periods(
     # curved valley, along which the later fits progress slowly.
     coarse = replace(problem, steps=_steps(periods, options.coarse_step), reach=0.0)
     if near is None:
-        x = _towards_prior(coarse, x, options)
-        soft, softness, spent = _softened(coarse, x, options)
+        sticking, rough, spent = _started(coarse, x, options)
     else:
-        soft, softness, spent = _narrowed(problem, near, options), near.softness, near.iterations
-    resolved = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
-    # An early fit may be far off: where it makes a joint much too light, the step must not stay wide for good.
-    floor = np.clip(resolved, options.width_floor, options.initial_width)
-    bounded = replace(problem.coordinates, width_floor=floor)
-    soft = bounded.raised(soft)
-    sticking = replace(coarse, coordinates=bounded, softness=softness, finer=options.finer, reach=1.0)
-    rough = _tempered(sticking, soft).minimise(soft, options.ftol_near)
+        soft = _narrowed(problem, near, options)
+        sticking, rough, spent = _resolved(replace(coarse, softness=near.softness), soft, options)
+        spent += near.iterations
+    bounded = sticking.coordinates
     positions = sticking.positions(rough.x)
     assert positions is not None  # the minimum's motion is finite
     weights, outliers = noise_weights(periods, positions, options.outlier_threshold)
@@ -187,8 +194,8 @@ def fit_periods(
     if not damped.stalled:
         minimum = last.minimise(damped.x, options.ftol, MINIMISER.min_damping, LAST, damped.at)
         spent += minimum.iterations
-    spent += rough.iterations + nearer.iterations + damped.iterations
-    if _remaining(minimum, bounded)[1] > options.unfinished:
+    spent += nearer.iterations + damped.iterations
+    if remaining(minimum, bounded)[1] > options.unfinished:
         finer = replace(last, steps=2 * last.steps)
         try:
             minimum, last = finer.minimise(minimum.x, options.ftol, MINIMISER.min_damping, LAST), finer
@@ -199,20 +206,56 @@ def fit_periods(
     return _fit(last, minimum, outliers, COVARIANCE, spent)
 
 
-def _remaining(minimum: Minimum, coordinates: ChainCoordinates) -> tuple[Array, float]:
-    """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations predict.
+def _started(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
+    """Return the problem with resolved friction, its rough minimum, and the number of simulations.
 
-    Where the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
-    A width at its floor stays there.
+    x: stage 1's result. Raises ConvergenceError if the stiffest observer does not follow the motion.
     """
-    at, least = minimum.at, np.full(minimum.x.size, -np.inf)
-    least[: len(coordinates.names)] = coordinates.room_below(minimum.x)
-    scale = np.sqrt(np.diag(at.normal))
-    scale = np.maximum(scale, 1e-12 * scale.max())
-    matrix = at.normal / np.outer(scale, scale)
-    matrix[np.diag_indices_from(matrix)] += MINIMISER.min_damping
-    step = bounded_step(matrix, at.gradient / scale, least * scale, np.full(least.size, np.inf)) / scale
-    return step, -float(step @ (2.0 * at.gradient + at.normal @ step))
+    soft, softness, spent = _softened(coarse, _towards_prior(coarse, x, options), options)
+    problem, found, more = _resolved(replace(coarse, softness=softness), soft, options)
+    spent += more
+    level = _level(problem, found.x)
+    if level <= options.poor:
+        return problem, found, spent
+    with suppress(ConvergenceError):
+        other, again, more = _softened_later(coarse, x, options)
+        spent += more
+        # A softer observer leaves larger residuals of the same errors, by about the ratio of the frequencies.
+        if _level(other, again.x) * other.softness < level * softness:
+            return other, again, spent
+    return problem, found, spent
+
+
+def _softened_later(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
+    """Start from the prior's links, and free the shape of friction before the observer is softened; see `_started`."""
+    start = _towards_prior(coarse, x, replace(options, towards_prior=(0.0,)))
+    stiff, softness, spent = _softened(coarse, start, replace(options, softness=options.softness[:1]))
+    problem, found, more = _resolved(replace(coarse, softness=softness), stiff, options)
+    spent += more
+    every_sample = replace(options, first_step=0.0, ftol_coarse=options.ftol_near, softness=options.softness[1:])
+    soft, softness, more = _softened(problem, found.x, every_sample)
+    problem = replace(problem, softness=softness)
+    found = _tempered(problem, soft).minimise(soft, options.ftol_near)
+    return problem, found, spent + more + found.iterations
+
+
+def _resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
+    """Return the problem with the shape of friction free and motion near standstill resolved, its minimum from `soft`,
+    and the number of simulations.
+    """
+    resolved = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
+    # An early fit may be far off: where it makes a joint much too light, the step must not stay wide for good.
+    floor = np.clip(resolved, options.width_floor, options.initial_width)
+    bounded = replace(coarse.coordinates, width_floor=floor)
+    soft = bounded.raised(soft)
+    sticking = replace(coarse, coordinates=bounded, finer=options.finer, reach=1.0)
+    found = _tempered(sticking, soft).minimise(soft, options.ftol_near)
+    return sticking, found, found.iterations
+
+
+def _level(problem: ChainProblem, x: Array) -> float:
+    """Return the root of the mean weighted squared residual at `x`: 1 is noise alone."""
+    return float(np.sqrt(replace(problem, prior_weight=0.0).cost(x) / _counted(problem)))
 
 
 def _narrowed(problem: ChainProblem, near: ChainFit, options: ChainOptions) -> Array:
@@ -257,12 +300,17 @@ def _tempered(problem: ChainProblem, x: Array) -> ChainProblem:
 
     Repeated readings count as one, as they do in the sum of squares.
     """
+    excess = replace(problem, prior_weight=0.0).cost(x) / _counted(problem)
+    return replace(problem, prior_weight=max(1.0, excess))
+
+
+def _counted(problem: ChainProblem) -> float:
+    """Return the number of samples that are compared, repeated readings counted as in the sum of squares."""
     counted = (
         np.square(weight * period.noise)[:: problem.every]
         for weight, period in zip(problem.weights, problem.periods, strict=True)
     )
-    samples = max(1.0, sum(float(np.sum(each)) for each in counted))
-    return replace(problem, prior_weight=max(1.0, replace(problem, prior_weight=0.0).cost(x) / samples))
+    return max(1.0, sum(float(np.sum(each)) for each in counted))
 
 
 def _problem(
@@ -348,7 +396,7 @@ def _fit(
     if structured > 0.0:  # a model error repeats itself, and its size may vary over time
         robust = robust_covariance(minimum.at, problem.scatter(x, window), samples, count, structured)
         covariance = _larger(covariance, robust)
-    step, decrease = _remaining(minimum, problem.coordinates)
+    step, decrease = remaining(minimum, problem.coordinates)
     value = problem.coordinates.values(x[:count])
     return ChainFit(
         value,
@@ -363,6 +411,7 @@ def _fit(
         problem.softness,
         decrease,
         neglected_covariance(problem, x),
+        None if problem.model.zeros or problem.model.joints == 1 else held_zeros(problem, x, decrease),
     )
 
 

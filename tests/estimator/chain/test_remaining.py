@@ -9,7 +9,8 @@ from benchmarks import chain as bench
 from hil.estimator.chain import identify
 from hil.estimator.chain.fit import stage2
 from hil.estimator.chain.fit.coordinates import ChainCoordinates
-from hil.estimator.chain.fit.stage2 import ChainOptions, _remaining
+from hil.estimator.chain.fit.remaining import remaining
+from hil.estimator.chain.fit.stage2 import ChainOptions
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.data.settled_period import SettledPeriod
@@ -27,14 +28,14 @@ def stopped_at(step: np.ndarray, normal: np.ndarray) -> Minimum:
 def test_the_step_to_the_minimum_and_its_decrease_are_those_of_the_normal_equations(scale: float) -> None:
     slopes = np.random.default_rng(1).standard_normal((20, 4)) * np.array([1.0, scale, 1.0, 10.0])
     normal, missing = slopes.T @ slopes, np.array([0.3, -1.0 / scale, 0.0, 2.0])
-    step, decrease = _remaining(stopped_at(missing, normal), FREE)
+    step, decrease = remaining(stopped_at(missing, normal), FREE)
     np.testing.assert_allclose(step, missing, rtol=1e-7, atol=1e-8)
     assert decrease == pytest.approx(missing @ normal @ missing)
 
 
 def test_nothing_remains_at_a_minimum_nor_in_a_direction_without_information() -> None:
     normal = np.diag([4.0, 0.0])
-    step, decrease = _remaining(stopped_at(np.array([0.0, 5.0]), normal), FREE)
+    step, decrease = remaining(stopped_at(np.array([0.0, 5.0]), normal), FREE)
     assert decrease == 0.0 and step[0] == 0.0
 
 
@@ -44,11 +45,11 @@ def test_a_width_at_its_floor_does_not_count() -> None:
     x = np.log(np.array([0.1, 0.01]))
     normal, missing = np.diag([100.0, 100.0]), np.array([0.02, -3.0])
     minimum = Minimum(x, Quadratic(1.0, normal, -normal @ missing), 1)
-    step, decrease = _remaining(minimum, at_floor)
+    step, decrease = remaining(minimum, at_floor)
     np.testing.assert_allclose(step, [0.02, 0.0], atol=1e-8)
     assert decrease == pytest.approx(100.0 * 0.02**2)
     above = replace(minimum, x=x + np.array([0.0, 1.0]))
-    np.testing.assert_allclose(_remaining(above, at_floor)[0], [0.02, -1.0], atol=1e-6)
+    np.testing.assert_allclose(remaining(above, at_floor)[0], [0.02, -1.0], atol=1e-6)
 
 
 @pytest.fixture(scope="module")

@@ -305,7 +305,7 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
     explained = 0.29 * np.ones(4)
     estimate: Any = SimpleNamespace(
         **{"std": 0.01 * known.prior.std, "over_noise": np.ones(4), "noise_steps": explained, "systematic": 0.8},
-        **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base)},
+        **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base), "doubtful_zeros": ()},
     )
     verdicts = []
     for estimate.reached in (True, False):
@@ -315,7 +315,12 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
     estimate.reached = True
     jumped = _verdict(config, estimate, known, np.full(4, 1e-3), [], ("The position of joint3 jumped.",))
     assert jumped.trust == "with care" and "The position of joint3 jumped." in jumped.sentences
-    estimate.systematic = 3.0
+    assert any("zeros were taken from the configuration and not identified:" in each for each in jumped.sentences)
+    estimate.doubtful_zeros = ((3, 0.021),)
+    shifted = _verdict(config, estimate, known, np.full(4, 1e-3), [])
+    assert shifted.trust == "with care"
+    assert any("contradicts them: joint3 by about 0.021 rad" in each for each in shifted.sentences)
+    estimate.doubtful_zeros, estimate.systematic = (), 3.0
     hidden = _verdict(config, estimate, known, np.full(4, 1e-3), [])
     assert hidden.trust == "with care"
     assert "part of it repeats with the motion" in hidden.sentences[0]
@@ -329,7 +334,7 @@ def test_a_value_less_certain_than_the_description_is_trusted_with_care(run: Run
     std[2] = 1.1 * known.prior.std[2]
     estimate: Any = SimpleNamespace(
         **{"std": std, "over_noise": np.ones(4), "noise_steps": 0.29 * np.ones(4), "systematic": 0.8},
-        **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base)},
+        **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base), "doubtful_zeros": ()},
     )
     verdict = _verdict(config, estimate, known, np.full(4, 1e-3), [])
     assert verdict.trust == "with care"

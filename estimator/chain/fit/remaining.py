@@ -1,0 +1,27 @@
+"""Distance from where a fit has stopped to its minimum."""
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.chain.fit.coordinates import ChainCoordinates
+from hil.estimator.fit.bounded_step import bounded_step
+from hil.estimator.fit.levenberg_marquardt import Minimum
+from hil.estimator.options import MinimiserOptions
+
+MINIMISER = MinimiserOptions()
+
+
+def remaining(minimum: Minimum, coordinates: ChainCoordinates) -> tuple[Array, float]:
+    """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations predict.
+
+    Where the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
+    A width at its floor stays there.
+    """
+    at, least = minimum.at, np.full(minimum.x.size, -np.inf)
+    least[: len(coordinates.names)] = coordinates.room_below(minimum.x)
+    scale = np.sqrt(np.diag(at.normal))
+    scale = np.maximum(scale, 1e-12 * scale.max())
+    matrix = at.normal / np.outer(scale, scale)
+    matrix[np.diag_indices_from(matrix)] += MINIMISER.min_damping
+    step = bounded_step(matrix, at.gradient / scale, least * scale, np.full(least.size, np.inf)) / scale
+    return step, -float(step @ (2.0 * at.gradient + at.normal @ step))
