@@ -164,3 +164,27 @@ def test_a_restart_keeps_all_but_wide_coulomb_steps(setup: bench.Setup) -> None:
         x = stage2._narrowed(problem, near, replace(DEFAULTS, initial_width=0.005))
         wanted = [expected if name.startswith("coulomb_width") else 0.5 for name in names]
         np.testing.assert_allclose(problem.coordinates.values(x[: problem.count]), wanted)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "chosen"),
+    [
+        (1.0, 0.5, "first"),  # explained: no second start
+        (5.0, 1.0, "second"),
+        (5.0, 6.0, "first"),
+    ],
+)
+def test_a_motion_that_is_not_explained_is_fitted_from_the_prior_too(
+    setup: bench.Setup, monkeypatch: pytest.MonkeyPatch, first: float, second: float, chosen: str
+) -> None:
+    problem, x = problem_of(setup, sticking(1))
+    level = {0.0: first, 1.0: second}
+    found = [Minimum(np.full(2, at), Quadratic(1.0, np.eye(2), np.zeros(2)), 1) for at in level]
+    monkeypatch.setattr(stage2, "_towards_prior", lambda _, x, options: x)
+    monkeypatch.setattr(stage2, "_softened", lambda *_: (x, 1.0, 1))
+    monkeypatch.setattr(stage2, "_resolved", lambda problem, *_: (problem, found[0], 1))
+    monkeypatch.setattr(stage2, "_softened_later", lambda *_: (replace(problem, softness=1.0), found[1], 10))
+    monkeypatch.setattr(stage2, "_level", lambda _, x: level[float(x[0])])
+    _, minimum, spent = stage2._started(problem, x, DEFAULTS)
+    assert minimum is found[chosen == "second"]
+    assert spent == (2 if first <= DEFAULTS.poor else 12)
