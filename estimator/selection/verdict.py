@@ -8,12 +8,13 @@ omits (`hil.estimator.selection.candidates.considered`) and for the unexplained 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.identify import Estimate
+from hil.estimator.models.bounds import bound_sentence
+from hil.estimator.models.conflicts import Conflict, Trust, conflict_sentences, contradicted
 from hil.estimator.models.terms import OPTIONS, kind_of
 from hil.estimator.selection.candidates import Candidate
 from hil.estimator.selection.drift import LEAST, Drift, TorqueChange
@@ -39,8 +40,6 @@ IMPROVEMENT = {
 ODD_HINT = "Its residual on odd lines indicates friction or ripple that the model lacks."
 EVEN_HINT = "Its residual on even lines indicates an effect that depends on direction, or an offset in torque or angle."
 BEYOND_NOISE = 2.0
-
-Trust = Literal["yes", "with care", "no"]
 
 
 @dataclass(frozen=True)
@@ -81,12 +80,14 @@ class Evidence:
     """Whether the model was selected from all available terms."""
     torque_limit: str = ""
     """The setting that limited the torque, for advice; "" if the user chose peak_torque."""
+    conflicts: tuple[Conflict, ...] = field(default=())
+    """Values far from what was known beforehand."""
 
 
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:
     """Return the verdict on `estimate`."""
     explained = float(validation.residual_over_floor.max()) <= EXPLAINED
-    trust = _trust(validation, evidence)
+    trust = _trust(validation, evidence, estimate.at_bound)
     sentences = (
         _noise(validation) if explained else _unexplained(estimate, validation, evidence, trust),
         *(() if explained or evidence.disturbances else _distorted(validation)),
@@ -94,6 +95,8 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
         *(() if evidence.disturbances else _drifted(evidence.drift)),
         *_pushed(evidence.torque),
         *_predicted(evidence.held_out, evidence.held_out_as_fitted),
+        *conflict_sentences(evidence.conflicts, explained),
+        *((bound_sentence(estimate.at_bound),) if estimate.at_bound else ()),
         *evidence.doubts,
         *evidence.notes,
         *_weak(validation, evidence.torque_limit),
@@ -103,10 +106,13 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
     return Verdict(trust, validation.weakest, sentences)
 
 
-def _trust(validation: Validation, evidence: Evidence) -> Trust:
+def _trust(validation: Validation, evidence: Evidence, at_bound: Sequence[str]) -> Trust:
     left = float(validation.residual_over_floor.max())
+    against = contradicted(evidence.conflicts, left <= EXPLAINED)
+    if against == "no":
+        return "no"
     doubtful = any(_is_weak(validation, name) for name in validation.relative_std)
-    doubtful = doubtful or bool(evidence.doubts or evidence.disturbances or evidence.torque)
+    doubtful = doubtful or bool(evidence.doubts or evidence.disturbances or evidence.torque or against or at_bound)
     if evidence.held_out is None:
         if left > MUCH_LEFT:
             return "no"

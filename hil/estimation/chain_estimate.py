@@ -23,6 +23,8 @@ from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.model.tilt import TILT, tilt_between
 from hil.estimator.chain.simulation.prediction import predict
+from hil.estimator.models.bounds import bound_sentence
+from hil.estimator.models.conflicts import Trust, conflict_sentences, contradicted, lowered
 from hil.fakes.plants.arm import armature
 from hil.plan.chain_model import KnownChain, known_chain
 from hil.plan.plan import HELD_OUT, IDENTIFY
@@ -190,9 +192,9 @@ def _verdict(
     count = known.base.count
     certain = estimate.std[:count] / known.prior.std
     weakest = known.base.names[int(np.argmax(certain))]
-    over = estimate.over_noise
+    explained = is_explained(estimate)
     sentences = [_unexplained(config, estimate)]
-    trust = "yes" if over.max() <= EXPLAINED and estimate.systematic <= SYSTEMATIC else "with care"
+    trust: Trust = "yes" if explained else "with care"
     if held_out is None:
         sentences.append("No second path was recorded, so the prediction could not be validated.")
         trust = "with care"
@@ -225,6 +227,11 @@ def _verdict(
             "The fit stopped short of its minimum, where a joint sticks and breaks away; the standard errors include "
             "the distance that remains. Use faster motion ([joint_path]), so that fewer joints stick."
         )
+    if estimate.at_bound:
+        trust = "with care" if trust == "yes" else trust
+        sentences.append(bound_sentence(estimate.at_bound))
+    trust = lowered(trust, contradicted(estimate.conflicts, explained))
+    sentences += conflict_sentences(estimate.conflicts, explained)
     if estimate.unseen:
         sentences.append(
             f"In this motion gravity does not reveal {', '.join(estimate.unseen)}: they are not identifiable, and are "
@@ -244,6 +251,11 @@ def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_p
     )
 
 
+def is_explained(estimate: ChainEstimate) -> bool:
+    """Whether the residual is noise, so that no effect is known to be missing from the model."""
+    return float(estimate.over_noise.max()) <= EXPLAINED and estimate.systematic <= SYSTEMATIC
+
+
 def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     """How large the residual is compared with the noise, and what that says about the model."""
     over, joint = float(estimate.over_noise.max()), int(np.argmax(estimate.over_noise))
@@ -254,7 +266,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
         else "encoder rounding"
     )
     said = f"The residual of {config.joints[joint].name} is the largest: {over:.2f} times {measured};"
-    if over <= EXPLAINED and estimate.systematic <= SYSTEMATIC:
+    if is_explained(estimate):
         return f"{said} nothing remains unexplained."
     causes = "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time"
     if not estimate.model.base_tilt and np.any(estimate.model.base.chain.gravity):

@@ -14,7 +14,7 @@ from hil.estimation.chain_estimate import estimate_chain_run
 from hil.estimation.model_from_config import lever_of, voltage_driven, wanted_model
 from hil.estimation.physical import physical_of
 from hil.estimation.pilot_limit import torque_limit
-from hil.estimation.plausibility import doubts
+from hil.estimation.plausibility import conflicts_of, doubts
 from hil.estimation.result import Checks, make_result
 from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
 from hil.estimation.settled_period import settled_period
@@ -99,6 +99,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
         notes,
         tried_all=choice is not None,
         torque_limit=limit,
+        conflicts=conflicts_of(config, estimate),
     )
     judged = judge(estimate, validation, evidence)
     checks = Checks(
