@@ -286,6 +286,17 @@ def test_a_wrong_description_is_named(old: str, new: str, message: str) -> None:
         parse_config(TEXT.replace(old, new, 1), FOUR)
 
 
+def test_a_run_folder_of_an_older_version_may_have_link_lengths() -> None:
+    old = TEXT.replace(
+        'urdf = "open_manipulator_x_like.urdf"\nrest',
+        'urdf = "open_manipulator_x_like.urdf"\nlink_lengths = [0.1, 0.1, 0.1, 0.1]\nrest',
+        1,
+    )
+    assert parse_config(old, FOUR, recorded=True).arm.link_lengths is None
+    with pytest.raises(ConfigError, match="link_lengths"):
+        parse_config(old, FOUR)
+
+
 def test_too_little_torque_for_the_path_is_named() -> None:
     weak = TEXT.replace("current_limit = 1.2", "current_limit = 0.3")
     with pytest.raises(ConfigError, match="needs about"):
