@@ -56,13 +56,14 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
         choice, estimate = None, identify_chain(period, model, known.prior)
     model = estimate.model
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
+    beyond = None
     if HELD_OUT in facts.segments:
         with suppress(RecordingCutShort):  # stopped in the held-out part: what was finished is estimated
             other = settled_period(config, facts, samples, HELD_OUT)
             predicted = predict(model, estimate.parameters, other)
             played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
+            beyond = played[HELD_OUT].error_beyond(other.noise)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
-    beyond = None if held_out is None else _beyond_noise(played[HELD_OUT], estimate)
     seconds = round(time.perf_counter() - started, 3)
     linear = len(model.linear_names)
     result = SettledResult(
@@ -174,12 +175,6 @@ def unmoved(config: Config, position: NDArray[np.float64]) -> list[str]:
     return [joint.name for joint, each in zip(config.joints, reach, strict=True) if each < UNMOVED]
 
 
-def _beyond_noise(played: PlayedPeriod, estimate: ChainEstimate) -> NDArray[np.float64]:
-    """Relative prediction error of each joint without the noise of its encoder, which no model predicts (joints,)."""
-    noise = estimate.noise_steps * estimate.position_step / np.nanstd(played.position, axis=1)
-    return np.asarray(np.sqrt(np.maximum(played.relative_error**2 - noise**2, 0.0)))
-
-
 def _verdict(
     config: Config,
     estimate: ChainEstimate,
@@ -201,7 +196,10 @@ def _verdict(
     else:
         error = float(np.max(held_out))
         joint = config.joints[int(np.argmax(held_out))].name
-        sentences.append(f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst.")
+        sentences.append(
+            f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst, encoder noise "
+            "not counted."
+        )
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
     if disturbances:
         trust = "with care" if trust == "yes" else trust
