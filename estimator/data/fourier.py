@@ -57,7 +57,8 @@ def white_noise(position: Array, valid: Mask | None = None) -> Array:
     noise = _upper_noise(without_jump(position))
     if valid is None or valid.all():
         return noise
-    return noise / np.array([_interpolated_noise(row) for row in valid])
+    of_valid: Array = noise / np.array([_interpolated_noise(row) for row in valid])
+    return of_valid
 
 
 def without_jump(position: Array) -> Array:
