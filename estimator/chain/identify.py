@@ -8,6 +8,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
+from hil.estimator.chain.conflicts import chain_conflicts
 from hil.estimator.chain.fit.coordinates import ANGLES, kind_of
 from hil.estimator.chain.fit.stage1 import ChainLinear, fit_lines
 from hil.estimator.chain.fit.stage2 import DEFAULTS, ChainFit, ChainOptions, fit_periods
@@ -16,6 +17,7 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ConvergenceError, ModelError
 from hil.estimator.fit.fitted_parameters import FittedParameters
+from hil.estimator.models.conflicts import Conflict
 
 EXPLAINED_RESIDUAL = 1.06
 """RMS residual of the worst joint, relative to the noise of its angle, below which a motion counts as explained."""
@@ -64,6 +66,10 @@ class ChainEstimate(FittedParameters):
     noise_steps: Array
     """Noise of one sample of each angle, encoder rounding included (joints,) [encoder steps]; rounding alone is 0.2887.
     """
+    at_bound: tuple[str, ...] = ()
+    """Parameters at a bound that the data would exceed, and on which base parameters depend."""
+    conflicts: tuple[Conflict, ...] = ()
+    """Values far from what was known beforehand, the largest contradiction first."""
 
     @property
     def over_noise(self) -> Array:
@@ -127,6 +133,8 @@ def identify_chain(
             if each > BELIEVED * ANGLES.get(kind_of(name), np.inf)
         ),
         noise_steps=used[0].noise / used[0].position_step,
+        at_bound=fit.at_bound,
+        conflicts=chain_conflicts(model.names, fit.value, np.sqrt(np.diag(fit.total_covariance)), prior),
     )
 
 

@@ -17,6 +17,7 @@ from hil.estimator.chain.fit.resolved_widths import resolved_widths
 from hil.estimator.chain.fit.stage1 import ChainLinear
 from hil.estimator.chain.fit.uncertainty import coloured_covariance, neglected_covariance
 from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
+from hil.estimator.chain.model.late_torque import limited
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
@@ -30,6 +31,7 @@ from hil.estimator.fit.covariance import (
 )
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.noise_weights import noise_weights
+from hil.estimator.models.bounds import MOVED, beyond_range
 from hil.estimator.options import CoordinateOptions, CovarianceOptions, MinimiserOptions
 from hil.estimator.simulation.arm import steps_per_sample
 
@@ -127,6 +129,8 @@ class ChainFit:
     """Decrease of the sum of squares that is expected from one more step, the one that would reach the minimum."""
     neglected: Array
     """Covariance due to what the model of voltage-driven joints neglects (parameters, parameters) [SI]."""
+    at_bound: tuple[str, ...] = ()
+    """Parameters at a bound that the data would exceed, and on which base parameters depend."""
 
     @property
     def total_covariance(self) -> Array:
@@ -350,10 +354,11 @@ def _fit(
         covariance = _larger(covariance, robust)
     step, decrease = _remaining(minimum, problem.coordinates)
     value = problem.coordinates.values(x[:count])
+    widened, missing = by_parameters(covariance, slopes, value), slopes @ step[:count]
     return ChainFit(
         value,
-        by_parameters(covariance, slopes, value),
-        slopes @ step[:count],
+        widened,
+        missing,
         by_parameters(white, slopes, value),
         tuple(problem.start(x, index) for index in range(len(problem.periods))),
         positions,
@@ -363,7 +368,22 @@ def _fit(
         problem.softness,
         decrease,
         neglected_covariance(problem, x),
+        _at_bound(problem, value, missing, np.sqrt(np.diag(widened))),
     )
+
+
+def _at_bound(problem: ChainProblem, value: Array, missing: Array, std: Array) -> tuple[str, ...]:
+    """Return the parameters at a bound that the data would exceed, if base parameters depend on them.
+
+    missing: undamped step of the parameters; std: their standard errors at the minimum (parameters,).
+    """
+    names, base = problem.coordinates.names, problem.model.base
+    found = list(limited(base, dict(zip(names, value.tolist(), strict=True)), std))
+    if np.any(np.abs(missing[: base.count]) > MOVED * std[: base.count]):
+        lower = np.where(problem.coordinates.positive, 0.0, -np.inf)
+        beyond = beyond_range(value, missing, std, lower, np.full(value.size, np.inf))
+        found += [name for name, over in zip(names, beyond, strict=True) if over]
+    return tuple(found)
 
 
 def _larger(one: Array, other: Array) -> Array:
