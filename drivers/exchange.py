@@ -8,7 +8,8 @@ instead of two. All packets are prepared in advance; a cycle only packs the goal
 
 The registers that are read vary from cycle to cycle. Most cycles read `spans[0]`. Every `slow_every`-th cycle reads one
 of the other spans, alternately; every `status_every`-th cycle reads `status`, the registers that show whether torque is
-still on. Every span must include what the control loop needs.
+still on. After a lost reply, the usual span is read with a few more bytes. Every span must include what the control
+loop needs.
 """
 
 import math
@@ -24,7 +25,7 @@ from hil.drivers.control_table import Register
 from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction, Packet
 from hil.drivers.port import Port
 from hil.drivers.read_back import REMEMBERED, TRY_AGAIN_S, Overruled, ReadBack
-from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead
+from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
 
 HOST_S = 0.75e-3
 """Time allowed for the computer itself, including USB frames, on top of wire, servos and adapter [s]."""
@@ -34,6 +35,10 @@ PATIENCE_SHARE = 0.5
 
 MOST_PATIENCE_S = 0.02
 """Upper limit of the minimum reply timeout [s]: in slow cycles too, a silent servo must not delay the others."""
+
+AFTER_LOSS = 5
+"""Number of reads of different lengths that take turns after lost replies: a reply to one of them that arrives fewer
+cycles late is recognised by its length."""
 
 _NEVER = 1 << 62
 _DOUBTS = 3
@@ -111,6 +116,8 @@ class Exchange:
             for register in dict.fromkeys(goals)
         ]
         every = [*spans] if status is None else [*spans, status]
+        self._kinds = len(every)
+        every += _of_other_lengths(every, len(self.ids))
         self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
         self._expected = frozenset().union(*(read.expected for read in self._reads))
         self._slow_spans = len(spans) - 1
@@ -123,8 +130,8 @@ class Exchange:
         self._slow_every = slow_every
         self._until_slow = slow_every
         self._slow = 0
-        self._lost = 0
         self._late_possible = False
+        self._after_loss = 0
         self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
         self._lasted = math.inf
         self._read_back: ReadBack | None = None
@@ -144,7 +151,7 @@ class Exchange:
     @property
     def longest(self) -> float:
         """Wire time of the longest exchange [s], without adapter and computer: a lower bound on the cycle time."""
-        return self._port.wire_time(max(self._bytes(read) for read in self._reads))
+        return self._port.wire_time(max(self._bytes(read) for read in self._reads[: self._kinds]))
 
     @property
     def patience(self) -> float:
@@ -208,7 +215,7 @@ class Exchange:
         servos = read.unpack(received) or read.search(received)[0]
         now = self._now()
         if None in servos:
-            self._late_possible, self._lost = True, 1
+            self._late_possible = True
         else:
             back.took(min(now - before, 2.0 * takes))
         found = back.look(servos, self._sent, now)
@@ -252,12 +259,12 @@ class Exchange:
         if servos is None:
             servos = self._search(read, received, before + timeout)
             if None in servos:
-                self._late_possible, self._lost = True, span
+                self._late_possible = True
         elif self._doubts and self._now() - before < self._soonest[span]:
             servos = self._latest(read, servos, before + timeout)
         after = self._now()
         self._lasted = after - before
-        return _reply((before, after, span, servos))
+        return _reply((before, after, span if span < self._kinds else 0, servos))
 
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
         """Handle replies that arrive sooner than the wire allows: they may belong to an earlier request.
@@ -273,16 +280,18 @@ class Exchange:
         return read.unpack(received) or self._search(read, received, deadline)
 
     def _other_span(self, between: bool) -> int:
-        """Choose the span for a cycle that does not read the usual one: another one after a lost reply, a slow one, or
-        the status.
+        """Choose the span for a cycle that does not read the usual one: one of another length after a lost reply, a
+        slow one, or the status.
         """
         if self._late_possible:
             self._late_possible = False
             if self._port.has_input():
                 self._port.put_aside()
             # A reply that arrives even later must not be taken for the reply to this request. Nothing in a packet
-            # identifies the request it belongs to, but its length differs if another span was requested.
-            return self._next_slow() if self._lost == 0 else 0
+            # identifies the request it belongs to, but its length differs if another span was requested. Where several
+            # replies in a row are late, each request needs a length of its own.
+            self._after_loss = self._after_loss % AFTER_LOSS + 1
+            return self._kinds - 1 + self._after_loss
         if self._until_slow <= 0 and not between:
             self._until_slow = self._slow_every
             # If a status is due as well, it waits for the next cycle, so that the two long reads never coincide.
@@ -377,6 +386,14 @@ class _GoalWrite:
         fields[2::2] = goal_ticks
         packet = self._pack(*fields)
         return packet + _pack_crc(_crc(packet))
+
+
+def _of_other_lengths(spans: Sequence[Span | Sequence[Span]], servos: int) -> list[tuple[Span, ...]]:
+    """Return the usual span with more bytes in front, so that no length occurs twice."""
+    taken = {one_each(span, servos)[0].size for span in spans}
+    usual = one_each(spans[0], servos)
+    lengths = [size for size in range(usual[0].size + 1, usual[0].size + AFTER_LOSS + len(taken)) if size not in taken]
+    return [tuple(each.longer(size - each.size) for each in usual) for size in lengths[:AFTER_LOSS]]
 
 
 def _packets_within(received: bytes) -> list[Packet]:

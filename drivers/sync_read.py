@@ -65,6 +65,10 @@ class Span:
             for span in own
         )
 
+    def longer(self, by: int) -> "Span":
+        """Return the span with `by` more bytes in front of the same registers."""
+        return Span(self.registers, self.address - by, self.size + by, "x" * by + self.format)
+
     @classmethod
     def _in(cls, table: ControlTable, registers: Sequence[str]) -> "Span":
         entries = [table[name] for name in registers]

@@ -1,30 +1,29 @@
-"""Compiled loops whose cache is invalidated by a change in any source file compiled into them.
+"""Compiled loops whose cache on disk is invalidated by a change in any code or constant compiled into them.
 
-numba stores compiled code next to the source and only checks the date of that one file. Code inlined from other
-modules, and constants taken from them, could therefore be older than their sources, and a fit would use outdated
-equations.
+numba stores compiled code next to the source and only checks the date of that one file. Functions inlined from other
+modules, and constants taken from them, could therefore be older than their sources; and where a file changes while a
+program starts, old code could be stored under the new date. So the cache is stamped with the code itself, as loaded.
 """
 
 import hashlib
-from collections.abc import Callable, Sequence
-from functools import cache
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numba
+import numpy as np
 
-FOLDERS = ("models", "simulation", "chain")
+PACKAGE = __name__.split(".", maxsplit=1)[0]
 
 
-def compiled(function: Callable[..., Any], sources: Sequence[Path] = (), **options: Any) -> Any:
-    """Compile `function` without the GIL, cached on disk until `sources` or a file in FOLDERS change."""
+def compiled(function: Callable[..., Any], **options: Any) -> Any:
+    """Compile `function` without the GIL, cached on disk until its code, or any code or constant it uses, changes."""
     dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
-    own = [hashlib.sha256(path.read_bytes()).hexdigest() for path in sources]
     # numba has no public name for this; without it the cache would only check the date of one file, as numba's own
     # cache does.
     on_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if on_file is not None:
-        on_file._source_stamp = (on_file._source_stamp, sources_digest(Path(__file__).parent), *own)
+        on_file._source_stamp = code_digest(function)
     return dispatcher
 
 
@@ -39,10 +38,63 @@ def only_version(dispatcher: Any) -> Any:
     return versions[0].entry_point if len(versions) == 1 else dispatcher
 
 
-@cache
-def sources_digest(estimator: Path) -> str:
-    """Return a hash of all source files in FOLDERS and their subfolders."""
+def code_digest(function: Callable[..., Any]) -> str:
+    """Return a hash of the function's code and of all code and constants of this package that it uses."""
     digest = hashlib.sha256()
-    for path in sorted(path for folder in FOLDERS for path in (estimator / folder).rglob("*.py")):
-        digest.update(path.relative_to(estimator).as_posix().encode() + path.read_bytes())
+    seen: set[FunctionType] = set()
+    waiting = [_plain(function)]
+    while waiting:
+        each = waiting.pop()
+        if each in seen:
+            continue
+        seen.add(each)
+        digest.update(repr((each.__module__, each.__name__, each.__defaults__)).encode())
+        for code in _codes(each.__code__):
+            constants = [value for value in code.co_consts if not isinstance(value, CodeType)]
+            digest.update(code.co_code + repr((code.co_names, code.co_varnames, constants)).encode())
+        for name, value in _used(each):
+            if isinstance(_plain(value), FunctionType):
+                waiting.append(_plain(value))
+            else:
+                digest.update(f"{name} = {_shown(value)}".encode())
     return digest.hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    """Return the Python function of a compiled one; anything else as it is."""
+    return getattr(value, "py_func", value)
+
+
+def _codes(code: CodeType) -> Iterator[CodeType]:
+    """Yield the code and that of the comprehensions in it."""
+    yield code
+    for value in code.co_consts:
+        if isinstance(value, CodeType):
+            yield from _codes(value)
+
+
+def _used(function: FunctionType) -> Iterator[tuple[str, Any]]:
+    """Yield names and values of the globals, and of attributes of the package's modules, that the function may use.
+
+    Libraries are left out: numba stores its code per version, and numpy's functions are numba's own.
+    """
+    names = sorted({name for code in _codes(function.__code__) for name in code.co_names})
+    for name in names:
+        value = function.__globals__.get(name)
+        if isinstance(value, ModuleType):
+            if value.__name__.startswith(PACKAGE):
+                yield from ((each, getattr(value, each)) for each in names if hasattr(value, each))
+        elif value is not None and _is_own(value):
+            yield name, value
+    for cell in function.__closure__ or ():
+        yield "", cell.cell_contents
+
+
+def _is_own(value: Any) -> bool:
+    """Whether a value is a constant or defined in this package."""
+    return not callable(value) or getattr(_plain(value), "__module__", "").startswith(PACKAGE)
+
+
+def _shown(value: Any) -> str:
+    """Return a constant as text that differs where the constants differ."""
+    return repr(value.tolist()) if isinstance(value, np.ndarray) else repr(value)

@@ -47,6 +47,8 @@ class Estimate(FittedParameters):
     """Number of samples excluded or downweighted because they are far from their neighbours or from the model."""
     correlation_time: float = 1.0
     """Number of samples over which the residual is correlated; 1 is white. `covariance` takes it into account."""
+    at_bound: tuple[str, ...] = ()
+    """Parameters at a bound that the data would exceed, and on which base parameters depend."""
 
 
 @one_blas_thread
@@ -101,6 +103,7 @@ def identify(
         iterations=fit.iterations,
         outliers=fit.outliers + spikes,
         correlation_time=fit.correlation_time,
+        at_bound=fit.at_bound,
     )
 
 

@@ -24,7 +24,7 @@ class JointFacts:
     """What a model knows about a joint besides its dynamics.
 
     mode: "current" (goals in A) or "pwm" (goals in V). torque_per_goal: N m/A or N m/V at the output shaft. goal_limit:
-    A or V. position_limit: rad. velocity_limit: rad/s.
+    A or V. position_limit: rad. velocity_limit: rad/s. servos: number of servos that drive the joint together.
     """
 
     name: str
@@ -35,6 +35,7 @@ class JointFacts:
     goal_limit: float
     position_limit: tuple[float, float]
     velocity_limit: float
+    servos: int = 1
 
     @property
     def goal_unit(self) -> str:

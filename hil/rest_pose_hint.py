@@ -1,6 +1,20 @@
 """What to do about a joint that is not where the configuration says it rests."""
 
-__all__ = ["rest_pose_hint"]
+import math
+from collections.abc import Sequence
+
+__all__ = ["rest_pose_hint", "within_limits"]
+
+
+def within_limits(position: float, limits: Sequence[float]) -> float:
+    """Return the angle that is whole turns away from `position` and within the position limits, if there is one.
+
+    An encoder measures within a turn. The turn closest to the rest pose is assumed, but a joint that fell is at an
+    angle that it can reach. All in rad; `position` itself is returned if it is within the limits, or no other is.
+    """
+    low, high = limits
+    inside = [each for turn in (0, -1, 1) if low <= (each := position + turn * math.tau) <= high]
+    return inside[0] if inside else position
 
 
 def rest_pose_hint(position: float, rest: float, tolerance: float, zero_ticks: int) -> str:

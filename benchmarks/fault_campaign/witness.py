@@ -1,6 +1,7 @@
 """The emulated servos' own record: goals, motor currents and motion, every millisecond."""
 
 import math
+from array import array
 from collections.abc import Sequence
 from typing import Any
 
@@ -48,7 +49,9 @@ class Witness:
         self._plant = bus.plant
         self._servos: tuple[EmulatedServo, ...] = bus._servos
         self._next = bus.time + STEP_S
-        self._rows: list[list[tuple[Any, ...]]] = []
+        self._times: list[float] = []
+        self._goals: list[tuple[tuple[bool, bool, int], ...]] = []
+        self._motion = array("d")  # currents, positions and velocities of all joints, row by row
         self._disturbed: list[tuple[int, Attack]] = []
         self._missing = [0.0] * bus.plant.joints
         self._turned_at = [(0.0, -1.0)] * bus.plant.joints  # sign of the current, and when it changed
@@ -147,21 +150,24 @@ class Witness:
     def advance(self, until: float, current: Sequence[float]) -> None:
         plant = self._plant
         if self._next <= until:
-            told = [_told(servo) for servo in self._servos]  # no servo receives anything within this time
+            told = tuple(map(_told, self._servos))  # no servo receives anything within this time
         while self._next <= until:
             plant.advance(self._next, self._driven_by(current, self._next) if self._disturbed else current)
-            self._rows.append(
-                [
-                    (self._next, *each, *state)
-                    for each, *state in zip(told, plant.current, plant.position, plant.velocity, strict=True)
-                ]
-            )
+            self._times.append(self._next)
+            self._goals.append(told)
+            self._motion.extend((*plant.current, *plant.position, *plant.velocity))
             self._next += STEP_S
         plant.advance(until, self._driven_by(current, until) if self._disturbed else current)
 
     def record(self) -> NDArray[Any]:
         """The record so far (milliseconds, joints), with dtype `RECORD`."""
-        return np.array(self._rows, dtype=RECORD).reshape(-1, self.joints)
+        record = np.empty((len(self._times), self.joints), RECORD)
+        record["time"] = np.array(self._times)[:, None]
+        goals = np.array(self._goals, dtype=np.int64).reshape(-1, self.joints, 3)
+        record["driven"], record["torque"], record["goal"] = np.moveaxis(goals, -1, 0)
+        motion = np.frombuffer(self._motion).reshape(-1, 3, self.joints)
+        record["current"], record["position"], record["velocity"] = np.moveaxis(motion, 1, 0)
+        return record
 
 
 def _told(servo: EmulatedServo) -> tuple[bool, bool, int]:

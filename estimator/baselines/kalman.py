@@ -14,10 +14,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.models.parameters import ABSENT, CONSTANTS
@@ -235,10 +235,10 @@ def _ukf_loop(
             P[i, i] += noise[i] * intervals[k]
 
 
-_accelerations = numba.njit(cache=True, nogil=True)(_accelerations)
-_advance = numba.njit(cache=True, nogil=True)(_advance)
-_constants = numba.njit(cache=True, nogil=True)(_constants)
-_correct = numba.njit(cache=True, nogil=True)(_correct)
-_root = numba.njit(cache=True, nogil=True)(_root)
-_ekf: Callable[..., None] = numba.njit(cache=True, nogil=True)(_ekf_loop)
-_ukf: Callable[..., None] = numba.njit(cache=True, nogil=True)(_ukf_loop)
+_accelerations = compiled(_accelerations)
+_advance = compiled(_advance)
+_constants = compiled(_constants)
+_correct = compiled(_correct)
+_root = compiled(_root)
+_ekf: Callable[..., None] = compiled(_ekf_loop)
+_ukf: Callable[..., None] = compiled(_ukf_loop)

@@ -61,6 +61,13 @@ class ChainCalibration:
     std: Array
     residual_steps: Array
     """RMS of the residual in encoder steps (runs, joints)."""
+    noise_steps: Array
+    """Noise of one sample of each angle in each run, encoder rounding included (runs, joints) [encoder steps]."""
+
+    @property
+    def misfit(self) -> float:
+        """Mean square of the residual, each run's relative to its own noise; 1 for noise alone."""
+        return float(np.mean((self.residual_steps / self.noise_steps) ** 2))
 
 
 def calibrate_chain(
@@ -103,6 +110,7 @@ def calibrate_chain(
                 for period, position in zip((without, with_mass), estimate.positions, strict=True)
             ]
         ),
+        np.stack([period.noise / period.position_step for period in (without, with_mass)]),
     )
 
 

@@ -65,7 +65,7 @@ def choose_chain(
     Raises what `identify_chain` raises for `model` itself.
     """
     started = time.perf_counter()
-    best = identify_chain(periods, model, prior)
+    best = identify_chain(periods, model, prior, test_zeros=True)
     trials = [ChainTrial(model, best, time.perf_counter() - started)]
     while not best.explained:
         found = [_tried(periods, richer, prior) for richer in _richer(best.model)]
@@ -93,7 +93,7 @@ def _richer(model: ChainModel) -> list[ChainModel]:
 def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior) -> ChainTrial:
     started = time.perf_counter()
     try:
-        estimate = identify_chain(periods, model, prior)
+        estimate = identify_chain(periods, model, prior, test_zeros=True)
     except ConvergenceError:
         estimate = None
     return ChainTrial(model, estimate, time.perf_counter() - started)

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
+from hil.estimator.chain.conflicts import chain_conflicts
 from hil.estimator.chain.fit.coordinates import ANGLES, kind_of
 from hil.estimator.chain.fit.held_zeros import HeldZeros
 from hil.estimator.chain.fit.stage1 import ChainLinear, fit_lines
@@ -18,6 +19,7 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.errors import ConvergenceError, ModelError
 from hil.estimator.fit.fitted_parameters import FittedParameters
+from hil.estimator.models.conflicts import Conflict
 
 EXPLAINED_RESIDUAL = 1.06
 """RMS residual of the worst joint, relative to the noise of its angle, below which a motion counts as explained."""
@@ -70,11 +72,15 @@ class ChainEstimate(FittedParameters):
     """Zero errors and tilts that the data hardly determine, so that they are taken as zero."""
     doubtful_zeros: tuple[tuple[int, float], ...]
     """Joints, from 1, whose encoder zeros the model holds although the recording shows them to be off, and by how much
-    (true minus measured angle) [rad].
+    (true minus measured angle) [rad]. Empty if they were not tested.
     """
     noise_steps: Array
     """Noise of one sample of each angle, encoder rounding included (joints,) [encoder steps]; rounding alone is 0.2887.
     """
+    at_bound: tuple[str, ...] = ()
+    """Parameters at a bound that the data would exceed, and on which base parameters depend."""
+    conflicts: tuple[Conflict, ...] = ()
+    """Values far from what was known beforehand, the largest contradiction first."""
 
     @property
     def over_noise(self) -> Array:
@@ -93,11 +99,14 @@ def identify_chain(
     model: ChainModel,
     prior: Prior,
     added: Sequence[Array | None] = (),
+    *,
+    test_zeros: bool = False,
 ) -> ChainEstimate:
     """Estimate the parameters of `model` from settled periods: regression on their lines, then maximum likelihood.
 
     `prior` determines what the data do not, as listed in `ChainEstimate.from_prior`. `added`: see `fit_lines`; for a
-    model with `added_mass`. Raises ModelError if `model` and a period differ in their number of joints,
+    model with `added_mass`. test_zeros: whether to test the encoder zeros that `model` holds
+    (`ChainEstimate.doubtful_zeros`), for a tenth more time. Raises ModelError if `model` and a period differ in their number of joints,
     ConvergenceError if no minimum is found.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
@@ -106,7 +115,7 @@ def identify_chain(
             raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
     used = [without_spikes(period) for period in given]
     linear = fit_lines(used, model, prior, added)
-    fit = _best_fit(used, model, linear, prior, DEFAULTS, added)
+    fit = _best_fit(used, model, linear, prior, replace(DEFAULTS, test_zeros=test_zeros), added)
     spikes = sum(int(period.valid.sum()) for period in given) - sum(int(period.valid.sum()) for period in used)
     count = model.base.count
     # The weight of the prior in the result; model errors or an unfinished fit widen the standard errors, not this.
@@ -140,6 +149,8 @@ def identify_chain(
         ),
         doubtful_zeros=doubtful_zeros(fit.held_zeros, systematic),
         noise_steps=used[0].noise / used[0].position_step,
+        at_bound=fit.at_bound,
+        conflicts=chain_conflicts(model.names, fit.value, np.sqrt(np.diag(fit.total_covariance)), prior),
     )
 
 

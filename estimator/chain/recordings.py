@@ -12,6 +12,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
+from hil.estimator.chain.conflicts import chain_conflicts
 from hil.estimator.chain.fit.regression import filtered_torque, fit_filtered
 from hil.estimator.chain.fit.stage1 import ChainLinear
 from hil.estimator.chain.fit.stage2 import fit_periods
@@ -23,6 +24,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ModelError, RecordingError
 from hil.estimator.fit.covariance import autocorrelation
+from hil.estimator.models.conflicts import Conflict
 
 CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the regression: the first that the recordings' rate and length allow
 LAG = 1e-3  # s: typical lag of a current loop, assumed by the regression
@@ -88,6 +90,9 @@ class RecordedChain:
     """Whether the fit has reached its minimum; always so for a regression."""
     systematic: float = 1.0
     """See `ChainEstimate.systematic`; 1 for a regression."""
+    at_bound: tuple[str, ...] = ()
+    conflicts: tuple[Conflict, ...] = ()
+    """See `ChainEstimate`."""
 
     @property
     def std(self) -> Array:
@@ -151,6 +156,8 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
         _from_prior(model, spread, prior),
         fit.reached,
         largest_ratio(np.sqrt(np.diag(fit.covariance))[:count], spread),
+        fit.at_bound,
+        chain_conflicts(model.names, fit.value, np.sqrt(np.diag(fit.total_covariance)), prior),
     )
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hil.estimator.arrays import Array
+from hil.estimator.arrays import Array, Mask
 
 Lines = npt.NDArray[np.complex128]
 
@@ -13,6 +13,7 @@ SIGNAL_OVER_NOISE = 4.0  # power ratio above which a band of lines counts as sig
 BAND = 8  # lines that are evaluated together
 
 
+_DRAWS = 16  # of white noise that is interpolated, to know its standard deviation to about 1 %
 _AHEAD = np.array((3.0, -3.0, 1.0))
 """Weights of the three nearest samples, nearest first, for quadratic extrapolation by one sample."""
 
@@ -44,17 +45,51 @@ def noise_power(lines: Lines) -> Array:
     return noise
 
 
-def white_noise(position: Array) -> Array:
+def white_noise(position: Array, valid: Mask | None = None) -> Array:
     """Return the standard deviation of the white noise in one period of angles (joints, samples), per joint.
 
     It is estimated from the upper quarter of the lines, far above any motion. A linear trend is removed first, since
     the jump of a period that does not close because the arm drifts spreads over all lines.
+
+    valid: samples that were received (joints, samples); the others hold a linear interpolation, which is less noisy at
+    fast lines. White noise that is interpolated in the same way shows by how much.
     """
+    noise = _upper_noise(without_jump(position))
+    if valid is None or valid.all():
+        return noise
+    of_valid: Array = noise / np.array([_interpolated_noise(row) for row in valid])
+    return of_valid
+
+
+def without_jump(position: Array) -> Array:
+    """Return a period (joints, samples) less the linear trend by which it fails to close."""
     samples = position.shape[1]
-    lines = lines_of(position - _jump(position)[:, None] * (np.arange(samples) / samples))
+    closed: Array = position - _jump(position)[:, None] * (np.arange(samples) / samples)
+    return closed
+
+
+def slow_part(position: Array, lines: int) -> Array:
+    """Return the part of a period (joints, samples) that consists of its first `lines` lines."""
+    kept = np.fft.rfft(position, axis=1)
+    kept[:, lines:] = 0.0
+    return np.asarray(np.fft.irfft(kept, position.shape[1], axis=1))
+
+
+def _upper_noise(position: Array) -> Array:
+    lines = lines_of(position)
     upper = lines[:, lines.shape[1] // 2 :]
-    noise: Array = np.sqrt(noise_power(upper) * samples)
+    noise: Array = np.sqrt(noise_power(upper) * position.shape[1])
     return noise
+
+
+def _interpolated_noise(valid: Mask) -> float:
+    """Return the noise that is left of white noise of 1 if only the samples `valid` (samples,) are not interpolated."""
+    if valid.all() or not valid.any():
+        return 1.0
+    index = np.arange(valid.size)
+    drawn = np.random.default_rng(_DRAWS).standard_normal((_DRAWS, valid.size))
+    drawn[:, ~valid] = [np.interp(index[~valid], index[valid], row[valid]) for row in drawn]
+    return float(np.sqrt(np.mean(np.square(_upper_noise(drawn)))))
 
 
 def _jump(position: Array) -> Array:

@@ -3,13 +3,15 @@
 Whatever repeats with the motion cancels: the motion itself, however fast, and the error of any model of it. What is
 left of a rounded angle depends on its noise. Without noise, both passes are rounded alike and nothing is left; the more
 noise there is before rounding, the more of the rounding error differs as well. With independent Gaussian noise of
-standard deviation s and angles spread evenly over the steps, half the mean square of the difference is
+standard deviation s, a slow drift d from one pass to the next, and angles spread evenly over the steps, half the mean
+square of the fast part of the difference is
 
-    s^2 + 1/12 - sum over k of exp(-(2 pi k s)^2) / (2 pi^2 k^2)   [steps^2],
+    s^2 + 1/12 - sum over k of exp(-(2 pi k s)^2) cos(2 pi k d) / (2 pi^2 k^2)   [steps^2],
 
 where the sum is the part of the rounding error's power 1/12 that repeats (Fourier series of the rounding error; B.
-Widrow and I. Kollar, Quantization Noise, 2008). Solved for s, this gives the error of one reading, s^2 + 1/12. Passes
-that differ for other reasons make it larger, so it is an upper bound.
+Widrow and I. Kollar, Quantization Noise, 2008). The drift is the slow part of the difference; friction that changes
+causes it. Solved for s, this gives the error of one reading, s^2 + 1/12. Passes that differ for other reasons make it
+larger, so it is an upper bound.
 """
 
 from collections.abc import Sequence
@@ -18,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.data.fourier import white_noise
+from hil.estimator.data.fourier import slow_part, white_noise, without_jump
 
 __all__ = ["agreed_noise", "repeated_noise"]
 
@@ -28,11 +30,13 @@ AGREE = 2.0  # standard errors
 _LINES = 8.0  # samples of a period per line that its noise is measured by
 _LINE_ERROR = 0.72  # relative standard error of the noise from the median power of one line
 _STD = np.linspace(0.0, 1.0, 401)
-_ORDERS = np.arange(1, 30)[:, None]
-_REPEATS = np.sum(np.exp(-((2.0 * np.pi * _ORDERS * _STD) ** 2)) / (2.0 * np.pi**2 * _ORDERS**2), axis=0)
-_REPEATS *= ROUNDING / _REPEATS[0]  # the series is truncated
-_DIFFERS = _STD**2 + ROUNDING - _REPEATS
-"""Half the mean square of the difference at each of `_STD` [steps^2]; beyond, the whole rounding error differs."""
+_ORDERS = np.arange(1, 30)
+_HEIGHTS = 1.0 / (2.0 * np.pi**2 * _ORDERS**2)
+_HEIGHTS *= ROUNDING / _HEIGHTS.sum()  # the series is truncated
+_REPEATS = _HEIGHTS * np.exp(-((2.0 * np.pi * _ORDERS * _STD[:, None]) ** 2))
+"""Power of each order of the rounding error that repeats at each of `_STD`, without drift (stds, orders) [steps^2]."""
+_SLOW = 1.0 / 16.0  # fraction of the lines that drift may have
+_MOST_NOISE = 1.0  # exponent of the correction for the drift's noise, beyond which an order counts as drifted apart
 
 
 def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> Array | None:
@@ -48,9 +52,14 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None
-    differs: Array = 0.5 * np.mean([_power(later - former) for former, later in pairwise(passes)], axis=0) / step**2
-    repeats = np.interp(differs, _DIFFERS, _REPEATS)
-    noise: Array = step * np.sqrt(differs / averaged + repeats)
+    differences = [(later - former) / step[:, None] for former, later in pairwise(passes)]
+    differs = 0.5 * np.mean([_power(each) for each in differences], axis=0)
+    kept = np.mean([_not_drifted(each, differs) for each in differences], axis=0)
+    repeats = np.array([_repeating(*joint) for joint in zip(differs, kept, strict=True)])
+    received = np.mean([np.isfinite(each).mean(axis=1) for each in passes], axis=0)
+    count = np.maximum(averaged * received, 1.0)
+    # Drift by half a step makes the errors of successive passes opposite, but not those of all.
+    noise: Array = step * np.sqrt((differs + repeats) / count + (1.0 - 1.0 / count) * np.maximum(repeats, 0.0))
     return noise
 
 
@@ -75,10 +84,32 @@ def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:
 
 
 def _power(difference: Array) -> Array:
-    """Return the power of the white noise (joints,) [rad^2]; samples that are filled in contribute none."""
-    received = np.maximum(np.mean(np.isfinite(difference), axis=1), 1.0 / difference.shape[1])
-    power: Array = np.square(white_noise(_filled(difference))) / received
+    """Return the power of the white noise (joints,) [steps^2]."""
+    power: Array = np.square(white_noise(_filled(difference), np.isfinite(difference)))
     return power
+
+
+def _not_drifted(difference: Array, differs: Array) -> Array:
+    """Return the fraction (joints, orders) of each order of the rounding error that repeats in spite of drift.
+
+    difference: between two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,); a fraction of it
+    is noise of the drift, whose effect is divided out.
+    """
+    filled = _filled(difference)
+    closed = without_jump(filled)
+    drift = filled - closed + slow_part(closed, max(1, int(_SLOW * filled.shape[1] / 2)))
+    alike = np.cos(2.0 * np.pi * _ORDERS[:, None] * drift[:, None, :]).mean(axis=2)
+    noise = (2.0 * np.pi * _ORDERS) ** 2 * _SLOW * differs[:, None]
+    kept: Array = np.where(noise < _MOST_NOISE, np.clip(alike * np.exp(np.minimum(noise, _MOST_NOISE)), -1.0, 1.0), 0.0)
+    return kept
+
+
+def _repeating(differs: float, kept: Array) -> float:
+    """Return the power of the rounding error that repeats [steps^2], where half the mean square of the difference is
+    `differs` [steps^2] and drift leaves the fractions `kept` (orders,) of each order.
+    """
+    repeats = _REPEATS @ kept
+    return float(np.interp(differs, np.maximum.accumulate(_STD**2 + ROUNDING - repeats), repeats))
 
 
 def _filled(difference: Array) -> Array:

@@ -78,7 +78,7 @@ class SettledPeriod:
         _check_values(self)
         _check_motion(self)
         rounding = self.position_step / np.sqrt(12.0)
-        white = agreed_noise(white_noise(self.filled()), self.repeated_noise, self.samples)
+        white = agreed_noise(white_noise(self.filled(), self.valid), self.repeated_noise, self.samples)
         object.__setattr__(self, "noise", np.maximum(white, rounding))
 
     @property

@@ -7,10 +7,10 @@ busy machine, and the last digits of a fit would depend on the number of threads
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 
 LANES = 8
 
@@ -44,6 +44,4 @@ def _loop(J: Any, r: Any, weight: Any, product: Any) -> None:
             product[a, columns] += p * r[i] + q * r[j] + s * r[k] + t * r[m]
 
 
-_multiply: Callable[[Array, Array, Array, Array], None] = numba.njit(
-    cache=True, nogil=True, error_model="numpy", fastmath={"contract"}
-)(_loop)
+_multiply: Callable[[Array, Array, Array, Array], None] = compiled(_loop, fastmath={"contract"})

@@ -88,6 +88,18 @@ class Coordinates:
             slope[share, second] += 0.5 * value[share]
         return slope
 
+    def ranges(self, value: Array) -> tuple[Array, Array]:
+        """Return the lower and upper bounds (parameters,) of the parameters `value` (parameters,).
+
+        Widths have none: below its floor a Coulomb step is as good as none.
+        """
+        positive = np.array([term_of(name).range == "positive" for name in self.names])
+        lower, upper = np.where(positive, 0.0, -np.inf), np.full(value.size, np.inf)
+        for share, first, second in self._shares:
+            upper[share] = np.sqrt(value[first] * value[second])
+            lower[share] = -upper[share]
+        return lower, upper
+
     @cached_property
     def _either_sign(self) -> Array:
         return np.array([term_of(name).range == "any" for name in self.names])

@@ -29,9 +29,11 @@ from hil.estimator.fit.ripple import WAVES, find_waves
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.fit.stage1 import LinearEstimate
+from hil.estimator.models.bounds import beyond_range, dependent, step_beyond
 from hil.estimator.models.model import Model
 from hil.estimator.models.terms import FRICTIONS, term_of
 from hil.estimator.options import LikelihoodOptions
+from hil.estimator.simulation.back_emf import limited
 
 DEFAULTS = LikelihoodOptions()
 HARDLY = 0.05
@@ -56,6 +58,8 @@ class Fit:
     """Number of samples over which the residual is correlated; 1 is white."""
     iterations: int
     """Number of simulations with derivatives."""
+    at_bound: tuple[str, ...] = ()
+    """Parameters at a bound that the data would exceed, and on which base parameters depend."""
 
 
 @dataclass(frozen=True)
@@ -275,15 +279,33 @@ def _fit(
         minimum.at, errors.scatter, errors.samples, count, errors.structured, errors.expected
     )
     value = objective.coordinates.values(x[:count])
+    widened = by_parameters(covariance, objective.coordinates.slopes(x[:count]), value)
     return Fit(
         value,
-        by_parameters(covariance, objective.coordinates.slopes(x[:count]), value),
+        widened,
         tuple(objective.start(x, run) for run in range(len(periods))),
         positions,
         refined.outliers,
         float(errors.lags),
         minimum.iterations,
+        _at_bound(objective.coordinates, minimum, value, np.sqrt(np.diag(widened))),
     )
+
+
+def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Array) -> tuple[str, ...]:
+    """Return the parameters at a bound that the data would exceed, if base parameters depend on them.
+
+    std: standard errors of the parameters `value` (parameters,).
+    """
+    names = coordinates.names
+    step, white = step_beyond(minimum.at.normal, minimum.at.gradient, coordinates.slopes(minimum.x[: value.size]))
+    known = np.isfinite(std) & (white > 0.0)
+    inflated = float(np.median(std[known] / white[known])) if known.any() else 1.0
+    beyond = beyond_range(value, step, inflated * white, *coordinates.ranges(value))
+    if not (beyond.any() and dependent(names, step, std)):
+        beyond[:] = False
+    late = limited(dict(zip(names, value.tolist(), strict=True)))
+    return tuple(name for name, over in zip(names, beyond, strict=True) if over or name in late)
 
 
 def _tempered(

@@ -8,6 +8,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
+from hil.estimator.models.conflicts import Trust
 from hil.estimator.models.terms import joint_of, kind_of
 from hil.estimator.selection.candidates import Candidate
 from hil.estimator.selection.verdict import (
@@ -18,7 +19,6 @@ from hil.estimator.selection.verdict import (
     USABLE_PREDICTION,
     WEAK,
     WELL_KNOWN,
-    Trust,
     Verdict,
 )
 

@@ -8,12 +8,13 @@ omits (`hil.estimator.selection.candidates.considered`) and for the unexplained 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.identify import Estimate
+from hil.estimator.models.bounds import bound_sentence
+from hil.estimator.models.conflicts import Conflict, Trust, conflict_sentences, contradicted
 from hil.estimator.models.terms import OPTIONS, kind_of
 from hil.estimator.selection.candidates import Candidate
 from hil.estimator.selection.drift import LEAST, Drift, TorqueChange
@@ -21,6 +22,7 @@ from hil.estimator.selection.validation import Validation
 
 EXPLAINED = 1.06  # ratio of residual to noise up to which the model explains the motion
 GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # prediction error relative to the motion's RMS
+LEAST_PERCENT = 0.01  # smallest prediction error that is stated: differences below the noise are not resolved
 MUCH_LEFT = 5.0  # ratio of residual to noise above which parameters are doubtful without a held-out check
 WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
 LITTLE_EFFECT = 0.02  # standard error of a parameter's torque, relative to the joint's, below which it hardly matters
@@ -40,8 +42,6 @@ ODD_HINT = "Its residual on odd lines indicates friction or ripple that the mode
 EVEN_HINT = "Its residual on even lines indicates an effect that depends on direction, or an offset in torque or angle."
 BEYOND_NOISE = 2.0
 
-Trust = Literal["yes", "with care", "no"]
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -57,7 +57,8 @@ class Evidence:
     """Evidence in addition to the estimate and its validation."""
 
     held_out: Array | None = None
-    """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,).
+    """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,), without the noise
+    of the encoders.
 
     Where friction has changed since the fitted motion, the prediction uses one factor per joint taken from the held-out
     motion itself.
@@ -81,12 +82,14 @@ class Evidence:
     """Whether the model was selected from all available terms."""
     torque_limit: str = ""
     """The setting that limited the torque, for advice; "" if the user chose peak_torque."""
+    conflicts: tuple[Conflict, ...] = field(default=())
+    """Values far from what was known beforehand."""
 
 
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:
     """Return the verdict on `estimate`."""
     explained = float(validation.residual_over_floor.max()) <= EXPLAINED
-    trust = _trust(validation, evidence)
+    trust = _trust(validation, evidence, estimate.at_bound)
     sentences = (
         _noise(validation) if explained else _unexplained(estimate, validation, evidence, trust),
         *(() if explained or evidence.disturbances else _distorted(validation)),
@@ -94,6 +97,8 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
         *(() if evidence.disturbances else _drifted(evidence.drift)),
         *_pushed(evidence.torque),
         *_predicted(evidence.held_out, evidence.held_out_as_fitted),
+        *conflict_sentences(evidence.conflicts, explained),
+        *((bound_sentence(estimate.at_bound),) if estimate.at_bound else ()),
         *evidence.doubts,
         *evidence.notes,
         *_weak(validation, evidence.torque_limit),
@@ -103,10 +108,13 @@ def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Ver
     return Verdict(trust, validation.weakest, sentences)
 
 
-def _trust(validation: Validation, evidence: Evidence) -> Trust:
+def _trust(validation: Validation, evidence: Evidence, at_bound: Sequence[str]) -> Trust:
     left = float(validation.residual_over_floor.max())
+    against = contradicted(evidence.conflicts, left <= EXPLAINED)
+    if against == "no":
+        return "no"
     doubtful = any(_is_weak(validation, name) for name in validation.relative_std)
-    doubtful = doubtful or bool(evidence.doubts or evidence.disturbances or evidence.torque)
+    doubtful = doubtful or bool(evidence.doubts or evidence.disturbances or evidence.torque or against or at_bound)
     if evidence.held_out is None:
         if left > MUCH_LEFT:
             return "no"
@@ -259,7 +267,7 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
     if held_out is None:
         return ("It was not validated on a held-out motion: set experiment.held_out = true.",)
     worst = _percent(held_out)
-    said = f"It predicts a held-out motion to within {worst} of that motion's RMS"
+    said = f"It predicts a held-out motion to within {worst} of that motion's RMS, encoder noise not counted"
     if as_fitted is None or _percent(as_fitted) == worst:
         return (f"{said}.",)
     return (
@@ -270,7 +278,7 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
 
 def _percent(error: Array) -> str:
     """The largest of some relative errors in percent, never in exponential notation."""
-    worst = 100.0 * float(error.max())
+    worst = max(100.0 * float(error.max()), LEAST_PERCENT)
     return f"{worst:.2g} %" if worst < 99.5 else f"{worst:.0f} %"
 
 

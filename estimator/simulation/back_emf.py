@@ -15,10 +15,12 @@ Ripple, saturation and load-dependent friction act on the motor's torque, which 
 back-EMF (`hil.estimator.simulation.arm`).
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.models.parameters import CONSTANTS, GENERATED, OWN_INERTIA, VISCOUS, Physics
+from hil.estimator.models.parameters import CONSTANTS, GENERATED, LEAST_INERTIA, OWN_INERTIA, VISCOUS, Physics
 
 _LATE: dict[str, tuple[int, ...]] = {"lag": (0, 1), "delay": (0, 1), "lag_difference_2": (1,)}
 """Joints whose torque is delayed by each of these parameters."""
@@ -77,6 +79,19 @@ def neglected(physics: Physics) -> dict[str, float]:
         lost = float(physics.vector[GENERATED + joint] * physics.late[joint])
         found[CONSTANTS[place]] = lost**2 / (float(physics.vector[place]) + lost)
     return found
+
+
+def limited(parameters: Mapping[str, float]) -> tuple[str, ...]:
+    """Return the names of the back-EMFs that would take more of their joint's inertia than the simulation allows
+    (`LEAST_INERTIA`). The estimated inertia then contains a loss that was not simulated.
+    """
+    physics = Physics.of(parameters)
+    found = []
+    for joint in _generating(physics):
+        lost = float(physics.vector[GENERATED + joint] * physics.late[joint])
+        if lost >= (1.0 - LEAST_INERTIA) * parameters[CONSTANTS[OWN_INERTIA[joint]]]:
+            found.append(f"back_emf_{joint + 1}")
+    return tuple(found)
 
 
 def _generating(physics: Physics) -> list[int]:

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import compiled
 
 
 def motor_torque(
@@ -136,4 +137,4 @@ def _follow(command: Any, j: int, rate: float, lag: float, lagging: Any) -> None
 
 
 _follow = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(_follow)  # type: ignore[call-overload]
-_average: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_average_loop)
+_average: Callable[..., None] = compiled(_average_loop)

@@ -28,7 +28,7 @@ _GEAR = 8.0
 """Largest ratio of a torque constant to the published one: an external gear, or a very bad guess."""
 
 _SPEED = 4.0
-"""Largest ratio of the velocity limit to the no-load speed, at which the back-EMF equals the supply voltage."""
+"""Largest ratio of the velocity limit to the no-load speed at the highest published supply voltage."""
 
 _CURRENT = 2.0
 """Largest ratio of the current limit to the model's stall current."""
@@ -73,11 +73,14 @@ def _joint(joint: "JointConfig") -> Iterator[str]:
             + (_meant(std, unit, joint.torque_per_goal) or f". It is a standard error in {unit}")
             + percent
         )
-    fastest = max(stall.voltage for stall in model.stalls) / model.torque_per_ampere.low
-    if joint.velocity_limit > _SPEED * fastest:
+    volts = max(stall.voltage for stall in model.stalls)
+    fastest = volts / model.back_emf
+    # The stall figures imply an up to twice as fast motor, and files that rely on that are not unit mistakes.
+    most = _SPEED * max(fastest, volts / model.torque_per_ampere.low)
+    if joint.velocity_limit > most:
         yield (
-            f"velocity_limit of {where} = {joint.velocity_limit:g} rad/s: an {joint.model} cannot exceed {fastest:.2g} "
-            f"rad/s{_meant(joint.velocity_limit, 'rad/s', _SPEED * fastest)}"
+            f"velocity_limit of {where} = {joint.velocity_limit:g} rad/s: without load, an {joint.model} turns at "
+            f"{fastest:.2g} rad/s at {volts:g} V{_meant(joint.velocity_limit, 'rad/s', most)}"
         )
     stall = max(stall.voltage if pwm else stall.current for stall in model.stalls)
     if joint.goal_limit > _CURRENT * stall:

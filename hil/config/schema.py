@@ -7,6 +7,7 @@ allowed.
 import math
 import tomllib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from os import PathLike
@@ -328,8 +329,12 @@ def load_config(path: str | PathLike[str]) -> Config:
     return parse_config(text, path)
 
 
-def parse_config(text: str, path: Path) -> Config:
-    """Check the text of a TOML file read from `path`. Raises ConfigError."""
+def parse_config(text: str, path: Path, *, recorded: bool = False) -> Config:
+    """Check the text of a TOML file read from `path`. Raises ConfigError.
+
+    recorded: the file is the copy in a run folder, perhaps that of an older version, whose configurations of spatial
+    arms could contain arm.link_lengths, without effect.
+    """
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -349,11 +354,23 @@ def parse_config(text: str, path: Path) -> Config:
     if isinstance(arm, dict) and isinstance(arm.get("urdf"), str):
         values["arm"] = {**arm, "urdf": str(found_beside(path.parent, arm["urdf"]))}
     try:
+        if recorded and isinstance(arm, dict) and "urdf" in arm and "link_lengths" in arm:
+            return _without_lengths(path, values)
         return Config(path=path, **values)
     except ValidationError as error:
         joints = values.get("joints")
         count = len(joints) if isinstance(joints, list) else None
         raise ConfigError(describe(error, path, Config, joints=count)) from error
+
+
+def _without_lengths(path: Path, values: dict[str, Any]) -> Config:
+    """The configuration without arm.link_lengths for a spatial arm; they belong to a planar one."""
+    lengths = {key: value for key, value in values["arm"].items() if key != "link_lengths"}
+    with suppress(ValidationError):
+        spatial = Config(path=path, **{**values, "arm": lengths})
+        if spatial.is_chain:
+            return spatial
+    return Config(path=path, **values)
 
 
 def _same_length(key: str, values: list[float] | list[list[int]], count: int) -> None:

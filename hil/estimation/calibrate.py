@@ -150,7 +150,7 @@ def _described_chain(config: Config, found: ChainCalibration) -> CalibrationResu
         },
         fit=CalibrationFit(
             residual_rms_ticks=tuple(map(tuple, steps.tolist())),
-            misfit=float(np.mean((steps / found.estimate.noise_steps) ** 2)),
+            misfit=found.misfit,
             joints=len(config.joints),
             reached=found.estimate.reached,
         ),

@@ -23,6 +23,8 @@ from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.model.tilt import TILT, tilt_between
 from hil.estimator.chain.simulation.prediction import predict
+from hil.estimator.models.bounds import bound_sentence
+from hil.estimator.models.conflicts import Trust, conflict_sentences, contradicted, lowered
 from hil.fakes.plants.arm import armature
 from hil.plan.chain_model import KnownChain, known_chain
 from hil.plan.plan import HELD_OUT, IDENTIFY
@@ -51,16 +53,17 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
         choice = choose_chain(period, model, known.prior)
         estimate = choice.estimate
     else:
-        choice, estimate = None, identify_chain(period, model, known.prior)
+        choice, estimate = None, identify_chain(period, model, known.prior, test_zeros=True)
     model = estimate.model
     played = {IDENTIFY: PlayedPeriod(period.rate, period.torque, period.position, estimate.position)}
+    beyond = None
     if HELD_OUT in facts.segments:
         with suppress(RecordingCutShort):  # stopped in the held-out part: what was finished is estimated
             other = settled_period(config, facts, samples, HELD_OUT)
             predicted = predict(model, estimate.parameters, other)
             played[HELD_OUT] = PlayedPeriod(other.rate, other.torque, other.position, predicted)
+            beyond = played[HELD_OUT].error_beyond(other.noise)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
-    beyond = None if held_out is None else _beyond_noise(played[HELD_OUT], estimate)
     seconds = round(time.perf_counter() - started, 3)
     linear = len(model.linear_names)
     result = SettledResult(
@@ -172,12 +175,6 @@ def unmoved(config: Config, position: NDArray[np.float64]) -> list[str]:
     return [joint.name for joint, each in zip(config.joints, reach, strict=True) if each < UNMOVED]
 
 
-def _beyond_noise(played: PlayedPeriod, estimate: ChainEstimate) -> NDArray[np.float64]:
-    """Relative prediction error of each joint without the noise of its encoder, which no model predicts (joints,)."""
-    noise = estimate.noise_steps * estimate.position_step / np.nanstd(played.position, axis=1)
-    return np.asarray(np.sqrt(np.maximum(played.relative_error**2 - noise**2, 0.0)))
-
-
 def _verdict(
     config: Config,
     estimate: ChainEstimate,
@@ -190,16 +187,19 @@ def _verdict(
     count = known.base.count
     certain = estimate.std[:count] / known.prior.std
     weakest = known.base.names[int(np.argmax(certain))]
-    over = estimate.over_noise
+    explained = is_explained(estimate)
     sentences = [_unexplained(config, estimate)]
-    trust = "yes" if over.max() <= EXPLAINED and estimate.systematic <= SYSTEMATIC else "with care"
+    trust: Trust = "yes" if explained else "with care"
     if held_out is None:
         sentences.append("No second path was recorded, so the prediction could not be validated.")
         trust = "with care"
     else:
         error = float(np.max(held_out))
         joint = config.joints[int(np.argmax(held_out))].name
-        sentences.append(f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst.")
+        sentences.append(
+            f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst, encoder noise "
+            "not counted."
+        )
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
     if estimate.doubtful_zeros:
         trust = "with care" if trust == "yes" else trust
@@ -229,6 +229,11 @@ def _verdict(
             "The fit stopped short of its minimum, where a joint sticks and breaks away; the standard errors include "
             "the distance that remains. Use faster motion ([joint_path]), so that fewer joints stick."
         )
+    if estimate.at_bound:
+        trust = "with care" if trust == "yes" else trust
+        sentences.append(bound_sentence(estimate.at_bound))
+    trust = lowered(trust, contradicted(estimate.conflicts, explained))
+    sentences += conflict_sentences(estimate.conflicts, explained)
     if estimate.unseen:
         sentences.append(
             f"In this motion gravity does not reveal {', '.join(estimate.unseen)}: they are not identifiable, and are "
@@ -265,6 +270,11 @@ def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_p
     )
 
 
+def is_explained(estimate: ChainEstimate) -> bool:
+    """Whether the residual is noise, so that no effect is known to be missing from the model."""
+    return float(estimate.over_noise.max()) <= EXPLAINED and estimate.systematic <= SYSTEMATIC
+
+
 def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     """How large the residual is compared with the noise, and what that says about the model."""
     over, joint = float(estimate.over_noise.max()), int(np.argmax(estimate.over_noise))
@@ -275,7 +285,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
         else "encoder rounding"
     )
     said = f"The residual of {config.joints[joint].name} is the largest: {over:.2f} times {measured};"
-    if over <= EXPLAINED and estimate.systematic <= SYSTEMATIC:
+    if is_explained(estimate):
         return f"{said} nothing remains unexplained."
     causes = "torque ripple or cogging, play or elasticity of the gears, a cable, friction that changes with time"
     if not estimate.model.base_tilt and np.any(estimate.model.base.chain.gravity):

@@ -4,6 +4,7 @@ import numpy as np
 
 from hil.config.schema import Config
 from hil.estimator.identify import Estimate
+from hil.estimator.models.conflicts import Conflict, conflicts
 
 DEVIATIONS = 4.0  # standard errors
 LENGTH_TOLERANCE = 0.05  # relative; link lengths are measured with a ruler
@@ -13,7 +14,7 @@ RATIO = 0.35  # largest plausible deviation of a torque constant ratio from 1
 
 def doubts(config: Config, estimate: Estimate, largest_torque: float) -> tuple[str, ...]:
     """One sentence per contradiction; `largest_torque` is the largest commanded torque [N m]."""
-    found = [*_length(config, estimate), *_weight(config, estimate, largest_torque), *_constants(estimate)]
+    found = [*_length(config, estimate), *_weight(config, estimate, largest_torque), *_constants(config, estimate)]
     return tuple(found)
 
 
@@ -57,10 +58,19 @@ def _weight(config: Config, estimate: Estimate, largest_torque: float) -> list[s
     return said
 
 
-def _constants(estimate: Estimate) -> list[str]:
+def conflicts_of(config: Config, estimate: Estimate) -> tuple[Conflict, ...]:
+    """Values of `estimate` that are far from what the configuration and typical servos imply."""
+    unsure = [joint.torque_per_goal_std / joint.torque_per_goal for joint in config.joints]
+    given = {"torque_scale_2": float(np.linalg.norm(unsure))} if len(unsure) == 2 and all(unsure) else {}
+    return conflicts(estimate.names, estimate.value, estimate.std, given)
+
+
+def _constants(config: Config, estimate: Estimate) -> list[str]:
     ratio = estimate.parameters.get("torque_scale_2", 1.0)
     if abs(np.log(max(ratio, 1e-6))) < np.log1p(RATIO):
         return []
+    if any(each.name == "torque_scale_2" for each in conflicts_of(config, estimate)):
+        return []  # says so itself
     return [
         f"The torque of joint 2 appears to be {ratio:.2g} times what its torque constant implies: check the model "
         "and the torque_constant of both joints."

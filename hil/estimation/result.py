@@ -74,6 +74,7 @@ def arm_facts(config: Config) -> ArmFacts:
             goal_limit=joint.goal_limit,
             position_limit=(joint.position_limit[0], joint.position_limit[1]),
             velocity_limit=joint.velocity_limit,
+            servos=len(joint.ids),
         )
         for joint in config.joints
     )

@@ -14,7 +14,7 @@ from hil.estimation.chain_estimate import estimate_chain_run
 from hil.estimation.model_from_config import lever_of, voltage_driven, wanted_model
 from hil.estimation.physical import physical_of
 from hil.estimation.pilot_limit import torque_limit
-from hil.estimation.plausibility import doubts
+from hil.estimation.plausibility import conflicts_of, doubts
 from hil.estimation.result import Checks, make_result
 from hil.estimation.result_checks import describe_choice, describe_validation, describe_verdict
 from hil.estimation.settled_period import settled_period
@@ -84,13 +84,14 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
         played[HELD_OUT] = _predicted(estimate, other, drift, is_corrected)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     as_fitted = _as_fitted(estimate, other, drift)
+    beyond = None if other is None else played[HELD_OUT].error_beyond(other.noise)
     validation = validate(period, estimate)
     wrong = doubts(config, estimate, float(np.abs(period.torque).max()))
     notes = supply_notes(config, supply_sag(config, samples))
     limit = torque_limit(config, samples)
     evidence = Evidence(
-        held_out,
-        as_fitted,
+        beyond,
+        _as_fitted(estimate, other, drift, beyond_noise=True),
         left_out,
         drift,
         torque,
@@ -99,6 +100,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
         notes,
         tried_all=choice is not None,
         torque_limit=limit,
+        conflicts=conflicts_of(config, estimate),
     )
     judged = judge(estimate, validation, evidence)
     checks = Checks(
@@ -161,13 +163,16 @@ def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift | None, is
     return PlayedPeriod(other.rate, other.torque, other.position, predicted)
 
 
-def _as_fitted(estimate: Estimate, other: SettledPeriod | None, drift: Drift | None) -> NDArray[np.float64] | None:
+def _as_fitted(
+    estimate: Estimate, other: SettledPeriod | None, drift: Drift | None, *, beyond_noise: bool = False
+) -> NDArray[np.float64] | None:
     """Relative prediction error of the held-out period with the friction of the fitted period; None if it did not
-    change.
+    change. beyond_noise: without the noise of the encoders.
     """
     if other is None or drift is None or not drift.is_seen:
         return None
-    return relative_error(other.position, predict_period(estimate, other))
+    noise = other.noise if beyond_noise else None
+    return relative_error(other.position, predict_period(estimate, other), noise)
 
 
 def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDArray[np.float64]:

@@ -6,7 +6,6 @@ commanded (`work`). Everything known about a joint is in one record of the type 
 """
 
 from collections.abc import Callable
-from pathlib import Path
 from struct import Struct
 from typing import Any
 
@@ -174,5 +173,4 @@ def _look_loop(
 
 _inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
 _may_be_outside, _fault = map(_inner, (_may_be_outside, _fault))
-_SOURCES = [Path(__file__).with_name(f"{name}.py") for name in ("consistency", "following", "work")]
-_look: Callable[..., int] = compiled(_look_loop, sources=_SOURCES)
+_look: Callable[..., int] = compiled(_look_loop)

@@ -20,7 +20,7 @@ from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
 from hil.plan.chain_plan import check_clearance, plan_of
 from hil.plan.plan import Plan
-from hil.rest_pose_hint import rest_pose_hint
+from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.runs.background import Background
 from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
@@ -266,7 +266,7 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
         _check_inside(config, bus)
     tolerance = config.rest_tolerance * (_MOVED if has_moved() else 1.0)
     or_there = " If that is where the arm lies without torque, set arm.rest_pose to it." if config.is_chain else ""
-    for joint, position, rest in zip(bus.joints, bus.read_positions(), config.arm.rest_pose, strict=True):
+    for joint, position, rest in zip(bus.joints, _positions(config, bus), config.arm.rest_pose, strict=True):
         if abs(position - rest) > tolerance:
             ticks = joint.zero_ticks + round((position - rest) / joint.position_unit)
             raise ExperimentError(
@@ -275,11 +275,17 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
             )
 
 
+def _positions(config: Config, bus: ServoBus) -> list[float]:
+    """Each joint's angle [rad], for a joint that fell within its position limits."""
+    read = zip(bus.read_positions(), config.joints, strict=True)
+    return [within_limits(position, joint.position_limit) for position, joint in read]
+
+
 def _check_inside(config: Config, bus: ServoBus) -> None:
     """Refuse an arm that the previous run left far beyond its limits, such as an upright one that fell without
     torque.
     """
-    for joint, position, limited in zip(bus.joints, bus.read_positions(), config.joints, strict=True):
+    for joint, position, limited in zip(bus.joints, _positions(config, bus), config.joints, strict=True):
         low, high = limited.position_limit
         if not low - MOST_OUTSIDE_RAD <= position <= high + MOST_OUTSIDE_RAD:
             raise ExperimentError(

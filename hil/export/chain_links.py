@@ -105,14 +105,15 @@ def _same_word(one: str, other: str) -> bool:
 
 
 def _rotor(model: ChainArmModel, number: int) -> float:
-    """A joint's rotor inertia [kg m^2]: as identified or, where it is part of a sum, as usual for its servo.
+    """A joint's rotor inertia [kg m^2]: as identified or, where it is part of a sum, as usual for its servos.
 
     A guess that is far too small would be made up for by a link that is far too heavy.
     """
     if (known := model.values.get(f"armature_{number}", 0.0)) > 0.0:
         return known
     try:
-        return servo_prior(servo_model(model.joints[number - 1].servo)).armature.median
+        joint = model.joints[number - 1]
+        return joint.servos * servo_prior(servo_model(joint.servo)).armature.median
     except DriverError:  # recordings of an unknown servo
         return 0.5 * ARMATURE
 

@@ -25,6 +25,7 @@ from hil.runs.background import Background
 from hil.runs.file_size import check_array
 
 _CHUNK_BYTES = 1 << 20
+_SMALL_BYTES = 4 << 20  # of a file next to the recording that is kept in memory meanwhile
 _POPULATE_WRITE = 23  # MADV_POPULATE_WRITE
 _TOUCH_S = 1.0
 _libc = ctypes.CDLL(None)
@@ -88,6 +89,7 @@ class Recorder:
         try:
             self._samples: NDArray[np.void] = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=(capacity,))
             _reserve(path)
+            self._beside = _small_files(path)
         except OSError as error:
             with contextlib.suppress(OSError):
                 path.unlink()  # a part of it could not be reserved
@@ -142,7 +144,8 @@ class Recorder:
     def close(self) -> None:
         """Truncate the file to the recorded rows; may be called again.
 
-        Raises RunFolderError if the file was removed or renamed in the meantime; its rows are then saved in a new file.
+        Raises RunFolderError if the file was removed or renamed in the meantime; its rows are then saved in a new file,
+        together with the configuration and the other files that were there when the recording began.
         """
         if self._bytes.nbytes == 0:
             return
@@ -161,11 +164,14 @@ class Recorder:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             np.save(self._path, self._samples)
+            for name, contents in self._beside.items():
+                if not (folder / name).exists():
+                    (folder / name).write_bytes(contents)
         except OSError as error:
             raise RunFolderError(f"{said}, and its samples cannot be saved to a new file: {error.strerror}.") from error
         raise RunFolderError(
-            f"{said}. Its {self.count} samples have been saved to a new file, {self._path}, but estimating from them "
-            "also needs the config.toml and run.json of the folder that is missing."
+            f"{said}. Its {self.count} samples have been saved again in {folder}, with the configuration as it was "
+            "when the recording began."
         )
 
     def _touch(self, first: int) -> None:
@@ -178,6 +184,12 @@ class Recorder:
         page = start - start % mmap.PAGESIZE
         # Kernels before 5.14 do not support this; the pages are then mapped by the writes themselves.
         _libc.madvise(ctypes.c_void_p(page), ctypes.c_size_t(start + chunk.nbytes - page), _POPULATE_WRITE)
+
+
+def _small_files(path: Path) -> dict[str, bytes]:
+    """Contents of the files next to the recording `path`, such as the configuration, by name."""
+    files = (each for each in path.parent.iterdir() if each != path and each.is_file())
+    return {each.name: each.read_bytes() for each in files if each.stat().st_size <= _SMALL_BYTES}
 
 
 def _cut(path: Path, samples: NDArray[np.void], count: int) -> NDArray[np.void]:

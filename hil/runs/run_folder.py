@@ -206,7 +206,7 @@ class RunFolder:
         except (OSError, UnicodeDecodeError) as error:
             reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
             raise RunFolderError(f"{self.config_path} cannot be read: {reason}.") from error
-        config = parse_config(text, self.config_path)
+        config = parse_config(text, self.config_path, recorded=True)
         if not self.played_path.is_file():
             return config
         played: dict[str, Any] = {}

@@ -20,7 +20,7 @@ from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNI
 from hil.errors import ConfigError
 from hil.plan.chain_plan import check_rest_pose
 from hil.plan.stabiliser import too_slow
-from hil.rest_pose_hint import rest_pose_hint
+from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.setup.bus_rate import check_rate, goals_taken
 from hil.setup.others import others_on_the_bus
 from hil.setup.servo_session import recover
@@ -327,7 +327,7 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     index = [joint.id in each.ids for each in config.joints].index(True)
     if joint.id != config.joints[index].id:
         return Level.OK, "pose", f"determined by the first servo (ID {config.joints[index].id})", ""
-    angle = joint.within_turn(ticks).angle(ticks)
+    angle = within_limits(joint.within_turn(ticks).angle(ticks), config.joints[index].position_limit)
     rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
     fix = f"arm.rest_pose is {rest:.3f} rad, arm.rest_tolerance allows {config.rest_tolerance:g}. " + rest_pose_hint(

@@ -246,7 +246,7 @@ def test_a_late_answer_is_not_taken_for_the_next_one(late_by: str, fast: bool) -
     late = answer(1, 0, 0, 10) + answer(2, 0, 0, 11)
     if fast:
         late = fast_answer((1, 0, state(0, 0, 10)), (2, 0, state(0, 0, 11)))
-    data = [struct.pack("<Hxxxxhii", 500, 0, 0, position) for position in (20, 21)]
+    data = [b"\x00" + state(0, 0, position) for position in (20, 21)]
     fresh = b"".join(encode_status(i, 0, d) for i, d in zip((1, 2), data, strict=True))
     if fast:
         fresh = fast_answer((1, 0, data[0]), (2, 0, data[1]))
@@ -255,23 +255,52 @@ def test_a_late_answer_is_not_taken_for_the_next_one(late_by: str, fast: bool) -
     assert list(cycle([0, 0]).servos) == [None, None]
     if late_by == "before the next cycle":
         wire.waiting = late
-    # The request after a loss asks for other registers too, so that answers to the lost one are known by their length.
+    # The request after a loss asks for one more byte, so that answers to the lost one are known by their length.
     reply = cycle([0, 0])
-    assert (reply.span, reply.servos) == (1, [(0, 500, 0, 0, 20), (0, 500, 0, 0, 21)])
+    assert (reply.span, reply.servos) == (0, [(0, 0, 0, 20), (0, 0, 0, 21)])
 
 
-def test_after_a_loss_in_a_slow_turn_the_usual_registers_are_asked_for() -> None:
+def asked(wire: Wire) -> list[int]:
+    """Number of bytes that each request asks every servo for."""
+    reads = [packet for sent in wire.written for packet in Framer().feed(sent) if packet.instruction != 0x83]
+    return [int.from_bytes(read.body[2:4], "little") for read in reads]
+
+
+@pytest.mark.parametrize("modes", [Mode.CURRENT, Mode.PWM])
+@pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize("cycles_late", [1, 2, 3, 4])
+def test_replies_that_are_all_some_cycles_late_are_never_taken_for_new_ones(
+    cycles_late: int, fast: bool, modes: Mode
+) -> None:
+    """Each arrives while another request is waited for; the positions tell to which one it belongs."""
+    tables = [XM430] * 2
     wire = Wire()
-    cycle = exchange(wire).cycle
-    assert [cycle([0, 0]).span for _ in range(4)] == [0, 1, 0, 2]
+    cycles = Exchange(wire, (1, 2), XM430["Goal Current"], spans(modes, tables), 0.0, fast=fast, slow_every=1000)
+    for _ in range(12):
+        cycles.cycle([0, 0])
+    every = asked(wire)
+    for number, size in enumerate(every[:-cycles_late]):
+        assert size != every[number + cycles_late], "a late reply has the length of the one waited for"
+    wire = Wire([b""] * cycles_late + [_padded(size, at, fast) for at, size in enumerate(every)])
+    cycles = Exchange(wire, (1, 2), XM430["Goal Current"], spans(modes, tables), 0.0, fast=fast, slow_every=1000)
+    assert [list(cycles.cycle([0, 0]).servos) for _ in range(12)] == [[None, None]] * 12
+
+
+def _padded(size: int, position: int, fast: bool) -> bytes:
+    data = bytes(size - 4) + struct.pack("<i", position)
+    if fast:
+        return fast_answer((1, 0, data), (2, 0, data))
+    return encode_status(1, 0, data) + encode_status(2, 0, data)
 
 
 def test_after_a_loss_and_an_answer_the_usual_registers_are_asked_for_again() -> None:
-    with_tick = struct.pack("<Hxxxxhii", 500, 0, 0, 1)
+    longer = b"\x00" + state(1, 1, 1)
     good = answer(1, 0, 0, 1) + answer(2, 0, 0, 1)
-    wire = Wire([b"", encode_status(1, 0, with_tick) + encode_status(2, 0, with_tick), good, good])
+    wire = Wire([b"", encode_status(1, 0, longer) + encode_status(2, 0, longer), good, good])
     cycle = exchange(wire).cycle
-    assert [cycle([0, 0]).span for _ in range(4)] == [0, 1, 0, 0]
+    for _ in range(4):
+        cycle([0, 0])
+    assert asked(wire) == [10, 11, 10, 10]
 
 
 @pytest.mark.parametrize(("count", "at_most_s"), [(2, 3e-3), (6, 4.5e-3)])

@@ -55,6 +55,35 @@ def test_missing_samples_are_bridged_and_single_passes_say_nothing() -> None:
     assert repeated_noise([one[:, :20], other[:, :20]], STEP) is None
 
 
+@pytest.mark.parametrize("lost", [0.05, 0.15])
+def test_lost_samples_do_not_make_the_noise_smaller(lost: float) -> None:
+    """Interpolated samples have less fast noise than received ones."""
+    several = passes(0.8, 6)
+    for index, each in enumerate(several):
+        each[np.random.default_rng(index).random(each.shape) < lost] = np.nan
+    found = repeated_noise(several, STEP)
+    assert found is not None
+    np.testing.assert_allclose(found / STEP, np.sqrt(1.0 / 12.0 + 0.8**2), rtol=0.04)
+    one = several[0] - fast_motion() * STEP[:, None]
+    valid = np.isfinite(one)
+    index = np.arange(SAMPLES)
+    filled = np.stack([np.interp(index, index[on], row[on]) for row, on in zip(one, valid, strict=True)])
+    np.testing.assert_allclose(white_noise(filled, valid) / STEP, np.sqrt(1.0 / 12.0 + 0.8**2), rtol=0.06)
+
+
+@pytest.mark.parametrize("std", [0.0, 0.13, 0.5])
+@pytest.mark.parametrize("drift", [0.3, 1.0, 3.0])
+def test_drift_is_not_noise(std: float, drift: float) -> None:
+    """A slow change from pass to pass rounds them differently, without any noise."""
+    rng = np.random.default_rng(7)
+    shape = 1.0 + 0.5 * np.sin(2.0 * np.pi * 3.0 * np.arange(SAMPLES) / SAMPLES)
+    moved = [fast_motion() + each * drift * shape for each in range(5)]
+    several = [np.round(each + std * rng.standard_normal(each.shape)) * STEP[:, None] for each in moved]
+    found = repeated_noise(several, STEP)
+    assert found is not None
+    np.testing.assert_allclose(found / STEP, np.sqrt(1.0 / 12.0 + std**2), rtol=0.1)
+
+
 def test_two_measurements_are_averaged_where_they_agree() -> None:
     white, repeated = np.array([1.0, 3.0, 1.0]), np.array([1.05, 1.0, 3.0])
     found = agreed_noise(white, repeated, SAMPLES)

@@ -90,11 +90,11 @@ def blocks(title: str) -> list[tuple[str, str]]:
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """A copy of the code that may be changed."""
-    unwanted = shutil.ignore_patterns("__pycache__", *FOLDERS)
+    """A copy of the code that may be changed, with the compiled loops: it recompiles only what changes."""
+    unwanted = shutil.ignore_patterns("*.pyc", *FOLDERS)
     shutil.copytree(ROOT / "hil", tmp_path / "hil", ignore=unwanted)
     for folder in FOLDERS:
-        shutil.copytree(ROOT / folder, tmp_path / "hil" / folder, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / folder, tmp_path / "hil" / folder, ignore=shutil.ignore_patterns("*.pyc"))
     (tmp_path / "hil" / "configs").unlink(missing_ok=True)
     return tmp_path
 

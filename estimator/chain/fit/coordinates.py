@@ -67,13 +67,13 @@ class ChainCoordinates:
 
     def values(self, x: Array) -> Array:
         """Return the parameters (parameters,) at the coordinates `x`."""
-        value: Array = np.where(self._positive, np.exp(np.where(self._positive, x, 0.0)), x * self._scales)
+        value: Array = np.where(self.positive, np.exp(np.where(self.positive, x, 0.0)), x * self._scales)
         return value
 
     def coordinates(self, value: Array) -> Array:
         """Return the coordinates of `value` (parameters,), moved into the physical range."""
-        positive = np.log(np.where(self._positive, np.maximum(value, self._least), 1.0))
-        x: Array = np.where(self._positive, positive, value / self._scales)
+        positive = np.log(np.where(self.positive, np.maximum(value, self._least), 1.0))
+        x: Array = np.where(self.positive, positive, value / self._scales)
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
@@ -107,7 +107,7 @@ class ChainCoordinates:
 
     def slopes(self, x: Array) -> Array:
         """Return the derivative of each parameter with respect to its coordinate (parameters,)."""
-        slope: Array = np.where(self._positive, self.values(x), self._scales)
+        slope: Array = np.where(self.positive, self.values(x), self._scales)
         return slope
 
     def limit(self, x: Array, reach: float, least: Array, most: Array) -> None:
@@ -145,7 +145,8 @@ class ChainCoordinates:
         return tuple(kind_of(name) for name in self.names)
 
     @cached_property
-    def _positive(self) -> Array:
+    def positive(self) -> Array:
+        """Whether each parameter is positive (parameters,)."""
         return np.array([kind in POSITIVE for kind in self._kinds])
 
     @cached_property

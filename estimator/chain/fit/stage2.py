@@ -26,6 +26,7 @@ from hil.estimator.chain.fit.resolved_widths import resolved_widths
 from hil.estimator.chain.fit.stage1 import ChainLinear
 from hil.estimator.chain.fit.uncertainty import coloured_covariance, neglected_covariance
 from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
+from hil.estimator.chain.model.late_torque import limited
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
@@ -38,6 +39,7 @@ from hil.estimator.fit.covariance import (
 )
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.noise_weights import noise_weights
+from hil.estimator.models.bounds import MOVED, beyond_range
 from hil.estimator.options import CoordinateOptions, CovarianceOptions, MinimiserOptions
 from hil.estimator.simulation.arm import steps_per_sample
 
@@ -75,6 +77,8 @@ class ChainOptions:
     """Initial widths of further fits, tried as long as no fit explains the motion [rad/s]."""
     poor: float = 1.2
     """Root of the mean weighted squared residual above which a second start is made: 1 is noise alone."""
+    test_zeros: bool = False
+    """Whether encoder zeros that the model holds are tested, which takes one more simulation with sensitivities."""
     min_initial_lag: float = 5e-4
     """Minimum initial guess of the lag [s]."""
     reach: float = 0.3
@@ -137,8 +141,12 @@ class ChainFit:
     """Decrease of the sum of squares that is expected from one more step, the one that would reach the minimum."""
     neglected: Array
     """Covariance due to what the model of voltage-driven joints neglects (parameters, parameters) [SI]."""
+    at_bound: tuple[str, ...] = ()
+    """Parameters at a bound that the data would exceed, and on which base parameters depend."""
     held_zeros: HeldZeros | None = None
-    """What the recording says about encoder zeros that the model holds; None if it fits them or has one joint."""
+    """What the recording says about encoder zeros that the model holds; None if it fits them, has one joint, or this
+    was not asked for.
+    """
 
     @property
     def total_covariance(self) -> Array:
@@ -203,7 +211,7 @@ def fit_periods(
             pass  # what remains widens the standard errors
         else:
             spent += minimum.iterations
-    return _fit(last, minimum, outliers, COVARIANCE, spent)
+    return _fit(last, minimum, outliers, COVARIANCE, spent, options.test_zeros and not model.zeros)
 
 
 def _started(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
@@ -377,6 +385,7 @@ def _fit(
     outliers: int,
     options: CovarianceOptions,
     iterations: int,
+    test_zeros: bool,
 ) -> ChainFit:
     x, count = minimum.x, problem.count
     positions = problem.positions(x)
@@ -398,10 +407,11 @@ def _fit(
         covariance = _larger(covariance, robust)
     step, decrease = remaining(minimum, problem.coordinates)
     value = problem.coordinates.values(x[:count])
+    widened, missing = by_parameters(covariance, slopes, value), slopes @ step[:count]
     return ChainFit(
         value,
-        by_parameters(covariance, slopes, value),
-        slopes @ step[:count],
+        widened,
+        missing,
         by_parameters(white, slopes, value),
         tuple(problem.start(x, index) for index in range(len(problem.periods))),
         positions,
@@ -411,8 +421,23 @@ def _fit(
         problem.softness,
         decrease,
         neglected_covariance(problem, x),
-        None if problem.model.zeros or problem.model.joints == 1 else held_zeros(problem, x, decrease),
+        _at_bound(problem, value, missing, np.sqrt(np.diag(widened))),
+        held_zeros(problem, x, decrease) if test_zeros and problem.model.joints > 1 else None,
     )
+
+
+def _at_bound(problem: ChainProblem, value: Array, missing: Array, std: Array) -> tuple[str, ...]:
+    """Return the parameters at a bound that the data would exceed, if base parameters depend on them.
+
+    missing: undamped step of the parameters; std: their standard errors at the minimum (parameters,).
+    """
+    names, base = problem.coordinates.names, problem.model.base
+    found = list(limited(base, dict(zip(names, value.tolist(), strict=True)), std))
+    if np.any(np.abs(missing[: base.count]) > MOVED * std[: base.count]):
+        lower = np.where(problem.coordinates.positive, 0.0, -np.inf)
+        beyond = beyond_range(value, missing, std, lower, np.full(value.size, np.inf))
+        found += [name for name, over in zip(names, beyond, strict=True) if over]
+    return tuple(found)
 
 
 def _larger(one: Array, other: Array) -> Array:

@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.geometry import LINK_TERMS, Chain
 from hil.estimator.chain.model.kernels import accelerate, differentiate, move, place, regress, room
+from hil.estimator.compiled import compiled
 from hil.estimator.errors import ShapeError
 
 TERMS = len(LINK_TERMS) + 1
@@ -140,5 +140,5 @@ def _regressor_loop(
         regress(column, a[k], work, Y[k])
 
 
-_inverse: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_inverse_loop)
-_regressors: Callable[..., None] = numba.njit(cache=True, nogil=True, error_model="numpy")(_regressor_loop)
+_inverse: Callable[..., None] = compiled(_inverse_loop)
+_regressors: Callable[..., None] = compiled(_regressor_loop)

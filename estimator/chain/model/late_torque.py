@@ -46,6 +46,22 @@ def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[
     return {joint: possible * share * viscous * late for joint, share, viscous, late in generating}
 
 
+def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -> tuple[str, ...]:
+    """Return the names of the lagging back-EMFs that would take more inertia than the simulation allows.
+
+    The estimated inertias then contain a loss that was not simulated, or less of it. A back-EMF is only named if that
+    loss exceeds the standard errors (base parameters or more,) of what the joint's rotor contributes to.
+    """
+    generating = _generating(base.chain.joints, parameters)
+    if _possible(base, parameters, generating) == 1.0:
+        return ()
+    return tuple(
+        f"back_emf_{joint + 1}"
+        for joint, share, viscous, late in generating
+        if np.any(np.abs(share * viscous * late * rotor(base, joint)) > std[: base.count])
+    )
+
+
 def rotor(base: BaseParameters, joint: int) -> Array:
     """Return the base parameters of a unit rotor inertia of a joint, counted from 0 (base parameters,)."""
     column: Array = base.grouping[:, TERMS * joint + _ARMATURE]

@@ -157,7 +157,9 @@ def _fit(result: SettledResult) -> list[str]:
         errors = ", ".join(f"{100 * value:.2f} %" for value in held_out)
         what = "path" if result.chain is not None else "multisine"
         how = "Closed-loop" if result.stabiliser is not None or result.chain is not None else "Open-loop"
-        lines.append(f"{how} prediction of a held-out {what}: error {errors} of the motion's RMS.")
+        lines.append(
+            f"{how} prediction of a held-out {what}: error {errors} of the motion's RMS, encoder noise included."
+        )
     return lines
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
 
 Array = NDArray[np.float64]
@@ -39,8 +40,12 @@ def jump_warnings(config: Config, facts: RunFacts, samples: NDArray[np.void]) ->
 
 
 def jump_disturbances(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tuple[str, ...]:
-    """A sentence for the verdict that names the joints whose position jumped, if any."""
-    found = zip(config.joints, _jumps(config, facts, samples), strict=True)
+    """A sentence for the verdict that names the joints whose position jumped, if any.
+
+    Jumps after the last multisine do not count: nothing after it is used.
+    """
+    used = np.flatnonzero(samples["phase"] == Phase.PERIODIC)
+    found = zip(config.joints, _jumps(config, facts, samples[: used[-1] + 1 if used.size else 0]), strict=True)
     names = [joint.name for joint, jumps in found if jumps]
     if not names:
         return ()

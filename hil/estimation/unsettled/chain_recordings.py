@@ -23,6 +23,8 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.recordings import MotionPiece, RecordedChain, identify_recordings, torque_error
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
+from hil.estimator.models.bounds import bound_sentence
+from hil.estimator.models.conflicts import Trust, conflict_sentences, contradicted, lowered
 from hil.results.parts import ChainFacts, Covariance, Quantity, ShootingFit, Timing, Validation, Verdict
 from hil.results.result import ShootingResult
 
@@ -159,7 +161,8 @@ def _method(found: RecordedChain) -> str:
 def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, prior: Prior) -> Verdict:
     names = found.model.base.names
     weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
-    trust, sentences = "yes", []
+    trust: Trust = "yes"
+    sentences = []
     if found.simulated:
         worst = float(found.residual_over_noise.max())
         joint = arm.joints[int(np.argmax(found.residual_over_noise))].name
@@ -197,6 +200,15 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     if said := vague(prior, names, found.std, found.from_prior):
         trust = "with care" if trust == "yes" else trust
         sentences.append(said)
+    if found.at_bound:
+        trust = "with care" if trust == "yes" else trust
+        sentences.append(bound_sentence(found.at_bound))
+    # A regression says nothing about missing effects.
+    explained = not found.simulated or (
+        float(found.residual_over_noise.max()) <= EXPLAINED and found.systematic <= SYSTEMATIC
+    )
+    trust = lowered(trust, contradicted(found.conflicts, explained))
+    sentences += conflict_sentences(found.conflicts, explained)
     if not found.reached:
         trust = "with care" if trust == "yes" else trust
         sentences.append(

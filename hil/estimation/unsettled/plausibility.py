@@ -6,7 +6,9 @@ import numpy as np
 
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
+from hil.estimator.models.bounds import bound_sentence
 from hil.estimator.models.terms import kind_of, term_of
+from hil.estimator.simulation.back_emf import limited
 
 TORQUE = (2e-3, 60.0)  # N m: the largest torque of the smallest and of the largest servos (PH54: 45 N m continuous)
 PENDULUM = (3e-3, 3.0)  # m: length of a pendulum with the joint's inertia and gravity
@@ -17,7 +19,13 @@ SHOWN = 1e-3  # of the largest torque of a joint, or of a ratio: less counts as 
 
 def implausible(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: float) -> list[str]:
     """One sentence for each impossible value. gravity: in the arm's plane [m/s^2]."""
-    return [*_torques(recordings), *_pendulum(estimate, gravity), *_weight(estimate, gravity)]
+    late = limited(estimate.parameters)
+    return [
+        *_torques(recordings),
+        *_pendulum(estimate, gravity),
+        *_weight(estimate, gravity),
+        *([bound_sentence(late)] if late else []),
+    ]
 
 
 def undetermined(estimate: ShootingEstimate) -> list[str]:

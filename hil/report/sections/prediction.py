@@ -20,7 +20,7 @@ def prediction(data: RunData) -> Section | None:
     if data.held_out is not None:
         for joint, name in enumerate(data.names):
             error = percent(float(data.held_out.relative_error[joint]))
-            said = f"held-out motion; prediction error is {error} of the motion's RMS"
+            said = f"held-out motion; prediction error is {error} of the motion's RMS, encoder noise included"
             pictures.append(_position(data.held_out, joint, name, "held out", said))
     words = (
         "The first pictures show the settled period that the model was fitted to. A residual that looks like noise "

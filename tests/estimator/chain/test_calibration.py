@@ -38,6 +38,9 @@ def test_wrong_torque_constants_are_found_and_the_parameters_are_in_true_units(s
     large = np.abs(setup.truth) > 0.1 * np.abs(setup.truth).max()
     np.testing.assert_allclose(found.value[: setup.base.count][large], setup.truth[large], rtol=0.01)
     assert found.residual_steps.max() < 0.31
+    assert found.misfit == pytest.approx(1.0, abs=0.1)
+    noisier = replace(found, residual_steps=np.array([[0.29], [1.5]]), noise_steps=np.array([[0.29], [1.5]]))
+    assert noisier.misfit == pytest.approx(1.0)  # each run has its own noise
 
 
 def test_a_mass_that_nothing_feels_is_refused(setup: bench.Setup) -> None:

@@ -15,10 +15,10 @@ def test_a_zero_that_gravity_reveals_is_doubted_and_right_ones_are_not() -> None
     setup = bench.set_up(bench.BENCHES[4], 1)
     period = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101))
     model = ChainModel(setup.base)
-    assert identify_chain(period, model, setup.prior).doubtful_zeros == ()
+    assert identify_chain(period, model, setup.prior, test_zeros=True).doubtful_zeros == ()
     shifted = period.position.copy()
     shifted[2] -= 0.025
-    wrong = identify_chain(replace(period, position=shifted), model, setup.prior)
+    wrong = identify_chain(replace(period, position=shifted), model, setup.prior, test_zeros=True)
     ((joint, by),) = wrong.doubtful_zeros
     assert joint == 3
     assert by == pytest.approx(0.025, abs=0.005)

@@ -17,7 +17,7 @@ from hil.estimator.chain.fit.uncertainty import neglected_covariance
 from hil.estimator.chain.identify import identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.dynamics import mass_matrix
-from hil.estimator.chain.model.late_torque import MOST_LOST, as_moving, complete, lags_of, lost_inertia
+from hil.estimator.chain.model.late_torque import MOST_LOST, as_moving, complete, lags_of, limited, lost_inertia
 from hil.estimator.chain.simulation.sensitivity import Simulation
 from hil.estimator.data.settled_period import SettledPeriod
 
@@ -144,6 +144,13 @@ def test_no_lag_takes_more_than_half_of_a_joints_inertia(setup: bench.Setup) -> 
     np.testing.assert_array_equal(changed, derivative)  # what is at its limit does not change with its causes
     complete(base, by_voltage(setup, 1e-3), names, changed)
     assert np.abs(changed - derivative)[:, :, -2:].min() > 0.0
+
+
+def test_a_back_emf_at_its_limit_is_named_where_inertias_depend_on_it(setup: bench.Setup) -> None:
+    base, small = setup.base, np.full(setup.base.count, 1e-6)
+    assert limited(base, by_voltage(setup, 1e-3), small) == ()
+    assert limited(base, by_voltage(setup, 0.5), small) == ("back_emf_1", "back_emf_4")
+    assert limited(base, by_voltage(setup, 0.5), np.full(base.count, np.inf)) == ()
 
 
 def test_standard_errors_include_what_a_late_back_emf_neglects(setup: bench.Setup, period: SettledPeriod) -> None:

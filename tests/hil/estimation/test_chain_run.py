@@ -24,6 +24,7 @@ from hil.estimation.changes.diff import diff_runs
 from hil.estimation.comparison.compare import compare_run
 from hil.estimation.settled_estimate import estimate_run
 from hil.estimation.unsettled.estimate import estimate_unsettled
+from hil.estimator.chain.conflicts import chain_conflicts
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.dynamics import inverse_dynamics
 from hil.estimator.chain.model.geometry import Chain, parameter_names
@@ -285,6 +286,17 @@ def test_a_wrong_description_is_named(old: str, new: str, message: str) -> None:
         parse_config(TEXT.replace(old, new, 1), FOUR)
 
 
+def test_a_run_folder_of_an_older_version_may_have_link_lengths() -> None:
+    old = TEXT.replace(
+        'urdf = "open_manipulator_x_like.urdf"\nrest',
+        'urdf = "open_manipulator_x_like.urdf"\nlink_lengths = [0.1, 0.1, 0.1, 0.1]\nrest',
+        1,
+    )
+    assert parse_config(old, FOUR, recorded=True).arm.link_lengths is None
+    with pytest.raises(ConfigError, match="link_lengths"):
+        parse_config(old, FOUR)
+
+
 def test_too_little_torque_for_the_path_is_named() -> None:
     weak = TEXT.replace("current_limit = 1.2", "current_limit = 0.3")
     with pytest.raises(ConfigError, match="needs about"):
@@ -305,7 +317,15 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
     explained = 0.29 * np.ones(4)
     estimate: Any = SimpleNamespace(
         **{"std": 0.01 * known.prior.std, "over_noise": np.ones(4), "noise_steps": explained, "systematic": 0.8},
-        **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base), "doubtful_zeros": ()},
+        **{
+            "from_prior": (),
+            "unseen": (),
+            "reached": True,
+            "model": ChainModel(known.base),
+            "at_bound": (),
+            "conflicts": (),
+            "doubtful_zeros": (),
+        },
     )
     verdicts = []
     for estimate.reached in (True, False):
@@ -320,10 +340,43 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
     shifted = _verdict(config, estimate, known, np.full(4, 1e-3), [])
     assert shifted.trust == "with care"
     assert any("contradicts them: joint3 by about 0.021 rad" in each for each in shifted.sentences)
-    estimate.doubtful_zeros, estimate.systematic = (), 3.0
+    estimate.doubtful_zeros = ()
+    estimate.at_bound = ("back_emf_2",)
+    bounded = _verdict(config, estimate, known, np.full(4, 1e-3), [])
+    assert bounded.trust == "with care" and "back_emf_2 is at its bound" in " ".join(bounded.sentences)
+    estimate.at_bound, estimate.systematic = (), 3.0
     hidden = _verdict(config, estimate, known, np.full(4, 1e-3), [])
     assert hidden.trust == "with care"
     assert "part of it repeats with the motion" in hidden.sentences[0]
+
+
+def test_a_torque_constant_far_from_the_file_lowers_the_verdict(run: RunFolder) -> None:
+    """With care if the motion is explained, no if something is missing; links are only named."""
+    config = run.load_config()
+    known = known_chain(config)
+    prior = replace(known.prior, scale_precision=np.eye(3) / 0.1**2)
+    names = (*known.base.names, "torque_scale_2", "torque_scale_3", "lag_ratio_2")
+    value = np.concatenate((prior.value, [1.2, 0.5, 1.5]))
+    std = np.concatenate((0.01 * prior.std, [0.01, 0.01, 0.1]))
+    assert [each.name for each in chain_conflicts(names, value, std, prior)] == ["torque_scale_3"]
+    ratio = chain_conflicts(names, value, std, prior)
+    value[0] += 5.0 * prior.std[0]
+    value[-2] = 1.0
+    link = chain_conflicts(names, value, std, prior)
+    assert [each.name for each in link] == [known.base.names[0]]
+    estimate: Any = SimpleNamespace(
+        **{"std": 0.01 * known.prior.std, "over_noise": np.ones(4), "noise_steps": 0.29 * np.ones(4)},
+        **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base), "at_bound": ()},
+    )
+    found = {}
+    for estimate.systematic in (0.8, 3.0):
+        for estimate.conflicts in (ratio, link):
+            verdict = _verdict(config, estimate, known, np.full(4, 1e-3), [])
+            found[estimate.systematic, estimate.conflicts[0].name] = verdict.trust
+            said = " ".join(verdict.sentences)
+            assert estimate.conflicts[0].said in said
+            assert ("identify again" in said) == (estimate.systematic > 1.0)
+    assert list(found.values()) == ["with care", "yes", "no", "with care"]
 
 
 def test_a_value_less_certain_than_the_description_is_trusted_with_care(run: RunFolder) -> None:
@@ -334,7 +387,15 @@ def test_a_value_less_certain_than_the_description_is_trusted_with_care(run: Run
     std[2] = 1.1 * known.prior.std[2]
     estimate: Any = SimpleNamespace(
         **{"std": std, "over_noise": np.ones(4), "noise_steps": 0.29 * np.ones(4), "systematic": 0.8},
-        **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base), "doubtful_zeros": ()},
+        **{
+            "from_prior": (),
+            "unseen": (),
+            "reached": True,
+            "model": ChainModel(known.base),
+            "at_bound": (),
+            "conflicts": (),
+            "doubtful_zeros": (),
+        },
     )
     verdict = _verdict(config, estimate, known, np.full(4, 1e-3), [])
     assert verdict.trust == "with care"

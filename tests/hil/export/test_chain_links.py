@@ -73,13 +73,15 @@ def test_a_gripper_keeps_its_inertia_and_the_arm_its_dynamics(
 def test_an_unknown_rotor_is_that_of_its_servo() -> None:
     """A rotor that is part of a sum must not be taken for a tiny one, which makes the link too heavy instead."""
     joints = [
-        SimpleNamespace(servo="XM430-W350"),
-        SimpleNamespace(servo="unknown"),
-        SimpleNamespace(servo="XL430-W250"),
+        SimpleNamespace(servo="XM430-W350", servos=1),
+        SimpleNamespace(servo="unknown", servos=1),
+        SimpleNamespace(servo="XL430-W250", servos=1),
+        SimpleNamespace(servo="XM430-W350", servos=2),
     ]
     model: Any = SimpleNamespace(joints=joints, values={"armature_3": 0.004})
-    rotors = [_rotor(model, number) for number in (1, 2, 3)]
-    assert rotors == pytest.approx([servo_prior(servo_model("XM430-W350")).armature.median, 0.01, 0.004])
+    rotors = [_rotor(model, number) for number in (1, 2, 3, 4)]
+    one = servo_prior(servo_model("XM430-W350")).armature.median
+    assert rotors == pytest.approx([one, 0.01, 0.004, 2.0 * one])
     assert rotors[0] > 5e-3
 
 

@@ -1,4 +1,4 @@
-"""Eight arms of the population, covering all models and orientations, are identified without help."""
+"""Five arms of the population, covering all models and orientations, are identified without help."""
 
 from pathlib import Path
 
@@ -6,13 +6,13 @@ import pytest
 
 from benchmarks.population import figures, study
 
-SEEDS = [7, 12, 13, 15, 29, 30, 31, 34]
+SEEDS = [7, 12, 15, 30, 34]
 """Seeds that cover all five models, all orientations, one and two joints, warm-up, and encoder noise and nonlinearity.
 """
 
 
 @pytest.mark.long
-def test_eight_arms_that_nobody_chose_their_torque_for(tmp_path: Path) -> None:
+def test_arms_that_nobody_chose_their_torque_for(tmp_path: Path) -> None:
     outcomes = study(SEEDS, jobs=2, keep=tmp_path, quick=True)
     measured = figures(outcomes)
     assert measured["failures"] == {}

@@ -1,6 +1,5 @@
 """`hil dry-run` of every kind of arm that `hil init` writes simulates what `hil identify` would do."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from hil.api.dry_run import dry_run
 from hil.config.schema import Config, load_config
 from hil.drivers.servo_model import Mode
 from hil.dry_run.stopping_distance import Stopping, Way
+from hil.dry_run.summary import DryRun, dry_run_lines
 from hil.errors import NoSafeTorque
 from hil.pilot import rehearsal as rehearsal_module
 from hil.pilot.belief import prior_belief
@@ -86,18 +86,16 @@ def test_the_rehearsal_says_which_stabiliser_and_torque_come_first(
     assert "Chance: probability that" in printed and "hil identify" in printed
 
 
-def test_where_no_torque_is_safe_for_every_arm_the_pilot_starts_with_little(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = written(tmp_path, HANGING, swing=0.03, model="XL330-M288")
-    assert hil("dry-run", path, "--arms", ARMS, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
+def test_where_no_torque_is_safe_for_every_arm_the_pilot_starts_with_little(tmp_path: Path) -> None:
+    rehearsal = dry_run(written(tmp_path, HANGING, swing=0.03, model="XL330-M288"), arms=ARMS)
+    assert rehearsal.is_safe and rehearsal.largest_peak_torque == ()
+    found = rehearsal.to_json()
     assert found["largest_peak_torque"] is None and found["safe"]
-    config = load_config(path)
+    config = rehearsal.config
     most = config.joints[0].goal_limit * config.joints[0].torque_per_goal
     assert found["first_run"]["peak_torque"][0] < 0.03 * most
-    assert hil("dry-run", path, "--arms", ARMS) == 0
-    assert "the pilot will find it" in " ".join(capsys.readouterr().out.split())
+    assert isinstance(rehearsal.found, DryRun)
+    assert "the pilot will find it" in " ".join(dry_run_lines(config, rehearsal.found.shown, rehearsal.found))
 
 
 def test_an_upright_arm_without_room_is_refused_as_by_identify(tmp_path: Path) -> None:

@@ -77,6 +77,8 @@ def test_errors_that_repeat_with_the_motion_are_trusted_with_care(setup: bench.S
     found: Any = SimpleNamespace(
         **{"model": ChainModel(setup.base), "std": 0.01 * setup.prior.std, "simulated": True, "from_prior": ()},
         **{"residual_over_noise": np.ones(4), "reached": True, "systematic": 0.9},
+        at_bound=(),
+        conflicts=(),
     )
     well = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
     assert well.trust == "yes"

@@ -88,6 +88,7 @@ def test_samples_outlive_their_folder(tmp_path: Path, reason: str) -> None:
     """A run folder that is removed while it is written to: the samples are saved again, and the message says so."""
     path = tmp_path / "run" / "samples.npy"
     path.parent.mkdir()
+    (path.parent / "config.toml").write_text("[port]", encoding="utf-8")
     with pytest.raises(ValueError if reason else RunFolderError) as caught, Recorder(path, 2, 100) as recorder:
         recorder.keep(7.0, Phase.REST, 0, -1, state(1))
         shutil.rmtree(path.parent)
@@ -98,8 +99,9 @@ def test_samples_outlive_their_folder(tmp_path: Path, reason: str) -> None:
     assert (
         said.startswith(reason)
         and "was removed or renamed" in said
-        and f"2 samples have been saved to a new file, {path}" in said
+        and f"2 samples have been saved again in {path.parent}" in said
     )
+    assert (path.parent / "config.toml").read_text(encoding="utf-8") == "[port]"
     assert load_samples(path, 2)["deadline"].tolist() == [7.0, 8.0]
 
 

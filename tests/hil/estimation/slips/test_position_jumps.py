@@ -1,11 +1,15 @@
 """A single jump of a position is found; real motion, delay and bad readings are not mistaken for one."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from hil.estimation.slips.position_jumps import position_jumps
+from hil.estimation.slips.position_jumps import jump_disturbances, jump_warnings, position_jumps
+from hil.runs.recording import Phase, sample_type
 
 STEP = 2 * np.pi / 4096
 VELOCITY_STEP = 0.229 * 2 * np.pi / 60
@@ -69,3 +73,17 @@ def test_a_knock_that_the_velocity_follows_late_is_no_jump() -> None:
     pushed = np.clip((time - 10.0) / 0.01, 0.0, 1.0) * 0.08  # 8 rad/s for 10 ms
     velocity[(time > 10.005) & (time <= 10.0151)] += 8.0  # one sample late
     assert position_jumps(time, position + pushed, velocity, STEP) == []
+
+
+def test_a_jump_after_the_last_used_sample_casts_no_doubt() -> None:
+    """Such as a horn knocked while the arm comes to rest; the warning still names it."""
+    time, position, velocity = swing(200.0, 1.0, 0.0, 4)
+    samples = np.zeros(len(time), sample_type(1))
+    samples["deadline"], samples["velocity"][:, 0] = time, velocity
+    samples["phase"] = np.where(time < 15.0, Phase.PERIODIC, Phase.COMING_TO_REST)
+    config: Any = SimpleNamespace(joints=[SimpleNamespace(name="shoulder")])
+    facts: Any = SimpleNamespace(position_step=[STEP])
+    for at, counts in ((18.0, False), (10.0, True)):
+        samples["position"][:, 0] = position + np.where(time > at, 60 * STEP, 0.0)
+        assert len(jump_warnings(config, facts, samples)) == 1
+        assert bool(jump_disturbances(config, facts, samples)) == counts

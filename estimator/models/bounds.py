@@ -1,0 +1,65 @@
+"""Parameters at the edge of their range, although the data ask for values beyond it.
+
+A fit cannot leave the physical range: an inertia stays positive, a coupling below the geometric mean of its inertias.
+Where the model is wrong or the recording says little, the best value may lie beyond. The fit then ends at the edge,
+with a standard error that knows nothing of it, and the other parameters absorb what is missing. A parameter that is
+truly zero, such as Stribeck friction that a joint lacks, ends there as well and does no harm: the undamped step of the
+normal equations, in the parameters themselves, tells one from the other.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hil.estimator.arrays import Array, Mask
+from hil.estimator.models.terms import kind_of, term_of
+
+SURE = 3.0  # standard errors by which the best value lies beyond the range
+FAINTEST = 1e-12  # influence of a coordinate relative to the largest, below which it is not resolved
+MOVED = 1.0  # standard errors by which the edge moves another parameter that then depends on it
+
+
+def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, Array]:
+    """Return the undamped step of the parameters (parameters,) [SI], ignoring their range, and its standard errors.
+
+    The standard errors are those of independent errors with variance 1. normal, gradient: of the sum of squares in
+    coordinates (coordinates, coordinates) and (coordinates,). slopes: derivatives of the parameters, which are first
+    among them, with respect to their coordinates (parameters, parameters).
+    """
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scale = np.maximum(scale, FAINTEST * scale.max())
+    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True)
+    count = len(slopes)
+    step = -(inverse @ (gradient / scale))[:count] / scale[:count]
+    covariance = (inverse / np.outer(scale, scale))[:count, :count]
+    std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, covariance, slopes), 0.0))
+    return np.asarray(slopes @ step), np.asarray(std)
+
+
+def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Array) -> Mask:
+    """Return which parameters (parameters,) the data significantly drive beyond their range, `lower` to `upper`."""
+    best = value + step
+    beyond: Mask = (best < lower - SURE * std) | (best > upper + SURE * std)
+    return beyond
+
+
+def dependent(names: tuple[str, ...], step: Array, std: Array) -> bool:
+    """Return whether a base parameter, other than offsets, would move by more than its standard error."""
+    base = np.array([term_of(name).part == "base" and kind_of(name) != "offset" for name in names])
+    return bool(np.any(np.abs(step[base]) > MOVED * std[base]))
+
+
+def bound_sentence(names: Sequence[str]) -> str:
+    """Return the sentence on parameters at a bound; empty if there are none."""
+    if not names:
+        return ""
+    late = any(kind_of(name) == "back_emf" for name in names)
+    cause = (
+        "back-EMF that lags takes as much of the joint's inertia as a motor can lose, so the inertia and the lag may "
+        "be wrong: check the joint's mode and model, and that nothing else delays its torque"
+        if late
+        else "an effect that the model lacks, or too little motion, drives it there, and distorts other values: use "
+        "wider and faster motion, and look for the cause above"
+    )
+    it, its = ("are", "their") if len(names) > 1 else ("is", "its")
+    return f"{', '.join(names)} {it} at {its} bound, beyond which the recording asks to go: {cause}."

@@ -1,0 +1,138 @@
+"""Values that contradict what was known before: many standard deviations away from the file's or from typical ones.
+
+A fit without a missing effect, such as play in the gears, lets other parameters imitate it. Some of these are known
+beforehand, and a value that is far from what was known reveals the imitation, which standard errors do not.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.models.terms import kind_of, term_of
+
+FAR = 4.0  # standard deviations
+Trust = Literal["yes", "with care", "no"]
+Source = Literal["file", "description", "servos"]
+"""Origin of an expectation: the configuration, the description of the links (URDF), or what is typical of servos."""
+_GIVEN = ("torque_scale", "zero")
+"""Terms whose expected values come from the configuration: torque_constant and zero_ticks."""
+_SOURCES: dict[Source, str] = {
+    "file": "which the file implies",
+    "description": "which the description of the arm implies",
+    "servos": "typical of servos",
+}
+_CHECKS = {
+    "torque_scale": "check the model, torque_constant and torque_constant_std of each joint, or measure the constants "
+    "with `hil calibrate`",
+    "zero": "check zero_ticks and the horn's position",
+    "base_tilt": "check arm.base",
+    "encoder": "check the encoder and its magnet",
+    "stribeck_velocity": "use slower motion to separate friction near standstill",
+}
+_DRIVE = "check the joint's model and mode"
+_LINK = "correct the mass, centre of mass and inertia of that link there, or find what the arm carries"
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """One value that is far from what was known beforehand."""
+
+    name: str
+    value: float
+    std: float
+    """Standard error of `value`."""
+    expected: float
+    spread: float
+    """Standard deviation of `expected`, relative to it if `relative`."""
+    relative: bool
+    deviations: float
+    """Distance in standard deviations, those of `value` and `expected` together."""
+    source: Source
+
+    @property
+    def said(self) -> str:
+        """A sentence with the values and the advice."""
+        spread = f"{100.0 * self.spread:.2g} %" if self.relative else f"{self.spread:.2g}"
+        usual = _LINK if self.source == "description" else _DRIVE
+        advice = next((check for kind, check in _CHECKS.items() if self.name.startswith(kind)), usual)
+        return (
+            f"{self.name} is {self.value:.3g} +- {self.std:.1g}, {self.deviations:.0f} standard deviations from "
+            f"{self.expected:.3g} +- {spread}, {_SOURCES[self.source]}: {advice}."
+        )
+
+
+def conflict(
+    name: str, value: float, std: float, expected: float, spread: float, *, relative: bool, source: Source | None = None
+) -> Conflict | None:
+    """Return the contradiction between `value` and `expected`, None if there is none.
+
+    relative: `spread` is the standard deviation of the logarithm.
+    """
+    source = source or ("file" if kind_of(name) in _GIVEN else "servos")
+    if not (np.isfinite(std) and spread > 0.0):
+        return None
+    if relative:
+        value = max(value, 1e-300)
+        away, own = np.log(value / expected), std / value
+    else:
+        away, own = value - expected, std
+    deviations = abs(float(away)) / float(np.hypot(spread, own))
+    return Conflict(name, value, std, expected, spread, relative, deviations, source) if deviations > FAR else None
+
+
+def conflicts(
+    names: Sequence[str], value: Array, std: Array, torque_scale_std: Mapping[str, float]
+) -> tuple[Conflict, ...]:
+    """Return the contradictions among the parameters of a planar arm, the largest first.
+
+    torque_scale_std: relative standard deviation of the ratio of torque constants by parameter, if the file gives it;
+    otherwise that of `hil.estimator.models.terms`.
+    """
+    found = []
+    for name, each, error in zip(names, value.tolist(), std.tolist(), strict=True):
+        term = term_of(name)
+        spread = torque_scale_std.get(name, term.spread)
+        if term.log_spread is not None:
+            found.append(conflict(name, each, error, term.initial, term.log_spread, relative=True))
+        elif isinstance(spread, float):
+            ratio = term.range == "positive"
+            found.append(conflict(name, each, error, term.absent, spread, relative=ratio))
+    return worst_first(found)
+
+
+def worst_first(found: Sequence[Conflict | None]) -> tuple[Conflict, ...]:
+    """Return those of `found` that are contradictions, the largest first."""
+    return tuple(sorted((each for each in found if each is not None), key=lambda each: -each.deviations))
+
+
+def contradicted(found: Sequence[Conflict], explained: bool) -> str:
+    """Return "no", "with care" or "" for contradictions: by how much they lower the verdict.
+
+    explained: whether the model explains the motion. If it does not, an effect that it lacks has distorted a value that
+    was known, and with it presumably all others.
+    """
+    if any(each.source == "file" for each in found):
+        return "with care" if explained else "no"
+    return "with care" if found and not explained else ""
+
+
+def lowered(trust: Trust, at_most: str) -> Trust:
+    """Return the lower of a verdict and that of `contradicted`."""
+    if at_most == "no":
+        return "no"
+    return "with care" if at_most and trust == "yes" else trust
+
+
+def conflict_sentences(found: Sequence[Conflict], explained: bool) -> tuple[str, ...]:
+    """Return the contradictions as sentences for users."""
+    if not found or explained:
+        return tuple(each.said for each in found)
+    return (
+        *(each.said for each in found),
+        "Since the motion is not explained either, an effect that the model lacks probably distorts these values, and "
+        "with them the others. Remove it (play of the gears, a loose screw or horn, a dragging cable, a weak supply) "
+        "and identify again.",
+    )
