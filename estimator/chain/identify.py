@@ -106,8 +106,8 @@ def identify_chain(
 
     `prior` determines what the data do not, as listed in `ChainEstimate.from_prior`. `added`: see `fit_lines`; for a
     model with `added_mass`. test_zeros: whether to test the encoder zeros that `model` holds
-    (`ChainEstimate.doubtful_zeros`), for a tenth more time. Raises ModelError if `model` and a period differ in their number of joints,
-    ConvergenceError if no minimum is found.
+    (`ChainEstimate.doubtful_zeros`), for a tenth more time. Raises ModelError if `model` and a period differ in their
+    number of joints, ConvergenceError if no minimum is found.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
     for period in given:

@@ -367,6 +367,7 @@ def test_a_torque_constant_far_from_the_file_lowers_the_verdict(run: RunFolder) 
     estimate: Any = SimpleNamespace(
         **{"std": 0.01 * known.prior.std, "over_noise": np.ones(4), "noise_steps": 0.29 * np.ones(4)},
         **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base), "at_bound": ()},
+        **{"doubtful_zeros": ()},
     )
     found = {}
     for estimate.systematic in (0.8, 3.0):
