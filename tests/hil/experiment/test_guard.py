@@ -89,6 +89,16 @@ def test_silence_of_all_servos_points_to_what_they_share(arm: Arm, missing: tupl
     assert str(stop.value).endswith(said)
 
 
+@pytest.mark.parametrize("missing", [(False, True), (True, True)])
+def test_what_was_heard_instead_replaces_the_remedy_for_silence(arm: Arm, missing: tuple[bool, bool]) -> None:
+    """Otherwise the message says that nothing was heard, and then that replies arrived."""
+    guard = Guard(arm(), heard_instead=lambda: "Replies did arrive, but too late.")
+    with pytest.raises(SafetyStop, match=r"allows 15 ms\. Replies did arrive, but too late\.$") as stop:
+        for number in range(10):
+            guard.look(at(number, MISSING._replace(missing=missing)))
+    assert stop.value.cause is Cause.MISSING
+
+
 def test_silence_on_a_computer_that_was_late_before_names_it_too(arm: Arm) -> None:
     guard = Guard(arm())
     guard.look(at(0, STILL))
