@@ -4,7 +4,8 @@
 
 Each mutation changes one operator, comparison, number or boolean of a module (except in strings, annotations and zip's
 `strict`) and runs that module's tests in a child process. Mutations that no test detects survive. A mutation that makes
-a test hang counts as detected after `PATIENCE_S`.
+a test hang counts as detected after `PATIENCE_S`. With NUMBA_DISABLE_JIT=1, compiled modules are tested without being
+compiled for each mutation, which takes longest.
 """
 
 import argparse

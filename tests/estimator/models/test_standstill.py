@@ -111,6 +111,14 @@ def test_what_friction_held_is_known_once_the_joint_moves() -> None:
     assert standstill.withstood(joint.rest) == pytest.approx(0.3 - 0.5 * MOMENTUM / FILTER_S), "the most so far"
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_small_excess_is_suspect_too(sign: float) -> None:
+    joint = Joint()
+    joint.alarm(sign * for_s(0.2, 0.2))
+    joint.alarm(-sign * for_s(0.2 - 0.5 * (0.4 - 2 * FRICTION - TOLERANCE), INTERVAL))
+    assert standstill.is_suspect(joint.rest)
+
+
 def test_it_is_suspect_while_the_torque_is_outside_the_band() -> None:
     joint = Joint()
     joint.alarm(for_s(0.2, 0.2))
@@ -121,7 +129,7 @@ def test_it_is_suspect_while_the_torque_is_outside_the_band() -> None:
     assert not standstill.is_suspect(joint.rest)
 
 
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("sign", [-1.0, -0.2, 0.2, 1.0])
 def test_only_terms_that_changed_since_the_farthest_torque_are_uncertain(sign: float) -> None:
     """The second joint's motion changes the first term by 0.2; the second one is the same throughout."""
     rest = standstill.memory(1, 2)[0]
