@@ -57,11 +57,25 @@ def test_a_goal_written_after_each_of_ours_is_found_within_a_tenth_of_a_second(f
         assert bus.port.clock.now() - start < 0.1
 
 
-def test_a_goal_written_once_or_twice_is_no_proof(fake_config: Make) -> None:
+@pytest.mark.parametrize("when", [20, 21, 22])
+def test_a_goal_written_once_is_no_proof(fake_config: Make, when: int) -> None:
+    times = iter(range(10_000))
+
+    def once(servos: Any) -> None:
+        if next(times) == when:
+            servos[1].write(102, b"\xf9\xff")
+
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        after_each(bus, once, 100)
+
+
+@pytest.mark.parametrize("when", [20, 21, 22])
+def test_nor_is_a_goal_of_ours_from_long_ago_seen_twice(fake_config: Make, when: int) -> None:
+    """Lost writes leave it, which the status detects."""
     times = iter(range(10_000))
 
     def twice(servos: Any) -> None:
-        if next(times) in (20, 21):
+        if next(times) in (when, when + 1):
             servos[1].write(102, b"\x07\x00")
 
     with driven(fake_config(interval=INTERVAL)) as bus:

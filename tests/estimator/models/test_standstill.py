@@ -77,7 +77,7 @@ def test_short_peaks_that_give_no_visible_velocity_are_none() -> None:
 
 @pytest.mark.parametrize(
     ("angle", "stands", "new"),
-    [(0.3, 1.0, False), (0.3 + 0.9 * WITHIN_RAD, 1.0, False), (0.31, 1.0, True), (0.3, 0.9, True)],
+    [(0.3, 1.0, False), (0.3 + 0.9 * WITHIN_RAD, 1.0, False), (0.3045, 1.0, True), (0.3, 0.9, True)],
 )
 def test_a_joint_that_moves_starts_a_new_band(angle: float, stands: float, new: bool) -> None:
     joint = Joint()
@@ -127,6 +127,16 @@ def test_it_is_suspect_while_the_torque_is_outside_the_band() -> None:
     assert standstill.is_suspect(joint.rest)
     joint.alarm(for_s(0.0, 0.1))
     assert not standstill.is_suspect(joint.rest)
+
+
+@pytest.mark.parametrize(("torque", "distance"), [(0.0, -1.5), (1.0, 1.5)])
+def test_earlier_torques_are_judged_by_the_present_estimates(torque: float, distance: float) -> None:
+    """Residuals are then -0.1 and -2.1 N m, and -1.6 or -0.6 now."""
+    rest = standstill.memory(1, 2)[0]
+    standstill.look(rest, 0.3, 1.0, 1.0, np.array([0.5, 1.0]), np.zeros(2))
+    standstill.look(rest, 0.3, 1.0, -1.0, np.array([0.4, 3.0]), np.zeros(2))
+    theta = np.array([2.0, 0.1])
+    assert standstill.look(rest, 0.3, 1.0, torque, np.array([0.7, 2.0]), theta) == pytest.approx(distance)
 
 
 @pytest.mark.parametrize("sign", [-1.0, -0.2, 0.2, 1.0])
