@@ -354,9 +354,11 @@ class ServoBus:
         seen = self.prepared.sighted
         if seen is None:
             return ""
+        # A tripped watchdog and a reboot leave 0 as well.
+        who = ": another program commands it, or writes are lost" if seen.value else ""
         return (
             f"Just before, {seen.register} of {self._drives[seen.place].title} was {seen.value} although "
-            f"{seen.written} had been written: another program commands it, or writes are lost."
+            f"{seen.written} had been written{who}."
         )
 
     def read_status_next(self) -> None:

@@ -64,6 +64,7 @@ EQUIVALENT = {
     ("len(self._reads[0].request)", "0  ->  1"): "exchange: the requests for all spans have the same length",
     ("rest[_SEEN] = angle, 1.0", "1.0  ->  2.0"): "standstill: any positive number",
     ("up, down = (beyond", "distance > 0.0  ->  distance <= 0.0"): "standstill: the two sides swap their names",
+    ("_NEVER = ", "62  ->  124"): "exchange: more cycles than any run has",
     ("self.due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: every look sets it before it is read",
     (
         "self._clock = [",

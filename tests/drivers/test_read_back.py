@@ -96,6 +96,18 @@ def test_a_foreign_goal_is_told_from_the_first_sighting_until_some_time_after_th
         assert bus.commanded_by_another == ""
 
 
+def test_of_a_goal_of_0_no_other_program_is_accused(fake_config: Make) -> None:
+    """A tripped watchdog or a reboot leaves it."""
+    with driven(fake_config(interval=INTERVAL)) as bus:
+
+        def once(servos: Any) -> None:
+            if not bus.commanded_by_another:
+                servos[2].write(102, b"\0\0")
+
+        after_each(bus, once, 20)
+        assert re.search(r"Goal Current of .*elbow.* was 0 although \d+ had been written\.$", bus.commanded_by_another)
+
+
 def test_a_changed_mode_is_found_within_a_tenth_of_a_second(fake_config: Make) -> None:
     times = iter(range(10_000))
 
