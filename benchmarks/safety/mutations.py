@@ -64,6 +64,10 @@ EQUIVALENT = {
     ("len(self._reads[0].request)", "0  ->  1"): "exchange: the requests for all spans have the same length",
     ("rest[_SEEN] = angle, 1.0", "1.0  ->  2.0"): "standstill: any positive number",
     ("up, down = (beyond", "distance > 0.0  ->  distance <= 0.0"): "standstill: the two sides swap their names",
+    ("ARMS = 96", "96  ->  192"): "chain_watch: the size of the ensemble, of which only mean and covariance are used",
+    ("is_home * (", "self._was_above * 1.0  ->  self._was_above / 1.0"): "chain_watch: the same number",
+    ("is_home * (", "self._was_below * 1.0  ->  self._was_below / 1.0"): "chain_watch: the same number",
+    ("self._seen_at = 0.0", "0.0  ->  1.0"): "chain_watch: not used before the first sample",
     ("_NEVER = ", "62  ->  124"): "exchange: more cycles than any run has",
     ("self.due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: every look sets it before it is read",
     (
