@@ -290,8 +290,8 @@ class Guard:
             index,
             Cause.FROZEN,
             f"reports a velocity of {state.velocity[index]:+.2f} rad/s that does not fit its position, "
-            f"{state.position[index]:.3f} rad: one of the two readings is frozen or wrong. Check the encoder and its "
-            "magnet; replace the servo if necessary.",
+            f"{state.position[index]:.3f} rad: one of the two readings is frozen or wrong, or its horn slips. Check "
+            "the horn, the encoder and its magnet; replace the servo if necessary.",
         )
 
     def _look_at_clocks(self, slow: Slow, now: float) -> None:

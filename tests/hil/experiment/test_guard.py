@@ -63,7 +63,7 @@ def test_a_frozen_encoder_is_seen_between_lost_replies(arm: Arm) -> None:
     with pytest.raises(SafetyStop) as stop:
         for number in range(60):
             guard.look(at(number, MISSING if number % 2 else fast))
-    assert stop.value.cause is Cause.FROZEN
+    assert stop.value.cause is Cause.FROZEN and "or its horn slips. Check the horn, the encoder" in str(stop.value)
 
 
 def test_replies_may_be_missing_but_not_too_many_in_a_row(arm: Arm) -> None:
