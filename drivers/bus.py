@@ -316,22 +316,28 @@ class ServoBus:
 
     @property
     def heard_instead(self) -> str:
-        """What was received in the last tenth of a second instead of complete replies in time; "" for nothing."""
+        """What was received in the last tenth of a second instead of complete replies in time, and what to do about it;
+        "" for nothing.
+        """
         exchange, since = self.prepared, self.port.clock.now() - _RECENT_S
         if exchange.late_at > since:
-            return "Replies did arrive, but too late or twice: suspect the adapter or this computer's load first."
+            return (
+                "Replies did arrive, but too late or twice: check the adapter's latency timer and what else keeps this "
+                "computer busy."
+            )
         if exchange.damaged_at > since and (strange := [each for each in exchange.senders if each not in exchange.ids]):
             return (
                 f"Intact replies came with ID {', '.join(map(str, dict.fromkeys(strange)))}, which was not asked: "
-                "a servo's ID has changed, or its reply is another servo's."
+                f"a servo's ID has changed, or its reply is another servo's. `hil scan {self.port.url}` lists the IDs."
             )
         if exchange.damaged_at > since and len(set(exchange.senders)) < len(exchange.senders):
             return (
                 f"Intact replies came with the IDs {', '.join(map(str, exchange.senders))}, although each servo was "
-                "asked once: replies are repeated or mixed up, or two servos have the same ID."
+                "asked once: replies are repeated or mixed up, or two servos have the same ID. "
+                f"`hil scan {self.port.url}` lists the IDs."
             )
         if exchange.damaged_at > since:
-            return "Bytes arrived, but damaged or incomplete."
+            return "Bytes arrived, but damaged or incomplete: check the cables, and what else sends on the bus."
         return ""
 
     @property
@@ -348,9 +354,11 @@ class ServoBus:
         seen = self.prepared.sighted
         if seen is None:
             return ""
+        # A tripped watchdog and a reboot leave 0 as well.
+        who = ": another program commands it, or writes are lost" if seen.value else ""
         return (
             f"Just before, {seen.register} of {self._drives[seen.place].title} was {seen.value} although "
-            f"{seen.written} had been written: another program commands it, or writes are lost."
+            f"{seen.written} had been written{who}."
         )
 
     def read_status_next(self) -> None:

@@ -23,14 +23,17 @@ goal.
 _GOALS_PER_MODE_IN_DOUBT = 4
 """The same while a foreign value is suspected, and every cycle is followed by a read-back."""
 
-REMEMBERED = 4
+_RECENT = 4
 """Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
 
-_GOAL_SIGHTINGS, _MODE_SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
-"""Numbers of read-backs of a foreign goal, or mode, that prove another writer, and the time in which they must occur
-[s].
+REMEMBERED = 128
+"""Number of goals of which a servo may hold one if writes are lost, until the status has detected that."""
 
-Three for goals, so that the status detects lost writes first.
+_UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
+"""Numbers of read-backs of a foreign value that prove another writer, and the time in which they must occur [s].
+
+Three for a goal that this program may have written, or a servo itself: that of an earlier cycle, or 0. Then the status
+detects lost writes, a tripped watchdog or a reboot first.
 """
 
 TRY_AGAIN_S = 0.005
@@ -99,7 +102,8 @@ class ReadBack:
                 self.sighted = Overruled(place, "Operating Mode", value, self._modes[place])
             else:
                 self.sighted = Overruled(place, self._goals[place], value, sent[-1][place])
-            most = _MODE_SIGHTINGS if of_modes else _GOAL_SIGHTINGS
+            is_ours = not of_modes and (value == 0 or any(value in each for each in sent))
+            most = _UNSURE_SIGHTINGS if is_ours else _SIGHTINGS
             if len(times) >= most:
                 return self.sighted
             self.doubts_until = now + _IN_DOUBT_S
@@ -122,7 +126,7 @@ class ReadBack:
                 if answer is not None and answer[-1] != mode and len(answer) > 1
             ]
         # A servo that received its neighbour's goal is not commanded by another master.
-        own = set().union(*sent)
+        own = set().union(*list(sent)[-_RECENT:])
         return [
             (place, answer[-1])
             for place, answer in enumerate(servos)

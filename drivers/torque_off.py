@@ -85,7 +85,8 @@ class TorqueOff:
 
     def _outcome(self) -> str:
         if not self.unconfirmed:
-            servos = "the servo" if len(self.confirmed) == 1 else f"all {len(self.confirmed)} servos"
+            count = len(self.confirmed)
+            servos = {1: "the servo", 2: "both servos"}.get(count, f"all {count} servos")
             return f"Torque is off on {servos}, read back."
         names = "; ".join(
             f"{and_list(str(joint).upper() for joint in joints)}: {why}" for why, joints in self._reasons()

@@ -21,6 +21,7 @@ SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "c
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
 LIMIT, SIGN, PROGRAM, SIGNAL, MODEL, POSE = "limit", "sign", "program", "signal", "model", "pose"
 REFUSED, STRANGER, DISK, MIXED = "refused", "stranger", "disk", "mixed"
+HAND, REPEATED = "hand", "repeated"
 
 WORDS = {
     SILENCE: r"heard nothing|received nothing|no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl"
@@ -34,10 +35,10 @@ WORDS = {
     HEAT: r"overheat|temperature|degrees C|too hot",
     OVERLOAD: r"overload",
     VOLTAGE: r"voltage|\d V\b",
-    STUCK: r"stuck|\bheld\b|jammed|not move|stands? still|blocked|not moving|something holds",
+    STUCK: r"stuck|\bheld\b|jammed|not move(?! like)|stands? still|blocked|not moving|something holds",
     ENCODER: r"encoder|magnet|seems to have moved|implausible|frozen|velocity and position"
     r"|position.{0,40}(disagree|contradict)",
-    LIMIT: r"(position|velocity)[ _]limit",
+    LIMIT: r"(outside|more than|beyond|exceeded) (its|the) (position|velocity)[ _]limit",
     SIGN: r"sign of|against its command|wrong way|turned? round",
     PROGRAM: r"deadlines?\b|(the|this) computer|program (was|stood|stopped)|stalled|suspended|did not run|kept waiting",
     SIGNAL: r"Ctrl-C|SIGINT|SIGTERM|SIGHUP",
@@ -45,14 +46,21 @@ WORDS = {
     REFUSED: r"refus|reports no hardware error|answers? with an? error",
     STRANGER: r"another (program|master)|Drive Mode is|somebody else|not asked for|collision|other master",
     MIXED: r"another servo's|mixed up|swapped|ID has changed|same ID|was not asked:",
+    REPEATED: r"repeated|too late or twice",
+    HAND: r"pushes or holds|hit it|slips",
     DISK: r"\bdisk\b|no space|File too large|cannot be written",
     POSE: r"rest[_ ]pose|before the start|starts? (from|at)",
 }
 """A message names a cause if it matches this pattern."""
 
-_FORGED = frozenset({ENCODER, STUCK, MODEL, TORQUE, SIGN})
+_READINGS = frozenset({ENCODER, STUCK, MODEL, SIGN})
+_FORGED = _READINGS | {TORQUE}
+_BY_HAND = frozenset({HAND, STUCK, MODEL, SIGN, LIMIT})
+_BY_MOTOR = _BY_HAND | {TORQUE}
 _LOST_GOALS = frozenset({TORQUE, MODEL, STUCK})
+_OTHER_GOALS = frozenset({TORQUE, MODEL, SIGN, LIMIT, STRANGER})
 _BYTES = frozenset({SILENCE, GARBLED})
+_REPEATED = _BYTES | {REPEATED}
 _SLOW = frozenset({LATE, SILENCE})
 
 CAUSES: dict[str, frozenset[str]] = {
@@ -60,7 +68,7 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.SPLIT: _SLOW | _BYTES,
     Kind.DROP: frozenset({SILENCE}),
     Kind.CUT: _BYTES,
-    Kind.REPEAT: _BYTES | {MIXED},
+    Kind.REPEAT: _REPEATED,
     Kind.FLIP: _BYTES,
     Kind.ECHO: _BYTES,
     Kind.SWAP: _FORGED | {MIXED},
@@ -76,12 +84,12 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.COLLISION: _BYTES | {MIXED},
     Kind.DEAF: frozenset({SILENCE}),
     Kind.DEAF_TO_GOALS: _LOST_GOALS,
-    Kind.TWICE_TOLD: _BYTES | {MIXED},
+    Kind.TWICE_TOLD: _REPEATED,
     Kind.TORQUE_TAKEN: _LOST_GOALS,
     Kind.WATCHDOG_TRIPPED: _LOST_GOALS,
-    Kind.STRANGE_GOAL: _LOST_GOALS | {LIMIT, STRANGER},
-    Kind.GOAL_FIGHT: _LOST_GOALS | {LIMIT, SIGN, POSE, STRANGER},
-    Kind.MODE_TAKEN: _LOST_GOALS | {LIMIT, SIGN, POSE, STRANGER},
+    Kind.STRANGE_GOAL: _OTHER_GOALS | {HAND},
+    Kind.GOAL_FIGHT: _OTHER_GOALS,
+    Kind.MODE_TAKEN: _OTHER_GOALS,
     Kind.ANSWERS_LESS: frozenset({SILENCE}),
     Kind.RAISED_LIMIT: frozenset(),
     Kind.LOWERED_LIMIT: _LOST_GOALS | {LIMIT},
@@ -93,11 +101,11 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.NEW_BAUD: frozenset({SILENCE}),
     Kind.CLOCK_RATE: frozenset({LATE}),
     Kind.CLOCK_WRAP: frozenset(),
-    Kind.WEAK: _FORGED | {LIMIT},
-    Kind.SATURATED: _FORGED | {LIMIT},
-    Kind.PUSHED: _FORGED | {LIMIT},
-    Kind.GRIPPED: _FORGED,
-    Kind.PLAY: _FORGED | {LIMIT},
+    Kind.WEAK: _BY_MOTOR,
+    Kind.SATURATED: _BY_MOTOR,
+    Kind.PUSHED: _BY_HAND,
+    Kind.GRIPPED: _BY_HAND,
+    Kind.PLAY: _BY_HAND,
     Kind.DISK_FULL: frozenset({DISK}),
     Kind.STALL: frozenset({PROGRAM, LATE}),
     Kind.SIGINT: frozenset({SIGNAL}),
@@ -109,22 +117,22 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.WRONG_ID: _BYTES | {MIXED},
     Kind.ONE_BEHIND: _FORGED | {LATE},
     Kind.REORDERED: _BYTES | {MIXED},
-    Kind.RIVAL: _LOST_GOALS | {LIMIT, SIGN, POSE, STRANGER},
+    Kind.RIVAL: _OTHER_GOALS,
     Kind.FACTORY_RESET: frozenset({SILENCE, REBOOT, TORQUE}),
-    Kind.SHADOWED: _LOST_GOALS | {LIMIT, SIGN, POSE, STRANGER},
-    Kind.THROTTLED: _FORGED | {LIMIT},
+    Kind.SHADOWED: _OTHER_GOALS,
+    Kind.THROTTLED: _BY_MOTOR,
     Kind.HOMING_MOVED: _FORGED | {LIMIT, POSE},
-    Kind.SLIP: _FORGED | {LIMIT, POSE},
-    Kind.OBSTACLE: _FORGED | {LIMIT},
-    Kind.SNAG: _FORGED | {LIMIT},
-    Kind.LOAD_CHANGED: _FORGED | {LIMIT, POSE},
-    Kind.FADING: _FORGED | {LIMIT},
+    Kind.SLIP: _BY_HAND,
+    Kind.OBSTACLE: _BY_HAND,
+    Kind.SNAG: _BY_HAND,
+    Kind.LOAD_CHANGED: _BY_HAND,
+    Kind.FADING: _BY_MOTOR,
     Kind.IDS_SWAPPED: _LOST_GOALS | {LIMIT, POSE, MIXED, ENCODER},
     Kind.SUSPENDED: frozenset({PROGRAM, LATE}),
     FaultKind.LOST_REPLY: frozenset({SILENCE}),
     FaultKind.CORRUPTED_REPLY: _BYTES,
     FaultKind.TRUNCATED_REPLY: _BYTES,
-    FaultKind.DUPLICATED_REPLY: _BYTES | {MIXED},
+    FaultKind.DUPLICATED_REPLY: _REPEATED,
     FaultKind.LATE_REPLY: _SLOW,
     FaultKind.NOISE: _BYTES,
     FaultKind.LOST_INSTRUCTION: _LOST_GOALS | {SILENCE},
@@ -141,6 +149,14 @@ CAUSES: dict[str, frozenset[str]] = {
     FaultKind.OTHER_MASTER: _BYTES | {STRANGER, LATE},
 }
 """Causes that a message may name for each fault. The host cannot distinguish a jammed joint from a dead encoder."""
+
+_OF_FIELD = {
+    "position": _READINGS | {LIMIT, POSE},
+    "velocity": _READINGS | {LIMIT},
+    "current": frozenset({TORQUE, VOLTAGE}),
+}
+"""Causes that a message may name if only one reading is forged: a wrong angle is no lost torque."""
+
 
 _INSTRUCTIONS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTRUCTION})
 UNHEARD = _INSTRUCTIONS | {
@@ -199,6 +215,15 @@ class Drawn:
             for each in self.faults
         ]
         return " and ".join(told)
+
+
+def causes_of(drawn: Drawn) -> frozenset[str]:
+    """Causes that a message may name for these faults."""
+    own = [CAUSES[each.kind] for each in drawn.faults]
+    for each in drawn.attacks:
+        is_forged = each.kind in FORGED - {Kind.SWAP, Kind.WRONG_ID}
+        own.append(_OF_FIELD[each.field] if is_forged and each.field in _OF_FIELD else CAUSES[each.kind])
+    return frozenset().union(*own)
 
 
 def draw(seed: object, until: float, ids: Sequence[int], often_since: float | None = None) -> Drawn:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.fault_campaign.attack import Kind, Request, blocks_in, field_of, goals_in, request_in
-from benchmarks.fault_campaign.draw import CAUSES, HARMLESS, SHIFTED, UNHEARD, WORDS, Drawn
+from benchmarks.fault_campaign.draw import HARMLESS, SHIFTED, UNHEARD, WORDS, Drawn, causes_of
 from benchmarks.fault_campaign.middle import Traffic
 from benchmarks.fault_campaign.twin import Heard, has_healthy_twin
 from benchmarks.fault_campaign.witness import STEP_S
@@ -123,7 +123,7 @@ def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
     offered = causes_in(text)
     if set(drawn.kinds) <= HARMLESS:
         return False, True  # regardless of the message: the run should not have stopped
-    right = frozenset().union(*(CAUSES[kind] for kind in drawn.kinds))
+    right = causes_of(drawn)
     if not right:
         return True, False  # none of the faults had to stop the run, so the message is not judged
     told = offered & right

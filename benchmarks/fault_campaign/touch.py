@@ -83,7 +83,8 @@ def overwrite_goals(attack: Attack, port: "Middle") -> None:
             address, goal = _write_goal(attack, servo)
             if attack.kind == Kind.RIVAL:  # the program hears it as well
                 said = encode(servo.id, Instruction.WRITE, address.to_bytes(2, "little") + goal)
-                port.bus._wire.put(said, port.bus.advanced_to)
+                wire = port.bus._wire
+                wire.put(said, max(port.bus.advanced_to, wire.reply_by))  # one after the other, not at the same time
 
 
 def _write_goal(attack: Attack, servo: EmulatedServo) -> tuple[int, bytes]:

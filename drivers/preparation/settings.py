@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 
 from hil.drivers.control_table import Register
-from hil.drivers.errors import DriverError, WrongSetting
+from hil.drivers.errors import DriverError, WrongReply, WrongSetting
 from hil.drivers.servo import Servo
 
 EEPROM = ("Current Limit", "Operating Mode")
@@ -39,8 +39,20 @@ WATCHDOG_TRIPPED = 0xFF
 
 
 def read_settings(servo: Servo) -> dict[str, int]:
-    """Return the registers that an experiment may change, by name [ticks]; raises as `Servo.read`."""
-    settings = {name: servo.read(name) for name in (*EEPROM, *RAM) if name in servo.table}
+    """Return the registers that an experiment may change, by name [ticks]; raises as `Servo.read`.
+
+    All are read twice, the second time in reverse order. A reply does not say which register it is of: one that belongs
+    to an earlier request would be stored, and restored, as the value of another register.
+    """
+    names = [name for name in (*EEPROM, *RAM) if name in servo.table]
+    settings = {name: servo.read(name) for name in names}
+    for name in reversed(names):
+        if (again := servo.read(name)) != settings[name]:
+            raise WrongReply(
+                f"{servo.title}: {name} reads {settings[name]}, then {again}: its replies are late and belong to "
+                "earlier requests, or another program changes its settings. Check the adapter, and end other programs "
+                "that use this port."
+            )
     watchdog = servo.read("Bus Watchdog")
     # A tripped watchdog can only be cleared, which switches it off.
     settings["Bus Watchdog"] = 0 if watchdog == WATCHDOG_TRIPPED else watchdog

@@ -6,7 +6,7 @@ The checks take a few us per sample: those of every joint are one compiled loop 
 commands or replies (`deadlines` and `silence`); `command_limits` clamps what is sent.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import copysign, isnan
 from typing import NoReturn
 
@@ -50,6 +50,8 @@ class Guard:
     interval: time between two exchanges [s]; by default, that between two samples. patience: how long an exchange waits
     for missing replies [s].
 
+    heard_instead: returns what arrived instead of replies, with what to do about it; "" if nothing did.
+
     left_by_a_run: whether the arm is where an immediately preceding run left it. One that was stopped at a limit may
     have come to rest slightly beyond it: such a joint may move back in, but no farther out.
     """
@@ -61,6 +63,7 @@ class Guard:
         *,
         interval: float | None = None,
         patience: float = 0.0,
+        heard_instead: Callable[[], str] = str,
         left_by_a_run: bool = False,
     ) -> None:
         rate = config.experiment.rate
@@ -80,6 +83,7 @@ class Guard:
         interval = 1.0 / rate if interval is None else interval
         self._silence = Silence(config, interval, patience)
         self._patience = patience or float("inf")
+        self._heard_instead = heard_instead
         self._deadlines = Deadlines(config)
         self._joints = _joint_records(config, planned, left_by_a_run)
         self._checks = JointChecks(self._joints, interval)
@@ -209,6 +213,8 @@ class Guard:
         )
 
     def _silence_remedy(self) -> str:
+        if heard := self._heard_instead():
+            return heard
         if len(self._missing) == 1 or not all(self._missing):
             return "Check its cable and its supply."
         # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
@@ -284,8 +290,8 @@ class Guard:
             index,
             Cause.FROZEN,
             f"reports a velocity of {state.velocity[index]:+.2f} rad/s that does not fit its position, "
-            f"{state.position[index]:.3f} rad: one of the two readings is frozen or wrong. Check the encoder and its "
-            "magnet; replace the servo if necessary.",
+            f"{state.position[index]:.3f} rad: one of the two readings is frozen or wrong, or its horn slips. Check "
+            "the horn, the encoder and its magnet; replace the servo if necessary.",
         )
 
     def _look_at_clocks(self, slow: Slow, now: float) -> None:

@@ -98,6 +98,7 @@ class Stream:
             planned,
             interval=self._apart,
             patience=bus.prepared.patience,
+            heard_instead=lambda: bus.heard_instead,
             left_by_a_run=self._left_by_a_run,
         )
         self._model: ModelWatch | ChainWatch = (
@@ -137,19 +138,13 @@ class Stream:
         try:
             self._play_all()
         except ExperimentError as error:
-            if isinstance(error, SafetyStop) and (heard := self._told_by_the_bus(error.cause)):
-                error.add_note(heard)
+            if isinstance(error, SafetyStop) and error.cause in _BY_OTHER_GOALS and self._bus.commanded_by_another:
+                error.add_note(self._bus.commanded_by_another)
             if self._lowering is not None and may_lower(self._config, error):
                 self._lower(self._lowering, error)
             elif may_brake(self._config, error):
                 self._brake()
             raise
-
-    def _told_by_the_bus(self, cause: Cause) -> str:
-        """What the bus knows about the cause of a stop; "" for nothing."""
-        if cause is Cause.MISSING:
-            return self._bus.heard_instead
-        return self._bus.commanded_by_another if cause in _BY_OTHER_GOALS else ""
 
     def _play_all(self) -> None:
         self._rest()

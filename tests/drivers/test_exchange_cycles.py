@@ -45,3 +45,21 @@ def test_a_reply_with_data_that_this_program_did_not_ask_for_is_a_strangers(data
     cycles = exchange(wire)
     cycles.cycle([0, 0])
     assert cycles.strangers == strangers
+
+
+def test_a_second_reply_is_awaited_no_longer_than_any() -> None:
+    wire = Wire([FINE])
+    wire.time = 1.0
+    cycles = exchange(wire)
+    assert cycles.cycle([0, 0]).servos[0] == (0, 1, 2, 3)
+    assert 1.0 < wire.time <= 1.0 + cycles.patience + 1e-9
+
+
+@pytest.mark.parametrize("ids", [(1, 2), (1, 2, 3, 4, 5)])
+def test_the_longest_exchange_is_all_that_is_sent_and_received(ids: tuple[int, ...]) -> None:
+    wire = Wire()
+    tables = [XM430] * len(ids)
+    usual = spans(Mode.CURRENT, tables)[:1]
+    cycles = Exchange(wire, ids, [XM430["Goal Current"], *[XM430["Goal PWM"]] * (len(ids) - 1)], usual, 0.0)
+    cycles.cycle([0] * len(ids))
+    assert cycles.longest == pytest.approx(wire.wire_time(len(wire.written[0]) + 21 * len(ids)))

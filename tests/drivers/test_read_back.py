@@ -57,11 +57,25 @@ def test_a_goal_written_after_each_of_ours_is_found_within_a_tenth_of_a_second(f
         assert bus.port.clock.now() - start < 0.1
 
 
-def test_a_goal_written_once_or_twice_is_no_proof(fake_config: Make) -> None:
+@pytest.mark.parametrize("when", [20, 21, 22])
+def test_a_goal_written_once_is_no_proof(fake_config: Make, when: int) -> None:
+    times = iter(range(10_000))
+
+    def once(servos: Any) -> None:
+        if next(times) == when:
+            servos[1].write(102, b"\xf9\xff")
+
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        after_each(bus, once, 100)
+
+
+@pytest.mark.parametrize("when", [20, 21, 22])
+def test_nor_is_a_goal_of_ours_from_long_ago_seen_twice(fake_config: Make, when: int) -> None:
+    """Lost writes leave it, which the status detects."""
     times = iter(range(10_000))
 
     def twice(servos: Any) -> None:
-        if next(times) in (20, 21):
+        if next(times) in (when, when + 1):
             servos[1].write(102, b"\x07\x00")
 
     with driven(fake_config(interval=INTERVAL)) as bus:
@@ -80,6 +94,18 @@ def test_a_foreign_goal_is_told_from_the_first_sighting_until_some_time_after_th
         assert re.search(r"Goal Current of .*shoulder.* was -9 although \d+ had been", bus.commanded_by_another)
         after_each(bus, nothing, 40)
         assert bus.commanded_by_another == ""
+
+
+def test_of_a_goal_of_0_no_other_program_is_accused(fake_config: Make) -> None:
+    """A tripped watchdog or a reboot leaves it."""
+    with driven(fake_config(interval=INTERVAL)) as bus:
+
+        def once(servos: Any) -> None:
+            if not bus.commanded_by_another:
+                servos[2].write(102, b"\0\0")
+
+        after_each(bus, once, 20)
+        assert re.search(r"Goal Current of .*elbow.* was 0 although \d+ had been written\.$", bus.commanded_by_another)
 
 
 def test_a_changed_mode_is_found_within_a_tenth_of_a_second(fake_config: Make) -> None:

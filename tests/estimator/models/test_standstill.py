@@ -77,7 +77,7 @@ def test_short_peaks_that_give_no_visible_velocity_are_none() -> None:
 
 @pytest.mark.parametrize(
     ("angle", "stands", "new"),
-    [(0.3, 1.0, False), (0.3 + 0.9 * WITHIN_RAD, 1.0, False), (0.31, 1.0, True), (0.3, 0.9, True)],
+    [(0.3, 1.0, False), (0.3 + 0.9 * WITHIN_RAD, 1.0, False), (0.3045, 1.0, True), (0.3, 0.9, True)],
 )
 def test_a_joint_that_moves_starts_a_new_band(angle: float, stands: float, new: bool) -> None:
     joint = Joint()
@@ -111,6 +111,14 @@ def test_what_friction_held_is_known_once_the_joint_moves() -> None:
     assert standstill.withstood(joint.rest) == pytest.approx(0.3 - 0.5 * MOMENTUM / FILTER_S), "the most so far"
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_small_excess_is_suspect_too(sign: float) -> None:
+    joint = Joint()
+    joint.alarm(sign * for_s(0.2, 0.2))
+    joint.alarm(-sign * for_s(0.2 - 0.5 * (0.4 - 2 * FRICTION - TOLERANCE), INTERVAL))
+    assert standstill.is_suspect(joint.rest)
+
+
 def test_it_is_suspect_while_the_torque_is_outside_the_band() -> None:
     joint = Joint()
     joint.alarm(for_s(0.2, 0.2))
@@ -121,7 +129,17 @@ def test_it_is_suspect_while_the_torque_is_outside_the_band() -> None:
     assert not standstill.is_suspect(joint.rest)
 
 
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize(("torque", "distance"), [(0.0, -1.5), (1.0, 1.5)])
+def test_earlier_torques_are_judged_by_the_present_estimates(torque: float, distance: float) -> None:
+    """Residuals are then -0.1 and -2.1 N m, and -1.6 or -0.6 now."""
+    rest = standstill.memory(1, 2)[0]
+    standstill.look(rest, 0.3, 1.0, 1.0, np.array([0.5, 1.0]), np.zeros(2))
+    standstill.look(rest, 0.3, 1.0, -1.0, np.array([0.4, 3.0]), np.zeros(2))
+    theta = np.array([2.0, 0.1])
+    assert standstill.look(rest, 0.3, 1.0, torque, np.array([0.7, 2.0]), theta) == pytest.approx(distance)
+
+
+@pytest.mark.parametrize("sign", [-1.0, -0.2, 0.2, 1.0])
 def test_only_terms_that_changed_since_the_farthest_torque_are_uncertain(sign: float) -> None:
     """The second joint's motion changes the first term by 0.2; the second one is the same throughout."""
     rest = standstill.memory(1, 2)[0]

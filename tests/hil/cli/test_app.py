@@ -57,7 +57,7 @@ def test_identify_prints_a_table_and_estimate_gives_the_same_numbers_again(
         "hil estimate run",
     ):
         assert said in printed.out
-    assert "Torque is off on all 2 servos" in printed.err
+    assert "Torque is off on both servos" in printed.err
     first = json.loads(Path("run/result.json").read_text(encoding="utf-8"))
     assert hil("estimate", "run", "--json") == 0
     again = json.loads(capsys.readouterr().out)
@@ -105,7 +105,7 @@ def test_the_run_folder_is_named_after_time_and_arm(arm_file: ArmFile) -> None:
     }  # fmt: skip
     assert (folder / "config.toml").read_bytes() == Path("arm.toml").read_bytes()
     events = [json.loads(line)["event"] for line in (folder / "events.jsonl").read_text(encoding="utf-8").splitlines()]
-    assert events[-1].startswith("Torque is off on all 2 servos")
+    assert events[-1].startswith("Torque is off on both servos")
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_a_failure_is_one_message_and_an_exit_code(
     assert "Traceback" not in printed.err
     assert printed.out == ""
     if "outside" in said:
-        assert "Torque is off on all 2 servos, read back." in printed.err
+        assert "Torque is off on both servos, read back." in printed.err
         assert printed.err.splitlines()[-1].startswith("Next: hil check "), "the last line is what to type next"
 
 
@@ -187,7 +187,7 @@ def test_sigterm_ends_in_a_message_and_exit_code_143(arm_file: ArmFile, tmp_path
         message = process.stderr.read()
         assert process.wait() == 143
     assert "Stopped by SIGTERM." in message
-    assert "Torque is off on all 2 servos, read back." in message
+    assert "Torque is off on both servos, read back." in message
     assert "Traceback" not in message
 
 

@@ -1,13 +1,15 @@
 """What the watch of a spatial arm judges, and what it does not."""
 
+import math
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from hil.config.schema import Config, load_config
-from hil.errors import SafetyStop
+from hil.errors import Cause, SafetyStop
+from hil.experiment import chain_watch
 from hil.experiment.chain_watch import ChainWatch
 from tests.support.paths import CONFIGS
 
@@ -70,3 +72,120 @@ def test_nor_does_it_keep_others_from_being_judged(config: Config) -> None:
     with pytest.raises(SafetyStop, match="hip_roll"):
         for number in range(200):
             look(config, watch, (rest[0] + 0.5, rest[1] + 0.3, rest[2]), (1.0, 0.0, 0.0), number)
+
+
+class Observer:
+    """Records what the watch passes on, and finds the joint `found`."""
+
+    def __init__(self, *given: Any) -> None:
+        self.given = given
+        self.found = -1
+        self.lacking = [0.25, 0.0, 0.0]
+        self.seen: Any = None
+
+    def observe(self, position: Any, velocity: Any, torque: Any, seconds: float, is_free: bool, support: Any) -> int:
+        self.seen = SimpleNamespace(torque=list(torque), seconds=seconds, is_free=is_free, support=support)
+        return self.found
+
+
+def arms(drive: Any, rigid: Any) -> Any:
+    names = ["mass_1", "inertia_2", "moment_2"]
+    return SimpleNamespace(
+        drive=np.array(drive), rigid=np.array(rigid), size=len(rigid), base=SimpleNamespace(names=names)
+    )
+
+
+#                viscous     dry friction  offset      -           scale of the commanded torque
+ONE = arms([[[0.1, 0.2], [0.3, 0.4], [0.5, 0.6], [9.0, 9.0], [2.0, 4.0]]], [[1.0, 2.0, 3.0]])
+TWO = arms([*ONE.drive, *ONE.drive], [[1.0, 2.0, 3.0], [1.4, 2.0, 3.0]])
+
+
+def test_parameters_are_in_units_of_the_commanded_torque() -> None:
+    (told,) = chain_watch.linear_parameters(ONE)
+    assert told.tolist() == pytest.approx([0.5, 0.5, 0.75, 0.05, 0.05, 0.15, 0.1, 0.25, 0.15])
+
+
+def test_the_prior_is_the_ensemble_widened() -> None:
+    """By half as much again, 5 % of each value, and half of the dry friction for the offset."""
+    mean, covariance = chain_watch.observed_parameters(TWO)
+    assert mean.tolist() == pytest.approx([0.6, 0.5, 0.75, 0.05, 0.05, 0.15, 0.1, 0.25, 0.15])
+    wanted = (0.05 * mean) ** 2
+    wanted[0] += 1.5**2 * 0.02  # the variance of 0.5 and 0.7
+    wanted[7:] += np.array([0.075, 0.05]) ** 2
+    assert np.allclose(covariance, np.diag(wanted), rtol=1e-6, atol=1e-11)
+    nothing = arms(np.tile([[[0.0], [0.0], [0.0], [0.0], [1.0]]], (2, 1, 2)), np.zeros((2, 3)))
+    assert chain_watch.observed_parameters(nothing)[1] == pytest.approx(1e-12 * np.eye(9), rel=1e-9, abs=1e-15)
+
+
+@pytest.fixture
+def watch(config: Config, monkeypatch: pytest.MonkeyPatch) -> ChainWatch:
+    monkeypatch.setattr(chain_watch, "ChainObserver", Observer)
+    return ChainWatch(config, [0.5, 1.0, 2.0], cast(Any, TWO))
+
+
+def sees(config: Config, watch: ChainWatch, at: float, **changed: Any) -> Any:
+    """What the observer sees of a sample at this time [s]; angles are relative to the rest pose."""
+    away = np.array(changed.pop("away", (0.0, 0.0, 0.0)))
+    said = {
+        "missing": (False,) * 3,
+        "goal_current": (0.0,) * 3,
+        "position": tuple(np.array(config.arm.rest_pose) + away),
+        "velocity": (0.0,) * 3,
+        **changed,
+    }
+    watch.look(cast(Any, SimpleNamespace(time_before_write=at, **said)))
+    return cast(Any, watch._observer).seen
+
+
+def test_the_observer_is_given_the_planned_torque_and_the_interval(config: Config, watch: ChainWatch) -> None:
+    base, mean, covariance, largest, interval, frictions = cast(Any, watch._observer).given
+    constants = [joint.torque_per_goal for joint in config.joints]
+    assert base is TWO.base and len(mean) == len(covariance) == 9
+    assert list(largest) == pytest.approx(np.array(constants) * [0.5, 1.0, 2.0])
+    assert interval == 1 / config.experiment.rate and frictions == 8.0
+    given = ChainWatch(config, [0.5, 1.0, 2.0], cast(Any, TWO), 0.007)
+    assert cast(Any, given._observer).given[4] == 0.007
+
+
+def test_each_sample_is_judged_by_the_goal_before_it(config: Config, watch: ChainWatch) -> None:
+    constants = np.array([joint.torque_per_goal for joint in config.joints])
+    seen = sees(config, watch, 1.0, goal_current=(0.1, 0.2, 0.3))
+    assert seen.seconds == np.inf and seen.torque == pytest.approx(constants * (0.1, 0.2, 0.3))
+    seen = sees(config, watch, 1.5, goal_current=(0.4, 0.5, 0.6))
+    assert seen.seconds == 0.5 and seen.torque == pytest.approx(constants * (0.1, 0.2, 0.3))
+    assert sees(config, watch, 1.7, missing=(False, True, False)) is seen, "not judged"
+    seen = sees(config, watch, 2.0)
+    assert seen.seconds == 0.5 and seen.torque == pytest.approx(constants * (0.4, 0.5, 0.6))
+
+
+def test_an_arm_in_its_rest_pose_may_be_supported(config: Config, watch: ChainWatch) -> None:
+    assert not sees(config, watch, 0.0, away=(0.079, -0.079, 0.0)).is_free
+    for away in ((0.0, 0.081, 0.0), (0.0, 0.0, -0.081)):
+        assert sees(config, watch, 0.0, away=away).is_free
+
+
+def test_the_stop_of_a_joint_lies_where_it_has_not_been(config: Config, watch: ChainWatch) -> None:
+    seen = sees(config, watch, 0.0, away=(0.081, -0.081, 0.3))
+    assert seen.is_free and seen.support is None, "none is at home"
+    home = {"away": (0.07, -0.07, 0.3), "velocity": (0.06, -0.06, 0.0)}
+    assert sees(config, watch, 0.1, **home).support.tolist() == [-1.0, 1.0, 0.0]
+    moving = {"away": (0.0, 0.0, 0.3), "velocity": (0.061, -0.061, 0.0)}
+    assert sees(config, watch, 0.2, **moving).support.tolist() == [0.0, 0.0, 0.0]
+    sees(config, watch, 0.3, away=(-0.1, 0.0, 0.3))
+    assert sees(config, watch, 0.4, **home).support.tolist() == [0.0, 1.0, 0.0], "the first has been on both sides"
+
+
+def test_what_is_said_of_a_joint_at_rest_and_of_one_that_moves(config: Config, watch: ChainWatch) -> None:
+    constant = config.joints[0].torque_per_goal
+    interval = 1 / config.experiment.rate
+    steps = math.ceil(0.3 / interval)
+    for number in range(steps + 20):  # the goal of sample n is judged, and stored, with sample n + 1
+        sees(config, watch, interval * number, goal_current=(0.01 * number, 0.0, 0.0))
+    cast(Any, watch._observer).found = 0
+    last = steps + 20
+    with pytest.raises(SafetyStop, match="stands still, with ") as stop:
+        sees(config, watch, interval * last, velocity=(0.059, 0.0, 0.0))
+    least, most = 0.01 * (last - steps) * constant, 0.01 * (last - 1) * constant
+    assert f"with {least:+.3f} to {most:+.3f} N m" in str(stop.value) and stop.value.cause is Cause.UNEXPECTED
+    with pytest.raises(SafetyStop, match=r"does not move like any arm .*: \+0\.250 N m"):
+        sees(config, watch, interval * (last + 1), velocity=(-0.06, 0.0, 0.0))

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from benchmarks.fault_campaign.arms import RATES, Setting, names, settings
-from benchmarks.fault_campaign.attack import Kind
+from benchmarks.fault_campaign.attack import Attack, Kind
 from benchmarks.fault_campaign.campaign import Outcome, prepare
-from benchmarks.fault_campaign.judge import received
+from benchmarks.fault_campaign.draw import Drawn
+from benchmarks.fault_campaign.judge import judge_words, received
 from benchmarks.fault_campaign.twin import has_healthy_twin
 from benchmarks.faults import campaign, figures
 
@@ -71,6 +72,35 @@ def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
 def test_every_shipped_configuration_is_in_it_at_every_rate() -> None:
     assert {(each.name, each.rate) for each in settings()} == {(name, rate) for name in names() for rate in RATES}
     assert len(names()) >= 11
+
+
+JUMP = "reports an angle that changed by 0.3 rad within 5 ms; its velocity limit allows at most 0.1. Check the encoder."
+CONTRADICTION = (
+    "reports a velocity that does not fit its position: one of the two readings is frozen. Check the encoder."
+)
+NO_TORQUE = "carries 0.000 instead of the commanded 0.300. Its torque is off."
+UNLIKE_ANY = (
+    "does not move like any arm consistent with the data. Its encoder has failed, something pushes or holds it."
+)
+TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
+
+
+@pytest.mark.parametrize(
+    ("kind", "field", "right", "wrong"),
+    [
+        (Kind.PUSHED, "state", UNLIKE_ANY, JUMP),
+        (Kind.WEAK, "state", NO_TORQUE, CONTRADICTION),
+        (Kind.GOAL_FIGHT, "state", "Another program commands it.", "stands still. Something blocks it."),
+        (Kind.BIAS, "position", JUMP, NO_TORQUE),
+        (Kind.BIAS, "current", NO_TORQUE, JUMP),
+        (Kind.REPEAT, "state", TWICE, "its reply is another servo's."),
+        (Kind.LAG, "velocity", "is at 1 rad, outside its position limit", "Lower velocity_limit, or raise the voltage"),
+    ],
+)
+def test_a_message_that_names_another_fault_is_misleading(kind: Kind, field: str, right: str, wrong: str) -> None:
+    drawn = Drawn((Attack(kind, 1.0, 2.0, field=field),), ())
+    assert judge_words(drawn, right) == (True, False)
+    assert judge_words(drawn, wrong) == (False, True)
 
 
 def test_a_healthy_twin_is_found_for_a_healthy_arm_and_a_stuck_one_but_not_for_one_that_freezes_in_motion() -> None:

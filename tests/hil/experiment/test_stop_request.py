@@ -96,9 +96,9 @@ def test_a_signal_while_torque_is_being_cut_is_not_lost(
     run = RunFolder.create(tmp_path / "run", config)
     with pytest.raises(StopRequested, match="SIGTERM") as stop:
         run_experiment(config, run, config.path, lambda _: None, make_plan(config).first_segment())
-    assert "Torque is off on all 2 servos" in stop.value.__notes__[0]
+    assert "Torque is off on both servos" in stop.value.__notes__[0]
     assert not any(servo.torque_enabled for servo in ports[0].bus.servos.values())
-    assert "Torque is off on all 2 servos" in (run.path / "events.jsonl").read_text(encoding="utf-8")
+    assert "Torque is off on both servos" in (run.path / "events.jsonl").read_text(encoding="utf-8")
 
 
 def test_after_the_torque_is_off_a_signal_ends_the_work_at_once_again() -> None:

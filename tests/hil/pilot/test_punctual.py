@@ -28,7 +28,7 @@ class Plays:
         if not self.causes:
             return "Torque is off."
         stop = SafetyStop("50 ms without a command.", self.causes.pop(0))
-        stop.add_note("Torque is off on all 2 servos.")
+        stop.add_note("Torque is off on both servos.")
         raise stop
 
 
@@ -38,7 +38,7 @@ def test_a_late_computer_repeats_a_run_and_keeps_what_was_recorded(arm: Arm, tmp
     plays, said = Plays(folder, Cause.LATE, Cause.LATE), []
     assert punctual(plays, config, folder, "Pilot", said.append) == "Torque is off."
     assert [line.splitlines()[0] for line in said] == [
-        "Pilot ended early: 50 ms without a command. Torque is off on all 2 servos."
+        "Pilot ended early: 50 ms without a command. Torque is off on both servos."
     ] * 2
     kept = [(folder.path / each / folder.samples_path.name).read_text() for each in ("late-1", "late-2", ".")]
     assert kept == ["recording 1", "recording 2", "recording 3"]

@@ -170,7 +170,7 @@ def test_a_servo_that_answers_again_after_torque_off_is_off_and_put_back(
     assert bench.changed() == []
     stopped = (tmp_path / "run" / "events.jsonl").read_text(encoding="utf-8")
     if isinstance(stop.value, TorqueNotOff):
-        assert str(stop.value).startswith("Torque is off on all 2 servos, read back. Joint 'elbow'"), "the last word"
+        assert str(stop.value).startswith("Torque is off on both servos, read back. Joint 'elbow'"), "the last word"
         assert "answers again" in str(stop.value) and "rebooted" not in str(stop.value)
         assert "NOT CONFIRMED" not in capsys.readouterr().err
         assert "Joint 'elbow' (ID 2, XM430-W350) answers again" in stopped.splitlines()[-1]
@@ -438,5 +438,5 @@ def test_a_stop_between_two_runs_says_that_torque_is_off(
                 pass
         raise stop
     (note,) = raised.value.__notes__
-    assert note.startswith("Torque is off on all") and "read back" in note
+    assert note.startswith(f"Torque is off on {'both' if runs else 'all'} servos") and "read back" in note
     assert ("has not switched it on" in note) is (runs == 0)

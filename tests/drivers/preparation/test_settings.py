@@ -1,0 +1,39 @@
+"""What is stored of a servo's settings, and when nothing is."""
+
+from typing import Any
+
+import pytest
+
+from hil.drivers.control_table import load_control_table
+from hil.drivers.errors import WrongReply
+from hil.drivers.preparation.settings import EEPROM, RAM, read_settings
+
+XM430 = load_control_table("XM430-W350")
+
+
+class Servo:
+    """Each register holds a number of its own; from the n-th read on, replies are one request behind."""
+
+    table, title = XM430, "The servo"
+
+    def __init__(self, behind: range = range(0)) -> None:
+        self._behind = behind
+        self._asked: list[str] = ["Torque Enable"]
+
+    def read(self, register: str) -> int:
+        self._asked.append(register)
+        answered = self._asked[-2 if len(self._asked) - 2 in self._behind else -1]
+        return 0xFF if answered == "Bus Watchdog" else XM430[answered].address
+
+
+def test_every_register_is_stored_and_a_tripped_watchdog_as_one_that_is_off() -> None:
+    servo: Any = Servo()
+    assert read_settings(servo) == {name: XM430[name].address for name in (*EEPROM, *RAM)} | {"Bus Watchdog": 0}
+
+
+@pytest.mark.parametrize("behind", [range(100), range(1, 100), range(13, 100), range(1), range(5, 6), range(2, 20)])
+def test_nothing_is_stored_if_replies_belong_to_earlier_requests(behind: range) -> None:
+    """Each of them would be restored as the value of another register."""
+    servo: Any = Servo(behind)
+    with pytest.raises(WrongReply, match="its replies are late and belong to earlier requests"):
+        read_settings(servo)
