@@ -23,7 +23,7 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
     # cache does.
     on_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if on_file is not None:
-        on_file._source_stamp = code_digest(function)
+        on_file._source_stamp = code_digest(dispatcher)
     return dispatcher
 
 
@@ -39,22 +39,24 @@ def only_version(dispatcher: Any) -> Any:
 
 
 def code_digest(function: Callable[..., Any]) -> str:
-    """Return a hash of the function's code and of all code and constants of this package that it uses."""
+    """Return a hash of the function's code and options, and of all code and constants of this package that it uses."""
     digest = hashlib.sha256()
-    seen: set[FunctionType] = set()
-    waiting = [_plain(function)]
+    seen: set[Callable[..., Any]] = set()
+    waiting = [function]
     while waiting:
-        each = waiting.pop()
-        if each in seen:
+        compiled_or_not = waiting.pop()
+        if compiled_or_not in seen:
             continue
-        seen.add(each)
+        seen.add(compiled_or_not)
+        each = _plain(compiled_or_not)
+        digest.update(_options(compiled_or_not).encode())
         digest.update(repr((each.__module__, each.__name__, each.__defaults__)).encode())
         for code in _codes(each.__code__):
             constants = [value for value in code.co_consts if not isinstance(value, CodeType)]
             digest.update(code.co_code + repr((code.co_names, code.co_varnames, constants)).encode())
         for name, value in _used(each):
             if isinstance(_plain(value), FunctionType):
-                waiting.append(_plain(value))
+                waiting.append(value)
             else:
                 digest.update(f"{name} = {_shown(value)}".encode())
     return digest.hexdigest()
@@ -63,6 +65,12 @@ def code_digest(function: Callable[..., Any]) -> str:
 def _plain(value: Any) -> Any:
     """Return the Python function of a compiled one; anything else as it is."""
     return getattr(value, "py_func", value)
+
+
+def _options(function: Any) -> str:
+    """Return the options that a function is compiled with; empty for one that is not."""
+    options = getattr(function, "targetoptions", {})
+    return repr(sorted((name, sorted(each) if isinstance(each, set) else each) for name, each in options.items()))
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:

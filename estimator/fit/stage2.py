@@ -299,9 +299,7 @@ def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Arr
     """
     names = coordinates.names
     step, white = step_beyond(minimum.at.normal, minimum.at.gradient, coordinates.slopes(minimum.x[: value.size]))
-    known = np.isfinite(std) & (white > 0.0)
-    inflated = float(np.median(std[known] / white[known])) if known.any() else 1.0
-    beyond = beyond_range(value, step, inflated * white, *coordinates.ranges(value))
+    beyond = beyond_range(value, step, white, *coordinates.ranges(value))
     if not (beyond.any() and dependent(names, step, std)):
         beyond[:] = False
     late = limited(dict(zip(names, value.tolist(), strict=True)))

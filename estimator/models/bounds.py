@@ -15,7 +15,8 @@ from hil.estimator.arrays import Array, Mask
 from hil.estimator.models.terms import kind_of, term_of
 
 SURE = 3.0  # standard errors by which the best value lies beyond the range
-FAINTEST = 1e-12  # influence of a coordinate relative to the largest, below which it is not resolved
+NEAR = 0.1  # distance from the edge, relative to the step beyond it, within which a fit has ended there
+FAINTEST = 1e-140  # influence of a coordinate below which its square is not a number
 MOVED = 1.0  # standard errors by which the edge moves another parameter that then depends on it
 
 
@@ -26,8 +27,9 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
     coordinates (coordinates, coordinates) and (coordinates,). slopes: derivatives of the parameters, which are first
     among them, with respect to their coordinates (parameters, parameters).
     """
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scale = np.maximum(scale, FAINTEST * scale.max())
+    # Each coordinate by its own scale: that of a parameter that has run to zero is many orders of magnitude smaller.
+    scale = np.sqrt(np.diag(normal))
+    scale = np.where(scale > FAINTEST, scale, 1.0)
     inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True)
     count = len(slopes)
     step = -(inverse @ (gradient / scale))[:count] / scale[:count]
@@ -37,10 +39,15 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
 
 
 def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Array) -> Mask:
-    """Return which parameters (parameters,) the data significantly drive beyond their range, `lower` to `upper`."""
-    best = value + step
-    beyond: Mask = (best < lower - SURE * std) | (best > upper + SURE * std)
-    return beyond
+    """Return which parameters (parameters,) lie at an edge of their range and are driven beyond it by the data.
+
+    std: standard errors of independent errors. Those that account for the misfit would hide it where the edge is what
+    causes the misfit.
+    """
+    best, near = value + step, NEAR * np.abs(step)
+    below: Mask = (best < lower - SURE * std) & (value - lower <= near)
+    above: Mask = (best > upper + SURE * std) & (upper - value <= near)
+    return below | above
 
 
 def dependent(names: tuple[str, ...], step: Array, std: Array) -> bool:

@@ -14,6 +14,11 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.terms import kind_of, term_of
 
 FAR = 4.0  # standard deviations
+LARGE_RATIO, LARGE_ANGLE = 0.35, 0.3
+"""Relative and absolute deviations [1, rad] of what the file gives that neither a magnet's temperature nor a tolerance
+nor one tooth of a horn explains.
+"""
+LARGE_SPREAD = 0.3  # standard deviation of a logarithm that is printed as a factor
 Trust = Literal["yes", "with care", "no"]
 Source = Literal["file", "description", "servos"]
 """Origin of an expectation: the configuration, the description of the links (URDF), or what is typical of servos."""
@@ -53,14 +58,24 @@ class Conflict:
     source: Source
 
     @property
+    def is_large(self) -> bool:
+        """Whether the deviation is larger than tolerances of the servos and of the assembly."""
+        if self.relative:
+            return bool(abs(np.log(self.value / self.expected)) > np.log1p(LARGE_RATIO))
+        return abs(self.value - self.expected) > LARGE_ANGLE
+
+    @property
     def said(self) -> str:
         """A sentence with the values and the advice."""
-        spread = f"{100.0 * self.spread:.2g} %" if self.relative else f"{self.spread:.2g}"
+        spread = f"+- {self.spread:.2g}"
+        if self.relative:
+            wide = self.spread > LARGE_SPREAD
+            spread = f"within a factor of {np.exp(self.spread):.2g}" if wide else f"+- {100.0 * self.spread:.2g} %"
         usual = _LINK if self.source == "description" else _DRIVE
         advice = next((check for kind, check in _CHECKS.items() if self.name.startswith(kind)), usual)
         return (
             f"{self.name} is {self.value:.3g} +- {self.std:.1g}, {self.deviations:.0f} standard deviations from "
-            f"{self.expected:.3g} +- {spread}, {_SOURCES[self.source]}: {advice}."
+            f"{self.expected:.3g} {spread}, {_SOURCES[self.source]}: {advice}."
         )
 
 
@@ -111,11 +126,12 @@ def worst_first(found: Sequence[Conflict | None]) -> tuple[Conflict, ...]:
 def contradicted(found: Sequence[Conflict], explained: bool) -> str:
     """Return "no", "with care" or "" for contradictions: by how much they lower the verdict.
 
-    explained: whether the model explains the motion. If it does not, an effect that it lacks has distorted a value that
-    was known, and with it presumably all others.
+    explained: whether the model explains the motion. If it does not, and a value that was known is far off, an effect
+    that the model lacks has distorted it, and with it presumably all others.
     """
-    if any(each.source == "file" for each in found):
-        return "with care" if explained else "no"
+    of_file = [each for each in found if each.source == "file"]
+    if of_file:
+        return "no" if not explained and any(each.is_large for each in of_file) else "with care"
     return "with care" if found and not explained else ""
 
 

@@ -187,9 +187,13 @@ class Recorder:
 
 
 def _small_files(path: Path) -> dict[str, bytes]:
-    """Contents of the files next to the recording `path`, such as the configuration, by name."""
-    files = (each for each in path.parent.iterdir() if each != path and each.is_file())
-    return {each.name: each.read_bytes() for each in files if each.stat().st_size <= _SMALL_BYTES}
+    """Contents of the readable files next to the recording `path`, such as the configuration, by name."""
+    found = {}
+    for each in path.parent.iterdir():
+        with contextlib.suppress(OSError):
+            if each != path and each.is_file() and each.stat().st_size <= _SMALL_BYTES:
+                found[each.name] = each.read_bytes()
+    return found
 
 
 def _cut(path: Path, samples: NDArray[np.void], count: int) -> NDArray[np.void]:

@@ -43,7 +43,15 @@ def loop(**changes: str) -> Callable[..., Any]:
 
 def test_the_same_code_has_the_same_digest() -> None:
     assert code_digest(loop()) == code_digest(loop())
-    assert code_digest(numba.njit(loop())) == code_digest(loop())
+    assert code_digest(numba.njit(loop())) == code_digest(numba.njit(loop()))
+
+
+def test_the_options_of_compilation_count() -> None:
+    made = [
+        code_digest(numba.njit(**options)(loop()))
+        for options in ({}, {"fastmath": True}, {"fastmath": {"contract"}}, {"error_model": "numpy"})
+    ]
+    assert len(set(made)) == 4
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,7 @@ from hil.estimator.fit.covariance import (
 )
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.noise_weights import noise_weights
-from hil.estimator.models.bounds import MOVED, beyond_range
+from hil.estimator.models.bounds import MOVED, beyond_range, step_beyond
 from hil.estimator.options import CoordinateOptions, CovarianceOptions, MinimiserOptions
 from hil.estimator.simulation.arm import steps_per_sample
 
@@ -421,21 +421,23 @@ def _fit(
         problem.softness,
         decrease,
         neglected_covariance(problem, x),
-        _at_bound(problem, value, missing, np.sqrt(np.diag(widened))),
+        _at_bound(problem, minimum, value, np.sqrt(np.diag(widened))),
         held_zeros(problem, x, decrease) if test_zeros and problem.model.joints > 1 else None,
     )
 
 
-def _at_bound(problem: ChainProblem, value: Array, missing: Array, std: Array) -> tuple[str, ...]:
+def _at_bound(problem: ChainProblem, minimum: Minimum, value: Array, std: Array) -> tuple[str, ...]:
     """Return the parameters at a bound that the data would exceed, if base parameters depend on them.
 
-    missing: undamped step of the parameters; std: their standard errors at the minimum (parameters,).
+    std: standard errors of the parameters `value` (parameters,).
     """
     names, base = problem.coordinates.names, problem.model.base
     found = list(limited(base, dict(zip(names, value.tolist(), strict=True)), std))
-    if np.any(np.abs(missing[: base.count]) > MOVED * std[: base.count]):
+    slopes = np.diag(problem.coordinates.slopes(minimum.x[: value.size]))
+    step, white = step_beyond(minimum.at.normal, minimum.at.gradient, slopes)
+    if np.any(np.abs(step[: base.count]) > MOVED * std[: base.count]):
         lower = np.where(problem.coordinates.positive, 0.0, -np.inf)
-        beyond = beyond_range(value, missing, std, lower, np.full(value.size, np.inf))
+        beyond = beyond_range(value, step, white, lower, np.full(value.size, np.inf))
         found += [name for name, over in zip(names, beyond, strict=True) if over]
     return tuple(found)
 

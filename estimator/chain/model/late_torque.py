@@ -16,6 +16,8 @@ from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 
 MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
 """Meanings of the kinds of parameters that only chains have."""
+PART = 0.1
+"""Smallest part that a joint has in the motion whose inertia is lost to be named."""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia by which a lagging back-EMF makes it move like a lighter one."""
 _ARMATURE = 10  # of a link's parameters
@@ -53,12 +55,13 @@ def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -
     loss exceeds the standard errors (base parameters or more,) of what the joint's rotor contributes to.
     """
     generating = _generating(base.chain.joints, parameters)
-    if _possible(base, parameters, generating) == 1.0:
+    most, parts = _most_lost(base, parameters, generating)
+    if most <= MOST_LOST:
         return ()
     return tuple(
         f"back_emf_{joint + 1}"
         for joint, share, viscous, late in generating
-        if np.any(np.abs(share * viscous * late * rotor(base, joint)) > std[: base.count])
+        if parts[joint] > PART and np.any(np.abs(share * viscous * late * rotor(base, joint)) > std[: base.count])
     )
 
 
@@ -112,16 +115,26 @@ def _possible(
     base: BaseParameters, parameters: Mapping[str, float], generating: Sequence[tuple[int, float, float, float]]
 ) -> float:
     """Return the fraction, at most 1, of the inertias lost to lagging back-EMF that these joints can lose."""
+    most, _ = _most_lost(base, parameters, generating)
+    return min(1.0, MOST_LOST / most) if most > 0.0 else 1.0
+
+
+def _most_lost(
+    base: BaseParameters, parameters: Mapping[str, float], generating: Sequence[tuple[int, float, float, float]]
+) -> tuple[float, Array]:
+    """Return the largest fraction of its inertia that any motion loses, and the joints' parts in it (joints,)."""
     lost = np.zeros(base.chain.joints)
     for joint, share, viscous, late in generating:
         lost[joint] = share * viscous * late
     if not lost.any() or not np.all(np.isfinite(lost)):
-        return 1.0
+        return 0.0, lost
     every = base.as_all(np.array([parameters[name] for name in base.names]))
     root = np.sqrt(lost)
-    largest = 0.0
+    largest, parts = 0.0, np.zeros_like(lost)
     for pose in _POSES[:, : base.chain.joints]:
         mass = mass_matrix(base.chain, every, pose)
         if np.all(np.isfinite(mass)) and np.linalg.eigvalsh(mass)[0] > 0.0:  # else it cannot be simulated anyway
-            largest = max(largest, float(np.linalg.eigvalsh(root[:, None] * np.linalg.inv(mass) * root)[-1]))
-    return min(1.0, MOST_LOST / largest) if largest > 0.0 else 1.0
+            fractions, motions = np.linalg.eigh(root[:, None] * np.linalg.inv(mass) * root)
+            if fractions[-1] > largest:
+                largest, parts = float(fractions[-1]), np.square(motions[:, -1])
+    return largest, parts

@@ -1,0 +1,38 @@
+"""A fit whose data ask for a value beyond its range says so, however far the coordinate has run."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hil.estimator.identify import identify
+from hil.estimator.models.model import Model
+from tests.support import recorded_arm
+
+MODEL = Model(1, "coulomb", "lag")
+
+
+@pytest.fixture(scope="module")
+def period() -> recorded_arm.SettledPeriod:
+    arm = recorded_arm.servo_arm({"coulomb_width": 0.05}, joints=1)
+    return recorded_arm.record(arm, recorded_arm.wave(1, (0.8,))).rounded()
+
+
+@pytest.mark.parametrize("shift_s", [-5e-5, -1e-3])
+def test_a_lag_that_would_have_to_be_negative_is_at_its_bound(
+    period: recorded_arm.SettledPeriod, shift_s: float
+) -> None:
+    early = replace(period, command_to_sample=period.command_to_sample + shift_s)
+    found = identify(early, MODEL)
+    assert found.parameters["lag"] < 1e-6
+    assert found.at_bound == ("lag",)
+
+
+def test_viscous_friction_that_would_have_to_be_negative_is_at_its_bound(period: recorded_arm.SettledPeriod) -> None:
+    velocity = np.gradient(period.position, 1.0 / period.rate, axis=1)
+    driven = replace(period, torque=period.torque - 0.07 * velocity)
+    assert "viscous_1" in identify(driven, MODEL).at_bound
+
+
+def test_nothing_is_at_a_bound_where_the_model_is_right(period: recorded_arm.SettledPeriod) -> None:
+    assert identify(period, MODEL).at_bound == ()
