@@ -274,3 +274,8 @@ def servo_model(name: str) -> ServoModel:
         return SERVO_MODELS[name]
     except KeyError:
         raise UnknownModel(f"{name!r} is not a supported servo model. Supported: {', '.join(SERVO_MODELS)}.") from None
+
+
+def fastest_no_load() -> float:
+    """No-load speed of the fastest model [rad/s]."""
+    return max(model.no_load.speed for model in _MODELS)

@@ -86,9 +86,9 @@ def _given_twice(error: str, lines: list[str], number: int) -> str:
 
 
 def _given_in(lines: list[str], number: int) -> tuple[str, str] | None:
-    """Table, as in a message, and key that a line gives, counted from 1; the key of a header is "". None for other lines.
+    """Table, as in a message, and key that a line gives, counted from 1; None for other lines.
 
-    Each [[header]] begins another table of the same name.
+    The key of a header is "". Each [[header]] begins another table of the same name.
     """
     table = ""
     for count, line in enumerate(lines[:number], 1):
