@@ -154,7 +154,7 @@ def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
             f"[columns]\ntime = {shown[0]}\nposition = [{shown[1]}, {shown[2]}]\ntorque = [{shown[3]}, {shown[4]}]"
         )
     return CsvError(
-        f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Specify them in --config ARM.toml (in "
-        'Python: config="ARM.toml"), '
+        f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Specify them in --config ARM.toml "
+        '(in Python: config="ARM.toml"), '
         f"for example, if this is their order:\n{example}"
     )
