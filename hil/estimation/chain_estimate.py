@@ -199,7 +199,10 @@ def _verdict(
     else:
         error = float(np.max(held_out))
         joint = config.joints[int(np.argmax(held_out))].name
-        sentences.append(f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst.")
+        sentences.append(
+            f"Beyond the noise of the encoders, a held-out path is predicted to within {100 * error:.2f} % of its "
+            f"motion, {joint} worst."
+        )
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
     if disturbances:
         trust = "with care" if trust == "yes" else trust
