@@ -156,12 +156,15 @@ class ServoModel:
         if goal == 0.0 or velocity * goal <= 0.0 or not abs(carried) < abs(goal):
             return False
         along = max(0.0, math.copysign(1.0, goal) * carried)
-        across = self.resistance * along + self.back_emf * abs(velocity)
+        back_emf = self.back_emf * abs(velocity)
         has_current = along > HARDLY_ANY * abs(goal)
         if supply > 0.0:
+            # The published stall figures of one model differ by up to a factor of two: the weakest motor counts.
+            weakest = max(stall.voltage / stall.current for stall in self.stalls)
+            across = weakest * along + back_emf
             return across >= (LEAST_OF_MEASURED if has_current else LEAST_SUPPLY_AT_NO_LOAD) * supply
         least = LEAST_SUPPLY if has_current else LEAST_SUPPLY_AT_NO_LOAD
-        return across >= least * min(stall.voltage for stall in self.stalls)
+        return self.resistance * along + back_emf >= least * min(stall.voltage for stall in self.stalls)
 
     @property
     def torque_per_ampere(self) -> Published:

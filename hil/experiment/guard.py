@@ -253,14 +253,21 @@ class Guard:
         said = f"carries {carried:.3f} {unit} instead of the commanded {commanded:.3f} {unit}"
         # If the servo holds another goal, that explains its current.
         has_own_goal = self._status.other_goal(index) is None
-        if has_own_goal and model and model.is_out_of_voltage(commanded, carried, velocity, self._supply[index]):
-            self._stop(
-                index,
-                Cause.OUT_OF_VOLTAGE,
-                f"{said} at {velocity:.2f} rad/s: at that speed its supply cannot drive more current against the "
-                f"back-EMF. Lower velocity_limit to {BELOW_VOLTAGE * abs(velocity):.2g} rad/s, or raise the supply "
-                f"voltage.{self._lower_torque}",
-            )
+        if has_own_goal and model and model.is_out_of_voltage(commanded, carried, velocity):
+            slower = f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s"
+            if model.is_out_of_voltage(commanded, carried, velocity, self._supply[index]):
+                why = (
+                    "at that speed its supply cannot drive more current against the back-EMF. Lower velocity_limit to "
+                    f"{slower}, or raise the supply voltage."
+                )
+            else:
+                # Published figures are too uncertain to rule the supply out: the stop is the same.
+                why = (
+                    f"by the published figures {self._supply[index]:.1f} V would drive it at that speed. Its goals are "
+                    "changed on the way or by another program, or its supply sags: check these, or lower "
+                    f"velocity_limit to {slower}."
+                )
+            self._stop(index, Cause.OUT_OF_VOLTAGE, f"{said} at {velocity:.2f} rad/s: {why}{self._lower_torque}")
         seconds = self._joints[index]["found"]
         self._stop(
             index,

@@ -32,21 +32,13 @@ def delivered_speed(config: Config, samples: NDArray[np.void]) -> Array:
     for index, joint in enumerate(config.joints):
         if joint.drive_mode is not Mode.CURRENT:
             continue
-        supply = _lowest_voltage(samples, index)
         columns = (last[name][:, index].tolist() for name in ("goal_current", "current", "velocity"))
         behind = [
             abs(velocity)
             for goal, carried, velocity in zip(*columns, strict=True)
             if abs(carried) < (1.0 - config.safety.follow_share) * abs(goal)
-            and joint.joint.servo.is_out_of_voltage(goal, carried, velocity, supply)
+            and joint.joint.servo.is_out_of_voltage(goal, carried, velocity)
         ]
         if behind:
             speed[index] = BELOW_VOLTAGE * max(behind)
     return speed
-
-
-def _lowest_voltage(samples: NDArray[np.void], joint: int) -> float:
-    """Lowest supply voltage of a joint in a recording [V]; NaN if none was read."""
-    read = samples["supply_voltage"][:, joint]
-    read = read[np.isfinite(read) & (read > 0.0)]
-    return float(read.min()) if read.size else math.nan
