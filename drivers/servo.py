@@ -86,7 +86,7 @@ class Servo:
                 return [], COMM_RX_CORRUPT, error
             return data, result, error
 
-        return entry.decode(bytes(self._try(f"reading {entry.name}", ask, attempts)))
+        return entry.decode(bytes(self._try(f"reading {entry.name}", ask, attempts, is_read=True)))
 
     def write(self, register: str, value: int, attempts: int | None = None) -> None:
         """Write a register and read it back; raises as `read`, and ServoRefused if another value is read back.
@@ -116,14 +116,19 @@ class Servo:
         """Return the Hardware Error Status, the reason for a raised alert bit; raises as `read`."""
         return HardwareError(self.read("Hardware Error Status"))
 
-    def _try(self, what: str, action: Callable[[], tuple[_T, int, int]], attempts: int = _ATTEMPTS) -> _T:
+    def _try(
+        self, what: str, action: Callable[[], tuple[_T, int, int]], attempts: int = _ATTEMPTS, *, is_read: bool = False
+    ) -> _T:
         """Run one SDK exchange until it succeeds, at most `attempts` times; turn result codes into exceptions."""
         late = False
-        for _ in range(attempts):
+        for left in reversed(range(attempts)):
             value, result, error = action()
             if result == COMM_SUCCESS:
                 break
             late = late or result == COMM_RX_TIMEOUT
+            if left == 1 and result != COMM_RX_TIMEOUT and is_read:
+                # A busy computer delivers replies late and in pieces, which are then discarded before the last attempt.
+                self.port.clock.wait_until(self.port.clock.now() + _LATE_S)
         if late and result == COMM_SUCCESS:
             # Late replies to the requests that timed out may still arrive and would be taken for the next reply.
             self.port.clock.wait_until(self.port.clock.now() + _LATE_S)
@@ -137,7 +142,8 @@ class Servo:
             text = self._sdk.getTxRxResult(result).removeprefix("[TxRxResult] ").rstrip("!. ").lower()
             raise WrongReply(
                 f"{self.title}: {what} failed: the reply is corrupted or does not match the request ({text}). Check "
-                f"its cable and supply, and for a second servo with ID {self.id}."
+                f"its cable and supply, and for a second servo with ID {self.id}. Replies may also have come too late "
+                "because other programs keep this computer busy: then close them and try again."
             )
         refused = error & ~ALERT
         if refused:

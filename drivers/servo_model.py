@@ -48,6 +48,9 @@ LEAST_SUPPLY = 0.6
 """Lowest voltage across a motor that counts as that of its supply, relative to the lowest one published: supplies sag,
 and resistance and no-load speed differ by tens of percent from servo to servo."""
 
+LEAST_OF_MEASURED = 0.75
+"""The same ratio if the supply was measured: it may sag between two readings, and motors differ."""
+
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
 """Fraction of the goal below which a current may as well be that of a servo without torque, and the same ratio then."""
 
@@ -141,20 +144,27 @@ class ServoModel:
         """Back-EMF per velocity of the output shaft [V s/rad]."""
         return self.no_load.voltage / self.no_load.speed
 
-    def is_out_of_voltage(self, goal: float, carried: float, velocity: float) -> bool:
+    def is_out_of_voltage(self, goal: float, carried: float, velocity: float, supply: float = math.nan) -> bool:
         """Whether a current stays behind its goal because the supply cannot drive more through the turning motor.
 
         It is taken for the cause if the motor turns in the direction of its goal and the voltage across its terminals,
-        that of its winding and its back-EMF, is about that of a supply. A servo without torque has the back-EMF alone.
+        that of its winding and its back-EMF, is about the supply's. A servo without torque has the back-EMF alone.
 
-        goal, carried: commanded and measured current [A]. velocity: of the output shaft [rad/s].
+        goal, carried: commanded and measured current [A]. velocity: of the output shaft [rad/s]. supply: lowest
+        measured voltage of the supply [V]; NaN if unknown, in which case it may be as low as supplies ever are.
         """
         if goal == 0.0 or velocity * goal <= 0.0 or not abs(carried) < abs(goal):
             return False
         along = max(0.0, math.copysign(1.0, goal) * carried)
-        across = self.resistance * along + self.back_emf * abs(velocity)
-        least = LEAST_SUPPLY if along > HARDLY_ANY * abs(goal) else LEAST_SUPPLY_AT_NO_LOAD
-        return across >= least * min(stall.voltage for stall in self.stalls)
+        back_emf = self.back_emf * abs(velocity)
+        has_current = along > HARDLY_ANY * abs(goal)
+        if supply > 0.0:
+            # The published stall figures of one model differ by up to a factor of two: the weakest motor counts.
+            weakest = max(stall.voltage / stall.current for stall in self.stalls)
+            across = weakest * along + back_emf
+            return across >= (LEAST_OF_MEASURED if has_current else LEAST_SUPPLY_AT_NO_LOAD) * supply
+        least = LEAST_SUPPLY if has_current else LEAST_SUPPLY_AT_NO_LOAD
+        return self.resistance * along + back_emf >= least * min(stall.voltage for stall in self.stalls)
 
     @property
     def torque_per_ampere(self) -> Published:
@@ -267,3 +277,8 @@ def servo_model(name: str) -> ServoModel:
         return SERVO_MODELS[name]
     except KeyError:
         raise UnknownModel(f"{name!r} is not a supported servo model. Supported: {', '.join(SERVO_MODELS)}.") from None
+
+
+def fastest_no_load() -> float:
+    """No-load speed of the fastest model [rad/s]."""
+    return max(model.no_load.speed for model in _MODELS)

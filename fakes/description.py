@@ -1,6 +1,5 @@
 """The [fake] table of an arm's TOML file: the fake servos on the bus, and what they move."""
 
-import tomllib
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -24,6 +23,7 @@ from hil.fakes.servo.health import Overload, Thermal
 from hil.fakes.servo.registers import BAUD_RATES, MODEL_NAMES, all_model_names, load_model
 from hil.fakes.servo.servo import EmulatedServo
 from hil.toml_errors import Described, describe, meant_name
+from hil.toml_file import TomlFileError, load_toml
 
 __all__ = ["DescriptionError", "FakeArm", "FakeServo", "beside", "found_beside", "load_fake", "make_bus"]
 
@@ -207,14 +207,10 @@ def load_fake(path: Path | str) -> FakeArm:
     Other tables of the file are ignored. Raises `DescriptionError`.
     """
     try:
-        text = find_arm(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise DescriptionError(f"{path} cannot be read: {reason}{_known_names(str(path))}") from error
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise DescriptionError(f"{path} is not TOML: {error}") from error
+        document = load_toml(find_arm(path))
+    except TomlFileError as error:
+        hint = _known_names(str(path)) if isinstance(error.__cause__, OSError) else ""
+        raise DescriptionError(f"{str(error).rstrip('.')}{hint}") from error
     table = document.get("fake")
     if not isinstance(table, dict):
         raise DescriptionError(f"{path} has no [fake] table, so there is no fake arm to open")

@@ -27,13 +27,13 @@ def _read(path: Path) -> dict[str, Any]:
     if path.is_dir() and not file.is_file():
         raise ResultError(_no_result(path))
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
         raise ResultError(f"{file} cannot be read: {reason}.") from error
     try:
         result = tomllib.loads(text) if file.suffix == ".toml" else json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ResultError(f"{file} is incomplete or damaged: {error}. Recreate it with hil estimate RUN.") from error
     if not isinstance(result, dict) or "schema" not in result:
         raise ResultError(f"{file} is not a result file of hil: it has no schema.")

@@ -1,6 +1,5 @@
 """Error messages for TOML files, and for the same tables written in Python: key, value, and what is allowed."""
 
-import codecs
 import difflib
 import re
 from collections.abc import Sequence
@@ -116,7 +115,14 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
         about = key if isinstance(detail["input"], dict | BaseModel) else f"{key} = {_shown(detail['input'])}"
         return f"{about}: {context['error']}" if key else str(context["error"])
     message = _EXPECTED.get(kind) or _constraint(kind, context, detail["input"]) or str(detail["msg"])
-    return f"{key} = {_shown(detail['input'])}: {message}{_unit_hint(detail, root)}"
+    return f"{key} = {_shown(detail['input'])}: {message}{_unit_hint(detail, root)}{_brackets_hint(key, detail)}"
+
+
+def _brackets_hint(key: str, detail: Any) -> str:
+    """For a table written once where a list of tables is expected: how such a list is written."""
+    if detail["type"] not in {"list_type", "tuple_type"} or not isinstance(detail["input"], dict):
+        return ""
+    return f". Write [[{key}]] with double brackets, once for each entry, instead of [{key}]"
 
 
 def _as_list(detail: Any, joints: int | None) -> str:
@@ -191,50 +197,6 @@ def _in_thousands(expected: str, value: object) -> str:
         if meant in expected.replace(",", "").split():
             return f". If it is in {name}, write {meant}"
     return ""
-
-
-def encoding_of(path: Path) -> str:
-    """What a file that is not UTF-8 text is, and how to save it as such."""
-    data = path.read_bytes()
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and (b"=\0" in data or b"\0=" in data):
-        return "UTF-16 text, as some Windows programs write it: save it with the encoding UTF-8"
-    return "not UTF-8 text"
-
-
-def not_toml(path: Path, error: Exception, text: str) -> str:
-    """The error message for a file with this text, which the TOML parser rejects: the line, and the likely cause."""
-    other = {".yaml": "YAML", ".yml": "YAML", ".json": "JSON", ".xml": "XML", ".urdf": "XML", ".csv": "CSV"}
-    kind = other.get(path.suffix.lower())
-    if kind is not None:
-        return f"{path}: judging by its name, it is {kind}; hil's files are TOML. `hil init` writes one."
-    lines = text.splitlines()
-    place = re.search(r"at line (\d+)", str(error))
-    number = int(place[1]) if place else 0
-    if not 0 < number <= len(lines):
-        return f"{path}: not valid TOML: {error}."
-    line = lines[number - 1].strip()
-    cause = next((said for pattern, said in _SYNTAX if re.search(pattern, _unquoted(line))), "")
-    return f"{path}: not valid TOML: {error}:\n  {line}" + (f"\n{cause}" if cause else "")
-
-
-_NUMBER = r"[-+]?\d[\d_.]*(?:[eE][-+]?\d+)?"
-_SYNTAX = (
-    (rf"{_NUMBER}\s*(?:°|º|deg)", "Angles are numbers in rad, without a sign or unit: 90 degrees are 1.5708."),
-    (rf"=\s*{_NUMBER.replace('.', '', 1)},\d+\s*$", "The decimal sign is a point, not a comma: 4.0, not 4,0."),
-    (r"[\[,]\s*[-+]?\d+,0\d", "The decimal sign is a point, not a comma: 1.06, not 1,06."),
-    (r"[=\[,]\s*(?:True|False|TRUE|FALSE)\b", "Write true or false in lower case."),
-    (r"[=\[,]\s*(?:yes|no|on|off|None|null|nil)\b", "Write true or false; leave out a key that has no value."),
-    (rf"[=\[,]\s*{_NUMBER}\s*[%A-Za-zµμΩ]", "Write the number without its unit; each key has one fixed unit."),
-    (r"=\s*[A-Za-z/]", "Text needs quotes."),
-    (r"=\s*$", "The value is missing."),
-    (r"^\w[\w.-]*\s*:", "Write = between key and value, not a colon."),
-    (r"[“”‘’„]", "Use straight quotes."),
-)
-"""Patterns of a rejected line without its comment and quoted texts, and the likely cause of each."""
-
-
-def _unquoted(line: str) -> str:
-    return re.sub(r"\"[^\"]*\"|'[^']*'", '""', line).partition("#")[0].strip()
 
 
 def _bound(value: float) -> str:

@@ -150,9 +150,14 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
 
 
 def loaded(config: ConfigLike) -> tuple[Config, Path]:
-    """Load and check the configuration; also return its path as the caller wrote it. Raises ConfigError."""
+    """Load and check the configuration; also return its path as the caller wrote it. Raises ConfigError, TypeError."""
     if isinstance(config, Config):
         return config, config.path
+    if not isinstance(config, str | PathLike):
+        raise TypeError(
+            "config must be a TOML file, the name of a bundled configuration or the result of hil.load_config, not "
+            f"{config!r}."
+        )
     return load_config(Path(config)), Path(config)
 
 

@@ -15,7 +15,6 @@ The TOML file of an experiment can be used, or a shorter one; tables that only t
     zero = [-1.5707963, 0.0]                          # rad added to the column: joint 1 from the horizontal
 """
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -26,6 +25,7 @@ from hil.config.known_quantities import KnownConfig
 from hil.config.table import Angle, Turned
 from hil.errors import ConfigError
 from hil.toml_errors import describe
+from hil.toml_file import TomlFileError, parse_toml, read_toml_text
 
 Gain = Annotated[float, Field(gt=0, le=100)]
 Column = Annotated[str, Field(min_length=1)]
@@ -194,18 +194,18 @@ class RecordingConfig(BaseModel):
 def load_recording_config(path: Path) -> RecordingConfig:
     """Read and check the file; raises ConfigError."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}.") from error
+        text = read_toml_text(path)
+    except TomlFileError as error:
+        raise ConfigError(str(error)) from error
     return parse_recording_config(text, path)
 
 
 def parse_recording_config(text: str, path: Path) -> RecordingConfig:
     """Check `text`, the contents of `path`; raises ConfigError."""
     try:
-        values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}.") from error
+        values = parse_toml(text, path)
+    except TomlFileError as error:
+        raise ConfigError(str(error)) from error
     try:
         return RecordingConfig.model_validate(_with_urdf_beside(values, path))
     except ValidationError as error:

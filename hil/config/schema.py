@@ -5,7 +5,6 @@ allowed.
 """
 
 import math
-import tomllib
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -39,7 +38,8 @@ from hil.estimator.excitation.harmonics import harmonics_within
 from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import arm_names, find_arm
 from hil.next_step import command
-from hil.toml_errors import describe, encoding_of, not_toml
+from hil.toml_errors import describe
+from hil.toml_file import TomlFileError, load_toml, parse_toml, read_toml_text
 from hil.unit_hints import in_other_units
 
 __all__ = [
@@ -317,15 +317,14 @@ class Config(Table):
 def load_config(path: str | PathLike[str]) -> Config:
     """Read and check a TOML file, or the bundled one of that bare name. Raises ConfigError."""
     path = find_config(Path(path))
+    if path.is_dir():
+        within = next(iter(sorted(path.glob("*.toml"))), None)
+        hint = "." if within is None else f"; did you mean {within}?"
+        raise ConfigError(f"{path} cannot be read: it is a folder{hint}")
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or f"it is {encoding_of(path)}"
-        if path.is_dir():
-            within = next(iter(sorted(path.glob("*.toml"))), None)
-            reason = "it is a folder" + ("" if within is None else f"; did you mean {within}?")
-        end = "" if reason.endswith("?") else f".{meant(path)}"
-        raise ConfigError(f"{path} cannot be read: {reason}{end}") from error
+        text = read_toml_text(path)
+    except TomlFileError as error:
+        raise ConfigError(f"{error}{meant(path)}") from error
     return parse_config(text, path)
 
 
@@ -336,9 +335,9 @@ def parse_config(text: str, path: Path, *, recorded: bool = False) -> Config:
     arms could contain arm.link_lengths, without effect.
     """
     try:
-        values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(not_toml(path, error, text)) from error
+        values = parse_toml(text, path)
+    except TomlFileError as error:
+        raise ConfigError(str(error)) from error
     if "path" in values:
         raise ConfigError(f"{path}: path is not a known key.")
     if "joints" not in values and "study" in values:
@@ -420,8 +419,8 @@ def port_url(port: str) -> str:
 def _is_only_fake(path: Path) -> bool:
     """Whether a TOML file describes nothing but a fake arm, which `hil fake` accepts."""
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        values = load_toml(path)
+    except TomlFileError:
         return False
     return "fake" in values and "port" not in values and "joints" not in values
 

@@ -80,7 +80,7 @@ def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
 def parse_urdf(path: Path) -> ET.Element:
     """Parse the file and return its root element, keeping comments. Raises ArmFileError."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ArmFileError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
     if "<!DOCTYPE" in text or "<!ENTITY" in text:

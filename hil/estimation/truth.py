@@ -1,13 +1,29 @@
-"""The true parameters of a fake arm."""
+"""The true parameters of a fake arm, and the same in the unit of torque that a result has.
+
+Motion and current determine the parameters only up to the torque constants: a result is in the torque that the file's
+constants imply, which need not be those of the fake arm's motors.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.estimation.torque_constants import RATIO
+from hil.estimator.chain.model.tilt import TILT
+from hil.estimator.models.terms import RIGID_BODY, TERMS, joint_of, kind_of, term_of
 from hil.fakes.description import FakeArm
 from hil.fakes.plants.arm import Drive, base_parameters
 from hil.fakes.servo.registers import load_model
+from hil.results.parts import Quantity
+from hil.results.result import Result
+
+_EQUAL = 1e-4
+"""Relative difference up to which two torque constants are equal."""
+
+_DETERMINED = 0.02
+"""Largest standard error, relative to the true value, of a well determined parameter."""
 
 
 def true_parameters(config: Config, time: float = math.inf) -> dict[str, float] | None:
@@ -37,3 +53,77 @@ def back_emf(config: Config, fake: FakeArm, drives: Sequence[Drive]) -> dict[str
             damping = drives[moved].torque_constant * motor.back_emf_v_s / motor.resistance_ohm
             found[name] = found.get(name, 0.0) + damping
     return found
+
+
+@dataclass(frozen=True)
+class Truth:
+    """True values in the file's unit of torque. note: how they differ from the arm's own; "" if they do not.
+
+    Left out are values that several joints' torques determine if the constants of these joints are wrong in different
+    ways: there is no unit that such a value is in.
+    """
+
+    values: dict[str, float]
+    note: str
+
+    def standard_errors(self, name: str, found: Quantity) -> float | None:
+        """The error of an estimate in its own standard errors; None if there is no truth or no standard error."""
+        if name not in self.values or not 0.0 < found.std < math.inf:
+            return None
+        return (found.value - self.values[name]) / found.std
+
+    def is_determined(self, name: str, found: Quantity) -> bool:
+        """Whether the parameter is known so well that its error relative to its true value means something."""
+        return name in self.values and found.std <= _DETERMINED * abs(self.values[name])
+
+
+def truth_of(result: Result, config: Config) -> Truth:
+    """The truth stored in a result, in the unit of torque that the result has."""
+    ratios = _torque_ratios(config)
+    truth = result.truth or {}
+    if not truth or all(abs(ratio - 1.0) <= _EQUAL for ratio in ratios):
+        return Truth(dict(truth), "")
+    factors = {name: _factor(name, ratios, result.extra, result.joints) for name in truth}
+    values = {name: factor * truth[name] for name, factor in factors.items() if factor is not None}
+    named = [
+        f"{joint.name} {100 * (1 / ratio - 1):+.2g} %"
+        for joint, ratio in zip(config.joints, ratios, strict=True)
+        if abs(ratio - 1.0) > _EQUAL
+    ]
+    note = (
+        f"The torque constants of the fake arm's motors differ from the file's ({', '.join(named)}), and the result is "
+        "in the torque that the file's constants imply: the true values are shown in that unit"
+    )
+    left = (
+        ""
+        if len(values) == len(truth)
+        else "; those that joints with different errors determine together are not shown"
+    )
+    return Truth(values, f"{note}{left}.")
+
+
+def _torque_ratios(config: Config) -> list[float]:
+    """Torque per goal according to the file over that of the fake arm's motors, per joint; 1 if that is unknown."""
+    fake = config.fake
+    arm = None if not config.is_fake or fake is None else fake.arm or fake.chain
+    if fake is None or arm is None:
+        return [1.0] * len(config.joints)
+    ratios = [1.0] * len(config.joints)
+    for servo, moved in zip(fake.servos, fake.joints, strict=True):
+        joint, true = config.joints[moved], arm.drives[moved].torque_constant
+        if joint.drive_mode is Mode.PWM:
+            true /= load_model(servo.model).resistance_ohm
+        ratios[moved] = joint.torque_per_goal / true
+    return ratios
+
+
+def _factor(name: str, ratios: Sequence[float], extra: Mapping[str, Quantity], joints: int) -> float | None:
+    """What the true value is multiplied by; None if the joints that determine it have different ratios."""
+    if name in TILT or (kind_of(name) in TERMS and not term_of(name).of_torque):
+        return 1.0
+    if any(kind_of(each) == RATIO for each in extra):
+        return ratios[0]
+    last = joint_of(name) or joints
+    own_row = kind_of(name) in TERMS and (name not in RIGID_BODY.get(joints, ()) or name.startswith("armature"))
+    among = ratios[last - 1 : last] if own_row else ratios[:last]
+    return among[0] if max(among) - min(among) <= _EQUAL * among[0] else None

@@ -15,7 +15,7 @@ import numpy as np
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
 from hil.drivers.packet import ALERT, StatusError
-from hil.drivers.servo_model import Mode
+from hil.drivers.servo_model import HARDLY_ANY, Mode
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
 from hil.experiment import following, joint_checks, work
@@ -72,6 +72,7 @@ class Guard:
         self._names = [str(joint.joint) for joint in config.joints]
         self._safety = safety
         currents = (joint.drive_mode is Mode.CURRENT for joint in config.joints)
+        self._units = [joint.drive_mode.goal_unit for joint in config.joints]
         self._models = [
             joint.joint.servo if by_current else None for joint, by_current in zip(config.joints, currents, strict=True)
         ]
@@ -92,6 +93,8 @@ class Guard:
         self._missing = self._silence.counts
         self._resting: tuple[float, ...] | None = None
         self._shortest = float("inf")
+        self._supply = [float("nan")] * len(config.joints)
+        """Lowest measured supply voltage of each joint [V]; NaN before the first reading."""
 
     def clamp(self, goals: Sequence[float]) -> list[float]:
         """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""
@@ -118,6 +121,7 @@ class Guard:
         took = state.time_after_read - now
         gap = watchdog_gap if watchdog_gap > took else took
         self._deadlines.check_gap(gap)
+        self._status.sent(state.goal_current)
         self._silence.ask(now)
         self._silence.woke_up(now, took - self._patience)
         if took < self._shortest:
@@ -229,7 +233,7 @@ class Guard:
             index,
             Cause.JUMP,
             f"reports an angle that changed by {joint['moved']:+.3f} rad within {1e3 * joint['seconds']:.0f} ms; its "
-            f"velocity limit allows at most {joint['most']:.3f}. Check the encoder, its magnet and the supply.",
+            f"velocity limit allows at most {joint['most']:.3f} rad. Check the encoder, its magnet and the supply.",
         )
 
     def _outside(self, index: int, state: State) -> NoReturn:
@@ -245,36 +249,54 @@ class Guard:
         self._stop(
             index,
             Cause.VELOCITY,
-            f"moves at {state.velocity[index]:.2f} rad/s, more than its velocity limit "
-            f"{self._joints[index]['fastest']:g}.{self._lower_torque}",
+            f"moves at {state.velocity[index]:.2f} rad/s, more than its velocity limit of "
+            f"{self._joints[index]['fastest']:g} rad/s.{self._lower_torque}",
         )
 
     def _not_followed(self, index: int, state: State) -> NoReturn:
-        carried, commanded, joint = state.current[index], state.goal_current[index], self._joints[index]
-        velocity, model = state.velocity[index], self._models[index]
-        if model is not None and model.is_out_of_voltage(commanded, carried, velocity):
-            self._stop(
-                index,
-                Cause.OUT_OF_VOLTAGE,
-                f"carries {carried:.3f} A instead of the commanded {commanded:.3f} at {velocity:.2f} rad/s: at that "
-                f"speed its supply cannot drive more current against the back-EMF. Lower velocity_limit to "
-                f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s, or raise the supply voltage.{self._lower_torque}",
-            )
-        away = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
-        is_driven = away > abs(commanded) + joint["following"]["allowed"] or away < -joint["following"]["allowed"]
-        if is_driven:
-            causes = "It has torque, but another: another program commands it, or its current sensor is wrong."
-        else:
-            causes = (
-                "Its torque is off, it was rebooted, its watchdog acted, or it cannot deliver this much at its speed "
-                "and supply voltage (safety.follow_share)."
-            )
+        carried, commanded, velocity = state.current[index], state.goal_current[index], state.velocity[index]
+        model, unit = self._models[index], self._units[index]
+        said = f"carries {carried:.3f} {unit} instead of the commanded {commanded:.3f} {unit}"
+        # If the servo holds another goal, that explains its current.
+        has_own_goal = self._status.other_goal(index) is None
+        if has_own_goal and model and model.is_out_of_voltage(commanded, carried, velocity):
+            slower = f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s"
+            if model.is_out_of_voltage(commanded, carried, velocity, self._supply[index]):
+                why = (
+                    "at that speed its supply cannot drive more current against the back-EMF. Lower velocity_limit to "
+                    f"{slower}, or raise the supply voltage."
+                )
+            else:
+                # Published figures are too uncertain to rule the supply out: the stop is the same.
+                why = (
+                    f"by the published figures {self._supply[index]:.1f} V would drive it at that speed. Its goals are "
+                    "changed on the way or by another program, or its supply sags: check these, or lower "
+                    f"velocity_limit to {slower}."
+                )
+            self._stop(index, Cause.OUT_OF_VOLTAGE, f"{said} at {velocity:.2f} rad/s: {why}{self._lower_torque}")
+        seconds = self._joints[index]["found"]
         self._stop(
             index,
             Cause.NOT_FOLLOWING,
-            f"carries {carried:.3f} instead of the commanded {commanded:.3f}, for {1e3 * joint['found']:.0f} ms. "
-            f"{causes}",
+            f"{said}, by the readings of the last {1e3 * seconds:.0f} ms. {self._why_not_followed(index, state)}",
         )
+
+    def _why_not_followed(self, index: int, state: State) -> str:
+        carried, commanded, unit = state.current[index], state.goal_current[index], self._units[index]
+        held = self._status.other_goal(index)
+        if held is not None and abs(carried - held) < abs(carried - commanded):
+            return (
+                f"Its goal register reads {held:.3f} {unit}, which fits what it carries: another program commands it, "
+                "or goals are changed or lost on the way."
+            )
+        along = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
+        allowed = self._joints[index]["following"]["allowed"]
+        if along > abs(commanded) + allowed or along < -allowed:
+            return "It has torque, but another: another program commands it, or its current sensor is wrong."
+        weak = "it cannot deliver this much at its speed and supply voltage (safety.follow_share)."
+        if along > HARDLY_ANY * abs(commanded):
+            return f"Its goals are changed on the way or by another program, its current sensor is wrong, or {weak}"
+        return f"Its torque is off, it was rebooted, its watchdog acted, or {weak}"
 
     def _not_together(self, index: int, servo: int, turned: float) -> NoReturn:
         ids = self._seconds[index]
@@ -318,6 +340,8 @@ class Guard:
     def _look_slow(self, slow: Slow) -> None:
         safety = self._safety
         for index, (celsius, volt) in enumerate(zip(slow.temperature, slow.voltage, strict=True)):
+            if volt > 0.0 and not volt >= self._supply[index]:
+                self._supply[index] = volt
             if celsius > safety.max_temperature:
                 self._stop(
                     index,

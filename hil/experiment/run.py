@@ -230,9 +230,10 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
         )
     if bus.port.latency_measured:
         raise WrongSetting(
-            f"experiment.rate = {rate:g}: this adapter was found to delay replies by "
-            f"{bus.port.latency * 1e3:.0f} ms, which allows at most {1 / slowest:.0f} Hz. Lower the rate, or use a "
-            "wired adapter with a short latency, such as a U2D2."
+            f"experiment.rate = {rate:g}: replies take {bus.port.latency * 1e3:.0f} ms longer than their bytes, even "
+            f"the fastest of many, which allows at most {1 / slowest:.0f} Hz. If other programs keep this computer "
+            "busy, close them and start again. Otherwise the adapter is slow: lower the rate, or use a wired adapter "
+            "with a short latency, such as a U2D2."
         )
 
 

@@ -5,6 +5,10 @@ sensor. The registers are read back several times per 0.1 s (hil.drivers.bus), s
 within 0.1 s.
 """
 
+from collections import deque
+from collections.abc import Sequence
+from itertools import islice
+
 from hil.config.schema import Config
 from hil.drivers.packet import HardwareError
 from hil.drivers.servo import describe_error
@@ -24,6 +28,12 @@ _STALE_READINGS = 2
 _GOALS_MISSED = 2
 """Consecutive mismatches before a goal counts as lost, because a single packet may be lost."""
 
+_REMEMBERED = 256
+"""Number of latest goals that are kept."""
+
+_HELD_BEFORE = 4
+"""Number of goals before a matching status that a servo may hold if its writes are lost."""
+
 
 class StatusCheck:
     """Compares reported values with the commanded ones. `look` returns the fault, or None."""
@@ -34,6 +44,14 @@ class StatusCheck:
         self._half_tick = [0.5 * abs(joint.joint.drive_unit(12.0)) for joint in config.joints]
         self._unit = [joint.drive_mode.goal_unit for joint in config.joints]
         self._missed = [0] * len(config.joints)
+        self._has_one_servo = [len(joint.ids) == 1 for joint in config.joints]
+        self._goals: deque[Sequence[float]] = deque(maxlen=_REMEMBERED)
+        self._cycles = 0
+        # Per joint: goal in the latest status if it differs from that sent [A or V], the number of goals sent when they
+        # last agreed, and whether a goal that this program did not send was seen since then.
+        self._held: list[float | None] = [None] * len(config.joints)
+        self._agreed_at = [0] * len(config.joints)
+        self._is_foreign = [False] * len(config.joints)
         # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
         self._clock = [(0.0, 0.0, 0, 0)] * len(config.joints)
 
@@ -41,6 +59,15 @@ class StatusCheck:
     def is_in_doubt(self) -> bool:
         """Whether the latest status was wrong in a way that one lost packet could explain: read it again at once."""
         return any(self._missed) or any(stale for *_, stale in self._clock)
+
+    def sent(self, goals: Sequence[float]) -> None:
+        """Remember the goals (joints,) of an exchange [A or V]."""
+        self._goals.append(goals)
+        self._cycles += 1
+
+    def other_goal(self, joint: int) -> float | None:
+        """The goal in the joint's latest status [A or V] if it differs from that sent; otherwise None."""
+        return self._held[joint]
 
     def look(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
         """Check a status reading; return the fault's cause and text, or None.
@@ -76,15 +103,38 @@ class StatusCheck:
     def _goal(self, joint: int, status: Status, sent: float) -> tuple[Cause, str] | None:
         if abs(status.goal - sent) < self._half_tick[joint]:
             self._missed[joint] = 0
+            self._held[joint], self._agreed_at[joint], self._is_foreign[joint] = None, self._cycles, False
             return None
+        self._held[joint] = status.goal
+        self._is_foreign[joint] |= self._never_sent(joint, status.goal)
         self._missed[joint] += 1
         if self._missed[joint] < _GOALS_MISSED:
             return None
         unit = self._unit[joint]
+        held = f"it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent"
+        if self._is_foreign[joint]:
+            return Cause.GOALS_LOST, (
+                f"does not hold the goals of this program: {held}, and it holds goals that this program never sent. "
+                "Another program commands it, or goals are changed on the way: end that program or unplug its "
+                "controller; then check the adapter and the cable."
+            )
         return Cause.GOALS_LOST, (
-            f"does not accept goals: it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent, and it missed "
-            "an earlier one too. Goals are lost on the way, or the servo refuses them: check its cable and limits."
+            f"does not accept goals: {held}, and it missed an earlier one too. Goals are lost on the way, or the servo "
+            "refuses them: check its cable and limits."
         )
+
+    def _never_sent(self, joint: int, held: float) -> bool:
+        """Whether none of the goals sent since a status last agreed, to any joint, explains the one that is held.
+
+        The halves of a goal for two servos may be of different age, so nothing is known about their sum.
+        """
+        if not self._goals or not self._has_one_servo[joint]:
+            return False
+        since = self._cycles - self._agreed_at[joint] + _HELD_BEFORE
+        if since > _REMEMBERED:
+            return False
+        latest = islice(reversed(self._goals), since)
+        return all(abs(held - goal) >= self._half_tick[joint] for goals in latest for goal in goals)
 
     def look_at_clock(self, joint: int, tick: float, now: float) -> tuple[Cause, str] | None:
         """Detect old replies and reboots by the servo's clock; return the fault's cause and text, or None.

@@ -12,6 +12,7 @@ from hil.estimator.errors import RecordingError
 from hil.recordings.clean import Rows, cleaned
 from hil.recordings.encoder import encoder_step
 from hil.recordings.guess import guessed, said
+from hil.recordings.plausible import refuse_degrees
 from hil.recordings.table import Table
 from hil.recordings.units import UNITS, unit_of
 
@@ -47,6 +48,8 @@ def convert(table: Table, columns: Columns) -> Converted:
     time = _time(table, whole)
     ticks = 0.0 if whole.ticks_per_turn is None else 2.0 * np.pi / whole.ticks_per_turn
     position = np.stack([_quantity(table, name, "position", whole.position_unit, ticks) for name in whole.position])
+    # The unit as the user stated it: that of `whole` may be guessed.
+    refuse_degrees(table.source, time, position, whole.model_copy(update={"position_unit": columns.position_unit}))
     if whole.angles == "absolute":
         position = np.diff(position, axis=0, prepend=0.0)
     torque = np.stack([_torque(table, whole, joint) for joint in range(len(whole.position))])

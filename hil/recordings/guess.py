@@ -56,7 +56,7 @@ def guessed(table: Table, columns: Columns) -> Columns:
         return Columns.model_validate(columns.model_dump(exclude_none=True) | found)
     except ValueError as error:
         said = str(error).split("Value error, ")[-1].split(" [type=")[0]
-        raise CsvError(f"{table.source}: {said}. Set [columns] in --config ARM.toml.") from error
+        raise CsvError(f"{table.source}: {said}. Set [columns] in --config ARM.toml, config= in Python.") from error
 
 
 def said(columns: Columns, table: Table) -> str:
@@ -154,6 +154,7 @@ def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
             f"[columns]\ntime = {shown[0]}\nposition = [{shown[1]}, {shown[2]}]\ntorque = [{shown[3]}, {shown[4]}]"
         )
     return CsvError(
-        f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Specify them in --config ARM.toml, "
+        f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Specify them in --config ARM.toml "
+        '(in Python: config="ARM.toml"), '
         f"for example, if this is their order:\n{example}"
     )

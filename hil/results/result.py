@@ -21,6 +21,7 @@ steps        with a pilot: predicted and measured peaks of each step
 zeros, recordings, notes   only of recordings made elsewhere; notes: what was guessed, corrected or averaged
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -100,8 +101,17 @@ class Result:
     @property
     def _title(self) -> str:
         trust = "" if self.verdict is None else f", trust this model: {self.verdict.trust}"
-        residual = ", ".join(f"{value:.3f}" for value in self.fit.residual_rms_ticks)
-        return f"{self.joints}-joint arm of {self.config}{trust}; residual {residual} encoder steps RMS"
+        return f"{self.joints}-joint arm of {self.config}{trust}; {self._residual}"
+
+    @property
+    def _residual(self) -> str:
+        """The residual in encoder steps; without them, in mrad."""
+        if steps := ", ".join(f"{value:.3f}" for value in self.fit.residual_rms_ticks):
+            return f"residual {steps} encoder steps RMS"
+        angles = getattr(self.fit, "residual_rms_rad", ())
+        if angles and all(map(math.isfinite, angles)):
+            return f"residual {', '.join(f'{1e3 * value:.3g}' for value in angles)} mrad RMS"
+        return "no position residual"
 
     @property
     def _sentences(self) -> list[str]:

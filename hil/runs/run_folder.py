@@ -39,6 +39,7 @@ from hil.next_step import command, only_steps, steps_of
 from hil.plan.plan import Plan
 from hil.results.json_form import FormError, from_json, to_json
 from hil.results.result import Result
+from hil.toml_file import TomlFileError, read_toml_text
 
 __all__ = ["SCHEMA", "Excitation", "RunFacts", "RunFolder", "RunRecord", "taken", "write_json"]
 
@@ -202,10 +203,9 @@ class RunFolder:
     def load_config(self) -> Config:
         """The configuration, with the experiment that was actually run. Raises ConfigError, RunFolderError."""
         try:
-            text = self.config_path.read_text(encoding="utf-8-sig")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-            raise RunFolderError(f"{self.config_path} cannot be read: {reason}.") from error
+            text = read_toml_text(self.config_path)
+        except TomlFileError as error:
+            raise RunFolderError(str(error)) from error
         config = parse_config(text, self.config_path, recorded=True)
         if not self.played_path.is_file():
             return config

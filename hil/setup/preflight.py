@@ -62,6 +62,7 @@ def check_arm(config: Config) -> Iterator[Finding]:
         yield Finding(Level.OK, bus.port.url, "port", f"opened at {config.port.baud} baud")
         if why := too_slow(config):
             yield Finding(Level.STOP, "stabiliser", "rate", f"{config.experiment.rate:g} Hz", why)
+        yield from _torque_of_pilot(config)
         yield from _rest_pose(config)
         yield _latency_timer(bus)
         yield from _others(config, bus)
@@ -78,6 +79,16 @@ def check_arm(config: Config) -> Iterator[Finding]:
         yield from goals
         if all(finding.level is not Level.STOP for finding in goals):
             yield from _rate(config, bus)
+
+
+def _torque_of_pilot(config: Config) -> Iterator[Finding]:
+    """Report a torque that the pilot ignores."""
+    if config.experiment.pilot and config.experiment.peak_torque is not None:
+        fix = (
+            "`hil identify` ignores peak_torque: the pilot finds the torque, up to current_limit or voltage_limit. "
+            "Remove peak_torque; or set pilot = false to use it."
+        )
+        yield Finding(Level.WARNING, "experiment", "torque", "pilot = true takes precedence over peak_torque", fix)
 
 
 def _rest_pose(config: Config) -> Iterator[Finding]:

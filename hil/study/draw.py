@@ -3,7 +3,6 @@
 Run number i draws only from the stream (seed, i), so that its values do not depend on other runs or on the scheduling.
 """
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from itertools import product
 from math import exp, log
@@ -16,6 +15,7 @@ from hil.config.bundled import find_config
 from hil.errors import ConfigError
 from hil.fakes.description import found_beside
 from hil.study.schema import Draw, Scalar, Study
+from hil.toml_file import TomlFileError, load_toml
 
 
 def run_count(study: Study) -> int:
@@ -67,12 +67,9 @@ def arm_values(study: Study) -> dict[str, Any]:
     """The arm's TOML as a dictionary. Raises ConfigError."""
     path = arm_path(study)
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not UTF-8 text"
-        raise ConfigError(f"{study.path}: study.config = {study.study.config!r}: {path}: {reason}.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{study.path}: study.config: {path}: not valid TOML: {error}.") from error
+        values = load_toml(path)
+    except TomlFileError as error:
+        raise ConfigError(f"{study.path}: study.config = {study.study.config!r}: {error}") from error
     for table in (values.get("arm"), values.get("fake", {}).get("chain")):
         if isinstance(table, dict) and isinstance(table.get("urdf"), str):
             # Each run's arm is written to another folder.

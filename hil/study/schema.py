@@ -16,7 +16,6 @@ seed = 1
 columns = ["verdict.trust", "parameters.*.value"]
 """
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -35,6 +34,7 @@ from pydantic import (
 
 from hil.errors import ConfigError
 from hil.toml_errors import UNSAID, describe
+from hil.toml_file import TomlFileError, load_toml
 
 Task = Literal["identify", "dry_run", "fault", "estimate", "empty"]
 ON_ARM: tuple[Task, ...] = ("identify", "dry_run", "fault")
@@ -168,11 +168,9 @@ class Study(_Table):
 def load_study(path: Path) -> Study:
     """Read and check the file. Raises ConfigError, whose message names file, key, value and what is allowed."""
     try:
-        values: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}.") from error
+        values = load_toml(path)
+    except TomlFileError as error:
+        raise ConfigError(str(error)) from error
     if "path" in values:
         raise ConfigError(f"{path}: path is not a known key.")
     if "study" not in values and "joints" in values:

@@ -150,7 +150,7 @@ def test_port_that_was_never_opened() -> None:
     [
         ("fake://", "does not name a file"),
         ("fake:///nowhere/arm.toml", "cannot be read"),
-        (f"fake://{Path(__file__)}", "is not TOML"),
+        (f"fake://{Path(__file__)}", "not valid TOML"),
     ],
 )
 def test_what_cannot_be_opened(url: str, said: str) -> None:

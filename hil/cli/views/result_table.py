@@ -9,8 +9,9 @@ from rich.table import Table
 
 from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
-from hil.estimation.torque_constants import RATIO, by_voltage_said, torque_constants_said
-from hil.estimator.models.terms import TERMS, joint_of, kind_of, term_of
+from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
+from hil.estimation.truth import Truth, truth_of
+from hil.estimator.models.terms import TERMS, kind_of, term_of
 from hil.next_step import command, next_step
 from hil.printing import print_fitting, say
 from hil.results.parts import Quantity
@@ -28,10 +29,11 @@ _ALIKE = 0.05
 
 def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:
     """Print the parameter table, the quality of the fit, the verdict and the next commands."""
-    print_fitting(console, _parameters(result))
+    truth = truth_of(result, config)
+    print_fitting(console, _parameters(result, truth))
     physical = [] if result.physical is None else physical_lines(result.physical)
     told = (*_fit(result), *_choice(result), *_stabiliser(result, config), *_verdict(result))
-    told = (*told, *_torque_constants(result, config), *physical)
+    told = (*told, *([truth.note] if truth.note else []), *_torque_constants(result, config), *physical)
     for line in (*told, *_next(result, run)):
         say(console, line)
 
@@ -74,8 +76,7 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
             print(what_next(result, run))
 
 
-def _parameters(result: SettledResult) -> Table:
-    truth = result.truth
+def _parameters(result: SettledResult, truth: Truth) -> Table:
     # Narrow enough for 80 columns, so that no number is truncated.
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False)
     table.title, table.title_justify, table.title_style = (
@@ -85,12 +86,10 @@ def _parameters(result: SettledResult) -> Table:
     )
     table.add_column("parameter", no_wrap=True)
     table.add_column("unit", no_wrap=True)
-    for heading in ("value", "std", *(("truth", "error %", "in std.") if truth else ())):
+    for heading in ("value", "std", *(("truth", "error %", "in std.") if truth.values else ())):
         table.add_column(heading, justify="right", no_wrap=True)
     for name, entry in result.parameters.items():
-        counted = math.hypot(entry.std, _constant_std(result, name) * abs(entry.value))
-        shown = _numbers(entry, truth.get(name) if truth else None, counted)
-        table.add_row(escape(name), escape(entry.unit), *shown)
+        table.add_row(escape(name), escape(entry.unit), *_numbers(name, entry, truth))
     table.add_row()
     for name, entry in result.extra.items():
         table.add_row(escape(name), escape(entry.unit), f"{entry.value:.5g}", f"{entry.std:.1e}")
@@ -119,31 +118,16 @@ def _may_be_absent(name: str, entry: Quantity) -> bool:
     return kind in TERMS and not abs(entry.value - term_of(name).absent) > entry.std
 
 
-def _constant_std(result: SettledResult, name: str) -> float:
-    """Relative standard error of the joint's torque constant, with which the parameter scales; 0 where it does not."""
-    known = [
-        each.torque_per_goal_std / each.torque_per_goal if each.torque_per_goal else 0.0 for each in result.arm.joints
-    ]
-    # Where the ratios of the torque constants were identified, every value scales with that of the first joint.
-    has_ratios = any(kind_of(each) == RATIO for each in result.extra)
-    if kind_of(name) not in TERMS:  # a base parameter of a spatial arm, to which several joints' torques contribute
-        return known[0] if has_ratios else max(known, default=0.0)
-    joint = joint_of(name) or 1
-    if not term_of(name).of_torque or joint > len(known):
-        return 0.0
-    return known[0 if f"{RATIO}_{joint}" in result.extra else joint - 1]
-
-
-def _numbers(entry: Quantity, truth: float | None, counted: float) -> list[str]:
-    """Return the cells of a parameter. counted: its standard error, including that of the torque constant."""
+def _numbers(name: str, entry: Quantity, truth: Truth) -> list[str]:
+    """Return the cells of a parameter: value, standard error and, if there is any truth, the error."""
     value, std = entry.value, entry.std
     cells = [f"{value:.5g}", f"{std:.1e}"]
-    if truth is not None:
-        error = value - truth
-        is_nothing = abs(truth) <= _NOTHING * std
-        percent = "-" if is_nothing else f"{100 * error / abs(truth):+.3f}"
-        cells += [f"{truth:.5g}", percent, f"{error / counted:+.1f}" if counted > 0 else "-"]
-    return cells
+    if name not in truth.values:
+        return [*cells, "", "", ""] if truth.values else cells
+    true = truth.values[name]
+    percent = "-" if abs(true) <= _NOTHING * std else f"{100 * (value - true) / abs(true):+.3f}"
+    counted = truth.standard_errors(name, entry)
+    return [*cells, f"{true:.5g}", percent, "-" if counted is None else f"{counted:+.1f}"]
 
 
 def _fit(result: SettledResult) -> list[str]:

@@ -21,7 +21,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
             f"{source}: the angle of joint 2 seems to be measured from a fixed direction, such as the horizontal, "
             f"instead of from link 1. With the difference of both angles, inverse dynamics leaves "
             f"{_percent(absolute[0])} of the torque unexplained instead of {_percent(absolute[1])}. Set in "
-            '[columns] of --config ARM.toml: angles = "absolute"'
+            '[columns] of --config ARM.toml (in Python: config="ARM.toml"): angles = "absolute"'
         )
     signs = suspect_signs(recordings)
     if signs is None:

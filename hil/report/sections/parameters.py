@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 
+from hil.estimation.truth import truth_of
 from hil.estimator.chain.model.late_torque import MEANINGS as LATE
 from hil.estimator.chain.model.tilt import MEANINGS
 from hil.estimator.models.terms import kind_of, term_of
@@ -17,19 +18,21 @@ TWO_SIDED_95 = 1.96
 
 def parameters(data: RunData) -> Section:
     """Always present."""
-    return parameters_of(data.result)
+    truth = truth_of(data.result, data.config)
+    return parameters_of(data.result, truth.values, truth.note)
 
 
-def parameters_of(result: Result) -> Section:
-    """The section for any kind of result."""
+def parameters_of(result: Result, truth: Mapping[str, float] | None = None, note: str = "") -> Section:
+    """The section for any kind of result. truth: true values in the result's units; note: a sentence about them."""
     groups = {} if result.chain is None else result.chain.groups
-    tables = [_table(result.parameters, result.truth or {}, groups, "Base parameters")]
+    tables = [_table(result.parameters, truth or {}, groups, "Base parameters")]
     if result.extra:
         tables.append(_table(result.extra, {}, {}, "Additional model terms"))
     left_out = ", and small effects that the model leaves out and the motion cannot rule out"
     words = (
         f"The interval covers the noise of this recording{left_out if result.chain is None else ''}. It includes "
         "neither the error of the torque constants, with which all values of a joint scale, nor other model errors.",
+        *([note] if note else []),
     )
     return Section("parameters", "Parameters", words, tuple(tables))
 

@@ -21,7 +21,7 @@ def provenance(data: RunData) -> Section:
         ("run folder", data.run.path.name),
     ]
     rows += [_excitation(entry, data.names) for entry in record.excitation]
-    folded = [Folded("Configuration", data.run.config_path.read_text(encoding="utf-8"))]
+    folded = [Folded("Configuration", data.run.config_path.read_text(encoding="utf-8-sig"))]
     if data.events:
         start = data.events[0][0]
         lines = [f"{time - start:9.3f} s  {what}" for time, what in data.events]

@@ -1,6 +1,7 @@
 """Section with the verdict stored in the result: can the model be trusted, why, and what to do if not."""
 
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
+from hil.estimation.truth import truth_of
 from hil.report.run_data import RunData
 from hil.report.section import Section
 from hil.report.words import listed, percent, steps
@@ -33,13 +34,20 @@ def _residual(data: RunData) -> str:
 
 
 def _truth(data: RunData) -> str:
-    truth = data.result.truth
-    if not truth:
+    truth, found = truth_of(data.result, data.config), data.result.parameters
+    told = []
+    counted = {name: truth.standard_errors(name, entry) for name, entry in found.items()}
+    if sigmas := {name: abs(error) for name, error in counted.items() if error is not None}:
+        worst = max(sigmas, key=lambda name: sigmas[name])
+        told.append(f"{sigmas[worst]:.1f} standard errors ({worst})")
+    known = {name: truth.values[name] for name, entry in found.items() if truth.is_determined(name, entry)}
+    if shares := {name: abs(found[name].value / value - 1) for name, value in known.items()}:
+        worst = max(shares, key=lambda name: shares[name])
+        told.append(f"{percent(shares[worst])} among the well determined values ({worst})")
+    if not told:
         return ""
-    found = data.result.parameters
-    errors = {name: abs(found[name].value / value - 1) for name, value in truth.items() if value and name in found}
-    worst = max(errors, key=lambda name: errors[name])
-    return f"This is a fake arm with known true parameters: the largest error is {percent(errors[worst])} ({worst})."
+    said = f"This is a fake arm with known true parameters: the largest error is {', and '.join(told)}."
+    return f"{said} {truth.note}".rstrip()
 
 
 def _limits(data: RunData) -> str:

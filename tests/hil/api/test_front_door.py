@@ -1,11 +1,13 @@
 """The functions of `import hil` match the command line: same files, same numbers, same errors."""
 
+import itertools
 import json
 import logging
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ import hil
 from hil.api.dry_run import dry_run
 from hil.errors import ConfigError, CsvError, MissingExtra, ResultError, RunFolderError
 from hil.results.result import SettledResult
+from hil.setup.preflight import Level, check_arm
 from tests.support.command_line import hil as command
 
 ArmFile = Callable[..., Path]
@@ -209,3 +212,19 @@ def test_the_log_is_under_hil_and_silent_unless_asked(
     assert names and all(name.startswith("hil.") for name in names)
     assert any("torque on" in each.message for each in caplog.records)
     assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("nothing", [None, 3, ["arm.toml"]])
+def test_what_names_no_configuration_is_a_type_error_that_says_what_does(nothing: Any) -> None:
+    with pytest.raises(TypeError, match=r"config must be a TOML file.* not "):
+        hil.check(nothing)
+
+
+def test_check_says_that_the_pilot_takes_precedence_over_a_torque() -> None:
+    """The torque would look like a limit that the pilot keeps."""
+    given = hil.load_config("first_time")
+    experiment = given.experiment.model_copy(update={"peak_torque": [0.2, 0.1]})
+    for config, told in ((given, 0), (given.model_copy(update={"experiment": experiment}), 1)):
+        found = [each for each in itertools.islice(check_arm(config), 3) if each.where == "experiment"]
+        assert [each.found for each in found] == told * ["pilot = true takes precedence over peak_torque"]
+        assert all("ignores peak_torque" in each.fix and each.level is Level.WARNING for each in found)

@@ -216,7 +216,7 @@ CASES: list[tuple[str, int, str]] = [
     ("init arm.toml --out arm.toml", 2, "arm.toml"),
     # fakes, studies, schema
     ("fake nowhere", 2, "nowhere"),
-    ("fake broken.toml --pty", 2, "is not TOML"),
+    ("fake broken.toml --pty", 2, "not valid TOML"),
     ("fake arm.toml --pty --fault foo", 2, "there is no kind 'foo'"),
     ("fake arm.toml --pty --fault silent:servo=9", 2, "9"),
     ("fake arm.toml --pty --fault silent:at=soon", 2, "soon"),

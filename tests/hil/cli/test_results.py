@@ -12,7 +12,6 @@ from rich.console import Console
 
 from hil.cli.views.result_table import print_result
 from hil.model_file import read_settled_result
-from hil.results.parts import Quantity
 from hil.runs.run_folder import RunFolder
 from tests.support.command_line import hil
 
@@ -87,19 +86,28 @@ def test_no_figure_is_cut_in_a_narrow_terminal(
     assert str(identified) in capsys.readouterr().out
 
 
-def test_with_an_identified_ratio_only_the_first_torque_constant_counts(
+def test_errors_are_in_own_standard_errors_and_the_truth_in_the_units_of_the_file(
     identified: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The errors of joint 2 are compared with what is still unknown: the constant to which all values refer."""
+    """The uncertainty of a torque constant is a unit's: it hides no error of the estimate."""
     result, config = read_settled_result(identified), RunFolder.open(identified).load_config()
+    true = (result.truth or {})["gravity_1"]
 
-    def in_std(ratio: bool, std_2: float) -> list[str]:
-        first, second = result.arm.joints
-        joints = (replace(first, torque_per_goal_std=0.1), replace(second, torque_per_goal_std=std_2))
-        extra = {**result.extra, "torque_scale_2": Quantity(1.0, 0.001, "1")} if ratio else result.extra
-        changed = replace(result, arm=replace(result.arm, joints=joints), extra=extra)
-        print_result(changed, config, identified, Console(width=200))
-        return [line for line in capsys.readouterr().out.splitlines() if line.startswith("inertia_2 ")]
+    def gravity(wrong: float) -> tuple[list[str], str]:
+        joints = [
+            joint.model_copy(update={"torque_constant": wrong * joint.torque_per_goal, "torque_constant_std": 0.2})
+            for joint in config.joints
+        ]
+        found = replace(result.parameters["gravity_1"], value=1.06 * true, std=0.01 * true)
+        changed = replace(result, parameters={**result.parameters, "gravity_1": found})
+        print_result(changed, config.model_copy(update={"joints": joints}), identified, Console(width=200))
+        out = capsys.readouterr().out
+        (line,) = [each for each in out.splitlines() if each.startswith("gravity_1 ")]
+        return line.split()[-3:], out
 
-    assert in_std(True, 0.2) == in_std(True, 0.5)
-    assert in_std(False, 0.2) != in_std(False, 0.5)
+    cells, out = gravity(1.0)
+    assert cells[1:] == ["+6.000", "+6.0"] and "differ from the file's" not in out
+    cells, out = gravity(1.06)
+    assert float(cells[0]) == pytest.approx(1.06 * true, rel=1e-4)
+    assert [abs(float(cell)) for cell in cells[1:]] == [0.0, 0.0]
+    assert "The torque constants of the fake arm's motors differ from the file's" in out

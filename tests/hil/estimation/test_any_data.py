@@ -153,7 +153,7 @@ def test_a_csv_whose_columns_are_unclear_needs_a_config_and_no_run_beside_it(
     Path("data.csv").write_text("a,b,c\n1,2,3\n", encoding="utf-8")
     assert hil("estimate", "data.csv") == 2
     error = capsys.readouterr().err
-    assert "--config ARM.toml" in error and "a, b, c" in error and "[columns]" in error
+    assert '--config ARM.toml (in Python: config="ARM.toml")' in error and "a, b, c" in error and "[columns]" in error
     assert not any(Path("runs").glob("*")), "nothing blocks the next attempt"
     assert hil("estimate", "data.csv", "some_run", "--config", "arm.toml") == 2
 

@@ -84,26 +84,26 @@ def test_residual_prediction_and_verdict(result: SettledResult) -> None:
     assert result.verdict.trust in ("yes", "with care")
 
 
-def test_the_error_column_counts_the_first_torque_constant_in_every_row(
+def test_with_identified_ratios_the_truth_scales_with_the_first_torque_constant_in_every_row(
     run: RunFolder, result: SettledResult, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """All values of a spatial arm scale with it, inertias as well as friction."""
     rows = ("inertia_zz_1", "moment_z_2", "viscous_1", "coulomb_3")
+    ratios = {f"torque_scale_{joint}": Quantity(1.0, 1e-3, "1") for joint in (2, 3, 4)}
+    scaled = {name: replace(each, value=1.02 * each.value) for name, each in result.parameters.items()}
+    changed = replace(result, parameters=scaled, extra={**result.extra, **ratios})
 
-    def in_std(std: float) -> dict[str, float]:
-        first, *others = result.arm.joints
-        joints = (replace(first, torque_per_goal_std=std * first.torque_per_goal), *others)
-        ratios = {f"torque_scale_{joint}": Quantity(1.0, 1e-3, "1") for joint in (2, 3, 4)}
-        known = {name: replace(each, value=1.02 * each.value) for name, each in result.parameters.items()}
-        changed = replace(result, parameters=known, extra={**result.extra, **ratios})
-        changed = replace(changed, arm=replace(result.arm, joints=joints))
-        print_result(changed, run.load_config(), run.path, Console(width=200))
+    def in_std(factor: float) -> dict[str, float]:
+        config = run.load_config()
+        first, *others = config.joints
+        first = first.model_copy(update={"torque_constant": factor * first.torque_per_goal})
+        print_result(changed, config.model_copy(update={"joints": [first, *others]}), run.path, Console(width=200))
         lines = (line.split() for line in capsys.readouterr().out.splitlines())
         return {words[0]: abs(float(words[-1])) for words in lines if words and words[0] in rows}
 
-    known, unknown = in_std(0.0), in_std(0.1)
+    as_given, in_its_unit = in_std(1.0), in_std(1.02)
     for name in rows:
-        assert unknown[name] < 0.4 < known[name], name
+        assert in_its_unit[name] < 4.0 < as_given[name], name
 
 
 def test_a_joint_that_hardly_moves_is_named(run: RunFolder) -> None:

@@ -1,6 +1,6 @@
 """Status registers of the servos: every fault is detected, and normal values are accepted."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 
@@ -48,6 +48,26 @@ def test_a_goal_may_get_lost_once_but_not_twice_in_a_row(arm: Arm) -> None:
     assert check.look(0, lost, 0.1, 1.0) is None
     wrong = check.look(0, lost, 0.1, 1.0)
     assert wrong is not None and wrong[0] is Cause.GOALS_LOST and "holds 0.050 A but 0.100 A was sent" in wrong[1]
+
+
+@pytest.mark.parametrize(
+    ("held", "is_foreign"),
+    [((0.404, 0.404), True), ((-0.1, -0.11), True), ((0.07, 0.404), True), ((0.07, 0.07), False)],
+)
+def test_goals_that_were_never_sent_are_not_lost_goals(arm: Arm, held: Sequence[float], is_foreign: bool) -> None:
+    """A servo that misses writes holds an older goal of this program."""
+    check = StatusCheck(arm())
+    for goal in (0.06, 0.07, 0.08, 0.09):
+        check.sent((0.0, goal))
+    check.look(1, FINE._replace(goal=0.09), 0.09, 1.0)
+    found = None
+    for goal, other in zip((0.1, 0.11), held, strict=True):
+        check.sent((0.0, goal))
+        found = check.look(1, FINE._replace(goal=other), goal, 1.0)
+        assert check.other_goal(1) == other
+    assert found is not None and found[0] is Cause.GOALS_LOST
+    assert ("this program never sent" in found[1]) == is_foreign
+    assert ("Goals are lost" in found[1]) != is_foreign
 
 
 def readings(check: StatusCheck, clock: Callable[[float], float], until: float) -> tuple[float, str] | None:

@@ -313,3 +313,28 @@ def test_absolute_angles_are_made_relative(tmp_path: Path) -> None:
     path.write_text("t,q1,q2,tau1,tau2\n" + rows, encoding="utf-8")
     (recording,) = convert(read_tables(path)[0], Columns(angles="absolute")).recordings
     assert recording.position[1] == pytest.approx(recording.position[0], abs=2e-6)
+
+
+@pytest.mark.parametrize("scale", [180.0 / math.pi, 60.0])
+def test_angles_beyond_any_arm_are_refused_at_once(scale: float) -> None:
+    """As degrees under a header without a unit, or one that states another."""
+    path = write("a.csv", scale=(1.0, 1.0, scale, 1.0, 1.0))
+    with pytest.raises(CsvError, match=r"column 'q2' goes from .* In degrees\?.*config=\"ARM.toml\""):
+        read(path)
+    assert read(path, Columns(position_unit="rad")).recordings, "the user says so"
+    stated = write("b.csv", ("time", "q1", "q2 [rad]", "tau1", "tau2"), scale=(1.0, 1.0, 60.0, 1.0, 1.0))
+    with pytest.raises(CsvError, match="unit in the column's header"):
+        read(stated)
+
+
+def test_a_speed_beyond_any_servo_is_refused_and_rotation_is_not() -> None:
+    table = np.column_stack((TIME, 9.0 * TIME, 300.0 * TIME, TORQUES.T))
+    lines = [",".join(HEAD), *(",".join(f"{value:.9g}" for value in row) for row in table)]
+    for name, columns, wrong in (("q1", "0,1,3", False), ("q2", "0,2,4", True)):
+        kept = [",".join(line.split(",")[int(each)] for each in columns.split(",")) for line in lines]
+        Path("a.csv").write_text("\n".join(kept) + "\n", encoding="utf-8")
+        if not wrong:
+            assert read(Path("a.csv")).recordings, f"{name} rotates on and on"
+            continue
+        with pytest.raises(CsvError, match="more than 5 times that of any servo"):
+            read(Path("a.csv"))

@@ -109,3 +109,10 @@ def test_a_pair_needs_two_entries() -> None:
     with pytest.raises(FormError, match="has 3 entries instead of 2 as 'limits'"):
         from_json(Range, {"limits": [1, 2, 3]})
     assert to_json(Range((1.0, 2.0))) == {"limits": [1.0, 2.0]}
+
+
+@given(shooting_results())
+def test_a_result_without_encoder_steps_shows_its_residual_as_an_angle(result: ShootingResult) -> None:
+    assert "residual 0.300 encoder steps RMS" in repr(result)
+    stepless = dataclasses.replace(result, fit=dataclasses.replace(result.fit, residual_rms_ticks=()))
+    assert "mrad RMS" in repr(stepless) and "encoder steps" not in repr(stepless)

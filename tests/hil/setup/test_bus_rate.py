@@ -1,9 +1,18 @@
 """The rate that `hil check` measures on the fake bus, whose wire takes the time of a real one."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
 
 import hil
+from hil.drivers.bus import ServoBus
+from hil.fakes.bus.clock import VirtualClock
+from hil.setup import bus_rate
+from hil.setup.bus_rate import ExchangeMode, check_rate
 from tests.support.paths import CONFIGS
 
 SERVOS = ((1, 1), (2, 2), (3, 2), (4, 3), (5, 3), (6, 4))  # ID, joint
@@ -43,3 +52,24 @@ def test_six_servos_with_shadows_hold_400_hz_at_1_mbaud(tmp_path: Path) -> None:
 def test_a_slower_bus_does_not_and_says_so(tmp_path: Path) -> None:
     possible, enough = rate_of(six_servos(tmp_path, "115_200"))
     assert not enough and possible < 150
+
+
+@pytest.mark.parametrize(
+    ("times", "fix"),
+    [
+        ([6e-3, 2e-3], ""),
+        ([6e-3, 6e-3], "Half of the exchanges are fast enough, so other programs may keep"),
+        ([2e-3], ""),
+    ],
+)
+def test_a_rate_is_refused_only_if_it_is_too_high_twice(
+    times: list[float], fix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mode = ExchangeMode(one_write=True, fast=False, median_s=1.5e-3, usual_s=0.0, longest_s=8e-3, lost=0)
+    measured = iter(times)
+    monkeypatch.setattr(bus_rate, "measure_modes", lambda _: [replace(mode, usual_s=next(measured))])
+    settings = SimpleNamespace(fast_sync_read=False, one_write=True)
+    bus = cast("ServoBus", SimpleNamespace(config=settings, port=SimpleNamespace(clock=VirtualClock())))
+    report = check_rate(bus, 400.0)
+    assert report.fix.startswith(fix) and bool(report.fix) == bool(fix)
+    assert not list(measured)

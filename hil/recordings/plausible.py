@@ -1,0 +1,66 @@
+"""Refusal of angles that no servo arm reaches: most often they are in degrees, although the file does not say so.
+
+An estimate from such angles takes minutes and means nothing. Joints that rotate on and on are accepted, and so is
+everything if [columns] states the unit.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.csv_columns import Columns
+from hil.drivers.servo_model import fastest_no_load
+from hil.errors import CsvError
+
+Values = NDArray[np.float64]
+
+MOST_RANGE_RAD = 4 * math.pi
+"""Widest range of a joint that goes back and forth [rad]."""
+
+TIMES_NO_LOAD = 5.0
+"""Highest plausible speed, relative to the no-load speed of the fastest servo."""
+
+_ONE_WAY = 0.7
+"""Least share of a joint's path that leads in one direction if it rotates on and on."""
+
+_OVER_S, _USUAL = 0.02, 0.9
+"""Time over which speeds are measured, so that noise hardly counts [s], and the fraction of them that is slower."""
+
+
+def refuse_degrees(source: str, time: Values, position: Values, columns: Columns) -> None:
+    """Raise CsvError if `position` (joints, samples) [rad] is beyond what servos do. time: (samples,) [s]."""
+    if columns.position_unit is not None:
+        return
+    fastest = TIMES_NO_LOAD * fastest_no_load()
+    for name, row in zip(columns.position or (), position, strict=True):
+        known = np.isfinite(row) & np.isfinite(time)
+        speed, path = _speed(time[known], row[known]), float(np.abs(np.diff(row[known])).sum())
+        if not known.any():
+            continue
+        low, high = float(row[known].min()), float(row[known].max())
+        rotates = high - low > _ONE_WAY * path
+        if speed > fastest:
+            what = f"its speed, {speed:.4g} rad/s, is more than {TIMES_NO_LOAD:g} times that of any servo"
+        elif high - low > MOST_RANGE_RAD and not rotates:
+            what = f"it swings over {(high - low) / (2 * math.pi):.2g} turns"
+        else:
+            continue
+        raise CsvError(
+            f"{source}: column {name!r} goes from {low:.4g} to {high:.4g} rad: {what}. In degrees? Then correct the "
+            'unit in the column\'s header; if the header has none, set position_unit = "deg" in [columns] of --config '
+            'ARM.toml (in Python: config="ARM.toml"). If it is in rad, set position_unit = "rad" there. Check the '
+            "unit of the time, too."
+        )
+
+
+def _speed(time: Values, position: Values) -> float:
+    """The speed that a joint seldom exceeds [rad/s]; 0 if the recording is too short to tell."""
+    step = np.diff(time)
+    usual = float(np.median(step)) if step.size else 0.0
+    lag = max(1, round(_OVER_S / usual)) if usual > 0.0 else 0
+    if not 0 < lag < time.size:
+        return 0.0
+    elapsed = time[lag:] - time[:-lag]
+    speeds = np.abs(position[lag:] - position[:-lag])[elapsed > 0.0] / elapsed[elapsed > 0.0]
+    return float(np.quantile(speeds, _USUAL)) if speeds.size else 0.0

@@ -1,0 +1,123 @@
+"""Reading TOML files: one reader for configurations, fake arms and results, so that all accept the same files.
+
+Text is UTF-8, with or without the byte order mark that some Windows programs write.
+"""
+
+import codecs
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+
+class TomlFileError(ValueError):
+    """A file that cannot be read or is not TOML; the text is the whole message and names the file."""
+
+
+def load_toml(path: Path) -> dict[str, Any]:
+    """The values in a TOML file. Raises TomlFileError."""
+    return parse_toml(read_toml_text(path), path)
+
+
+def read_toml_text(path: Path) -> str:
+    """The text of a file, without a byte order mark. Raises TomlFileError."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise TomlFileError(f"{path} cannot be read: it is {_encoding_of(path, error)}.") from error
+    except OSError as error:
+        raise TomlFileError(f"{path} cannot be read: {error.strerror or error}.") from error
+
+
+def parse_toml(text: str, path: Path) -> dict[str, Any]:
+    """The values in `text`, the contents of `path`. Raises TomlFileError."""
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise TomlFileError(_not_toml(path, error, text)) from error
+    except RecursionError:
+        raise TomlFileError(f"{path}: not valid TOML: a value has too many nested brackets.") from None
+
+
+def _encoding_of(path: Path, error: UnicodeDecodeError) -> str:
+    """What a file that is not UTF-8 text is, and how to save it as such."""
+    data = path.read_bytes()
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and (b"=\0" in data or b"\0=" in data):
+        return "UTF-16 text, as some Windows programs write it: save it with the encoding UTF-8"
+    if b"\0" in data:
+        return "not UTF-8 text but a binary file"
+    number = error.object.count(b"\n", 0, error.start) + 1
+    line = error.object.splitlines()[number - 1].decode("latin-1").strip()
+    return f"not UTF-8 text, from line {number} on:\n  {line}\nSave it with the encoding UTF-8"
+
+
+def _not_toml(path: Path, error: Exception, text: str) -> str:
+    """The error message for a file with this text, which the TOML parser rejects: the line, and the likely cause."""
+    other = {".yaml": "YAML", ".yml": "YAML", ".json": "JSON", ".xml": "XML", ".urdf": "XML", ".csv": "CSV"}
+    kind = other.get(path.suffix.lower())
+    if kind is not None:
+        return f"{path}: judging by its name, it is {kind}; hil's files are TOML. `hil init` writes one."
+    lines = text.splitlines()
+    place = re.search(r"at line (\d+)", str(error))
+    number = int(place[1]) if place else len(lines)
+    if again := _given_twice(str(error), lines, number):
+        return f"{path}: not valid TOML: {again}."
+    if place is None or not 0 < number <= len(lines):
+        return f"{path}: not valid TOML: {error}."
+    line = lines[number - 1].strip()
+    cause = next((said for pattern, said in _SYNTAX if re.search(pattern, _unquoted(line))), "")
+    return f"{path}: not valid TOML: {error}:\n  {line}" + (f"\n{cause}" if cause else "")
+
+
+def _given_twice(error: str, lines: list[str], number: int) -> str:
+    """Name the key or table that line `number` gives for a second time; "" if the error is another one."""
+    if not error.startswith(("Cannot overwrite", "Cannot declare")):
+        return ""
+    own = _given_in(lines, number)
+    if own is None:
+        return ""
+    first = next((each for each in range(1, number) if _given_in(lines, each) == own), None)
+    table, key = own
+    shown = key or table
+    where = f" in {table}" if key and table else ""
+    if first is not None:
+        return f"{shown} is given twice{where}, in lines {first} and {number}. Delete one of them"
+    return f"{shown} in line {number} is already given{where}, in another form. Delete one of them"
+
+
+def _given_in(lines: list[str], number: int) -> tuple[str, str] | None:
+    """Table, as in a message, and key that a line gives, counted from 1; None for other lines.
+
+    The key of a header is "". Each [[header]] begins another table of the same name.
+    """
+    table = ""
+    for count, line in enumerate(lines[:number], 1):
+        if header := _HEADER.match(line):
+            table = f"[{header[2]}]" if header[1] == "[" else f"the [[{header[2]}]] of line {count}"
+    line = lines[number - 1] if 0 < number <= len(lines) else ""
+    if _HEADER.match(line):
+        return table, ""
+    key = _KEY.match(line)
+    return None if key is None else (table, key[1])
+
+
+_HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]")
+_KEY = re.compile(r"^\s*([\w.\"'-]+)\s*=")
+_NUMBER = r"[-+]?\d[\d_.]*(?:[eE][-+]?\d+)?"
+_SYNTAX = (
+    (rf"{_NUMBER}\s*(?:°|º|deg)", "Angles are numbers in rad, without a sign or unit: 90 degrees are 1.5708."),
+    (rf"=\s*{_NUMBER.replace('.', '', 1)},\d+\s*$", "The decimal sign is a point, not a comma: 4.0, not 4,0."),
+    (r"[\[,]\s*[-+]?\d+,0\d", "The decimal sign is a point, not a comma: 1.06, not 1,06."),
+    (r"[=\[,]\s*(?:True|False|TRUE|FALSE)\b", "Write true or false in lower case."),
+    (r"[=\[,]\s*(?:yes|no|on|off|None|null|nil)\b", "Write true or false; leave out a key that has no value."),
+    (rf"[=\[,]\s*{_NUMBER}\s*[%A-Za-zµμΩ]", "Write the number without its unit; each key has one fixed unit."),
+    (r"=\s*[A-Za-z/]", "Text needs quotes."),
+    (r"=\s*$", "The value is missing."),
+    (r"^\w[\w.-]*\s*:", "Write = between key and value, not a colon."),
+    (r"[“”‘’„]", "Use straight quotes."),
+)
+"""Patterns of a rejected line without its comment and quoted texts, and the likely cause of each."""
+
+
+def _unquoted(line: str) -> str:
+    return re.sub(r"\"[^\"]*\"|'[^']*'", '""', line).partition("#")[0].strip()

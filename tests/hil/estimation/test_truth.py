@@ -1,0 +1,67 @@
+"""True values of a fake arm in the torque that the file's constants imply, which is what a result is in."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from hil.config.schema import Config
+from hil.estimation.truth import truth_of
+from hil.model_file import read_settled_result
+from hil.report.run_data import RunData
+from hil.report.sections.verdict import verdict
+from hil.results.parts import Quantity
+from hil.results.result import SettledResult
+from hil.runs.run_folder import RunFolder
+
+
+def stronger(config: Config, factors: tuple[float, ...]) -> Config:
+    """The file with other torque constants than the fake arm's motors."""
+    joints = [
+        joint.model_copy(update={"torque_constant": joint.torque_per_goal * factor})
+        for joint, factor in zip(config.joints, factors, strict=True)
+    ]
+    return config.model_copy(update={"joints": joints})
+
+
+@pytest.fixture(scope="module")
+def result(identified_once: Path) -> SettledResult:
+    return read_settled_result(identified_once)
+
+
+def test_equal_constants_leave_the_truth_as_it_is(result: SettledResult, identified_once: Path) -> None:
+    truth = truth_of(result, RunFolder.open(identified_once).load_config())
+    assert truth.values == result.truth and truth.note == ""
+
+
+def test_one_factor_scales_every_value(result: SettledResult, identified_once: Path) -> None:
+    config = RunFolder.open(identified_once).load_config()
+    truth = truth_of(result, stronger(config, (1.06, 1.06)))
+    assert result.truth is not None
+    assert truth.values == pytest.approx({name: 1.06 * value for name, value in result.truth.items()})
+    assert "shoulder -5.7 %, elbow -5.7 %" in truth.note
+
+
+def test_what_both_joints_determine_has_no_unit_if_their_constants_differ(
+    result: SettledResult, identified_once: Path
+) -> None:
+    config = stronger(RunFolder.open(identified_once).load_config(), (1.06, 1.0))
+    truth = truth_of(result, config)
+    assert set(result.truth or {}) - set(truth.values) == {"coupling", "inertia_2", "gravity_2"}
+    assert truth.values["gravity_1"] == pytest.approx(1.06 * (result.truth or {})["gravity_1"])
+    assert truth.values["viscous_2"] == (result.truth or {})["viscous_2"]
+    assert "are not shown" in truth.note
+    ratio = {**result.extra, "torque_scale_2": Quantity(1.06, 1e-3, "1")}
+    whole = truth_of(dataclasses.replace(result, extra=ratio), config)
+    assert whole.values == pytest.approx({name: 1.06 * value for name, value in (result.truth or {}).items()})
+
+
+def test_a_value_near_zero_does_not_head_the_relative_errors(identified_once: Path) -> None:
+    data = RunData.load(identified_once)
+    found = {name: Quantity(value, 1e-3 * abs(value), "1") for name, value in (data.result.truth or {}).items()}
+    found["offset_1"] = Quantity(6e-4, 3e-4, "N m")
+    found["gravity_1"] = dataclasses.replace(found["gravity_1"], value=1.005 * found["gravity_1"].value)
+    truth = {**(data.result.truth or {}), "offset_1": 1e-5}
+    changed = dataclasses.replace(data, result=dataclasses.replace(data.result, parameters=found, truth=truth))
+    (said,) = [each for each in verdict(changed).bullets if "known true parameters" in each]
+    assert said.endswith("5.0 standard errors (gravity_1), and 0.5 % among the well determined values (gravity_1).")
