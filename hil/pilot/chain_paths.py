@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.clearance.space import Space
+from hil.config.chain import POSITION_RESERVE
 from hil.config.schema import Config
 from hil.errors import NoSafeTorque
 from hil.estimator.chain.excitation.fourier_path import Path
@@ -36,7 +37,7 @@ class Reserve:
     need not keep.
     """
 
-    position: float = 0.08
+    position: float = POSITION_RESERVE
     speed: float = 0.6
     torque: float = 0.65
     clearance: float = 0.01

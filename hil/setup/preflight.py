@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from hil import fakes
+from hil.clearance.doubts import doubts
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
@@ -62,7 +63,7 @@ def check_arm(config: Config) -> Iterator[Finding]:
         yield Finding(Level.OK, bus.port.url, "port", f"opened at {config.port.baud} baud")
         if why := too_slow(config):
             yield Finding(Level.STOP, "stabiliser", "rate", f"{config.experiment.rate:g} Hz", why)
-        yield from _rest_pose(config)
+        yield from _described(config)
         yield _latency_timer(bus)
         yield from _others(config, bus)
         all_well = True
@@ -80,8 +81,10 @@ def check_arm(config: Config) -> Iterator[Finding]:
             yield from _rate(config, bus)
 
 
-def _rest_pose(config: Config) -> Iterator[Finding]:
-    """Whether a spatial arm is clear of itself, the floor and the boxes in its rest pose."""
+def _described(config: Config) -> Iterator[Finding]:
+    """Report what is doubtful about the description, and whether the rest pose of a spatial arm is clear."""
+    for doubt in doubts(config):
+        yield Finding(Level.WARNING, "arm", "description", "doubtful", doubt)
     if not config.is_chain:
         return
     try:
