@@ -22,6 +22,10 @@ MOST_JOINTS = 7
 POSITION_RESERVE = 0.08
 """Fraction of a joint's position_limit that a designed path leaves free at either end."""
 
+DEFAULT_BAND = (0.1, 1.5)
+"""Default band of a spatial arm's pilot [Hz]."""
+
+_HARMONICS = 2  # of a path, at least
 _PLANAR = 2
 _WIDER_RAD = 1e-3
 _OPTIONS = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
@@ -163,6 +167,12 @@ def _path_slips(config: "Config") -> Iterator[str]:
         yield (
             "experiment.lines: a spatial arm follows a path, whose highest frequency is the upper end of "
             "experiment.band"
+        )
+    high = (config.experiment.band or DEFAULT_BAND)[1]
+    if config.experiment.period * high < _HARMONICS - 1e-9:
+        yield (
+            f"experiment.period = {config.experiment.period:g} s: a path needs at least {_HARMONICS} harmonics below "
+            f"the upper end of its band, {high:g} Hz: make it at least {_HARMONICS / high:.3g} s; 8 to 10 s are usual"
         )
     if config.joint_path is None:
         return

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from hil.config.schema import Config
-from hil.drivers.bus import ServoBus
 from hil.dry_run.prediction import peaks_of
 from hil.errors import DidNotMove, ExperimentError, NotSettled
 from hil.estimation.settled_estimate import estimate_run
@@ -26,7 +25,7 @@ from hil.pilot.steps import Say, Step, tells_of_the_arm
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
-from hil.setup.lying import NEAR_RAD, from_where_it_lies, said_of_the_rest, wait_for_rest
+from hil.setup.lying import from_where_it_lies, said_of_the_rest, wait_for_rest
 from hil.setup.servo_session import servo_session
 
 MOST_STEPS = 6
@@ -40,33 +39,27 @@ MOST_RAISE = 2.5
 
 @dataclass(kw_only=True)
 class ChainSearch(SafeShares):
-    """Runs so far and the current belief. asked: the configuration with the rest pose that the file gives."""
+    """Runs so far and the current belief."""
 
     run: RunFolder
     shown_path: Path
     watch: Watch
-    bus: ServoBus
-    asked: Config
     steps: list[Step] = field(default_factory=list)
 
     @classmethod
-    def of(
-        cls, config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say, bus: ServoBus
-    ) -> "ChainSearch":
+    def of(cls, config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say) -> "ChainSearch":
         """Design the paths and draw the prior ensemble. Raises NoSafeTorque, ConfigError, ArmFileError."""
-        asked = chain_config(config)
-        config = _lying(asked, asked, bus, say)
+        config = chain_config(config)
         belief = ChainBelief.prior(config)
         paths = Paths.of(config, belief.torque)
         say(
             f"Designed a path that leaves the worst base parameter {100 * paths.identify.worst:.2g} % of its prior "
             f"standard error (held-out path, with random phases: {100 * paths.held_out.worst:.2g} %)."
         )
-        return cls(config, belief, paths, say, run=run, shown_path=shown_path, watch=watch, bus=bus, asked=asked)
+        return cls(config, belief, paths, say, run=run, shown_path=shown_path, watch=watch)
 
     def step(self, name: str, folder: str, shares: tuple[float, ...]) -> Found:
         """Play one step, compare it with the prediction, and update the belief."""
-        self.look_where_it_lies()
         config = step_config(self.config)
         found = self.safe(config, shares, shares[0] if self.steps else np.inf)
         below = self.run.below(folder, config)
@@ -75,12 +68,6 @@ class ChainSearch(SafeShares):
             self.limit_after(error, found)
         self.learn(config, below)
         return found
-
-    def look_where_it_lies(self) -> None:
-        """Let the next run start and end where the previous one left the arm."""
-        if self.steps:
-            wait_for_rest(self.bus)
-            self.given = _lying(self.asked, self.given, self.bus, self.say)
 
     def limit_after(self, error: ExperimentError, found: Found) -> None:
         """Allow less of the path after a run that exceeded a limit, but not after one in which friction held a
@@ -141,7 +128,12 @@ def identify_chain_in_steps(
     Raises what a run raises, and NoSafeTorque.
     """
     with StopRequest(), servo_session(config, run.path, say) as bus:
-        search = ChainSearch.of(config, run, shown_path, watch, say, bus)
+        lies = from_where_it_lies(config, bus.read_positions())
+        if lies is not config:
+            wait_for_rest(bus)
+            lies = from_where_it_lies(config, bus.read_positions())
+            say(said_of_the_rest(config, lies))
+        search = ChainSearch.of(lies, run, shown_path, watch, say)
         search.step("Pilot", "pilot", PILOT_SHARES)
         while len(search.steps) < MOST_STEPS:
             wanted = search.safe(step_config(search.config), SHARES)
@@ -158,22 +150,10 @@ def identify_chain_in_steps(
     return torque, result
 
 
-def _lying(asked: Config, former: Config, bus: ServoBus, say: Say) -> Config:
-    """The configuration for an arm that lies where it is now; `former` is that for the previous run."""
-    now = from_where_it_lies(asked, bus.read_positions())
-    moved = np.abs(np.subtract(now.arm.rest_pose, former.arm.rest_pose)).max()
-    if moved <= NEAR_RAD:
-        return former
-    if now is not asked:
-        say(said_of_the_rest(asked, now))
-    return now
-
-
 def _full(search: ChainSearch) -> str:
     """Play the full run; repeat it with a smaller amplitude if it exceeds a limit or never settles."""
     tries = 3
     for number in range(1, tries + 1):
-        search.look_where_it_lies()
         config = search.config
         found = search.safe(config, SHARES, MOST_RAISE * search.last)
         search.run.write_played(config)
