@@ -9,6 +9,7 @@ from pathlib import Path
 
 from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Identification, Run, identification, load_run
+from hil.clearance.doubts import doubts
 from hil.config.schema import Config, load_config
 from hil.drivers.errors import DriverError
 from hil.errors import ConfigError, ExperimentError, StopRequested
@@ -77,6 +78,7 @@ def identify(
         tell(Progress("experiment", message))
 
     with _discarding(run, "identify", shown):
+        _tell_doubts(checked, tell)
         if checked.experiment.pilot:
             from hil.pilot import identify_in_steps
 
@@ -113,6 +115,7 @@ def record(
     run = new_run_folder(checked, shown, out)
     tell = forgiving(on_progress)
     with _discarding(run, "record", shown):
+        _tell_doubts(checked, tell)
         torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))
     tell(Progress("experiment", torque))
     return load_run(run.path)
@@ -126,6 +129,12 @@ def _earlier(config: Config, shown: Path, path: Path) -> Result:
             f"{shown}: an earlier run replaces the prior of a planar arm's pilot (experiment.pilot = true), but {why}."
         )
     return read_result(path)
+
+
+def _tell_doubts(config: Config, tell: OnProgress) -> None:
+    """Report warnings about the configuration and the description, before anything moves."""
+    for doubt in doubts(config):
+        tell(Progress("experiment", f"Warning: {doubt}"))
 
 
 def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: Path) -> list[str]:

@@ -28,16 +28,31 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
     return None
 
 
-def mesh_corners(path: Path) -> Array | None:
-    """Vertices (points, 3) in the file's units; None if the file cannot be read as a mesh."""
+class UnreadMesh(ValueError):
+    """Raised when a mesh cannot be used; the message says why, without naming the mesh."""
+
+
+def mesh_corners(name: str, urdf: Path) -> Array:
+    """Vertices (points, 3), in the file's units, of a mesh that a URDF names. Raises UnreadMesh."""
+    path = find_mesh(name, urdf)
+    if path is None:
+        raise UnreadMesh("there is no such file in the URDF's folder or in one above it")
+    read = {".stl": _stl, ".obj": _obj}.get(path.suffix.lower())
+    if read is None:
+        raise UnreadMesh("only STL and OBJ files can be read; convert it")
     try:
-        if path.stat().st_size > MOST_BYTES:
-            return None
-        found = {".stl": _stl, ".obj": _obj}.get(path.suffix.lower(), lambda _: None)(path.read_bytes())
-    except (OSError, ValueError):
-        return None
-    if found is None or not len(found) or not np.isfinite(found).all():
-        return None
+        is_small = path.stat().st_size <= MOST_BYTES
+        found = read(path.read_bytes()) if is_small else None
+    except OSError as error:
+        raise UnreadMesh(f"the file cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise UnreadMesh(f"the file is damaged: {error}") from error
+    if not is_small:
+        raise UnreadMesh(f"the file is larger than {MOST_BYTES / 1e6:.0f} MB")
+    if found is None or not len(found):
+        raise UnreadMesh("the file contains no vertices")
+    if not np.isfinite(found).all():
+        raise UnreadMesh("the file is damaged: a vertex is not a number")
     return np.asarray(found, dtype=np.float64)
 
 

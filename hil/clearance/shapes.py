@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.clearance.mesh import find_mesh, mesh_corners
+from hil.clearance.mesh import UnreadMesh, mesh_corners
 from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import is_mjcf
 from hil.description.mjcf import Geom, read_geoms
@@ -47,11 +47,13 @@ class Shapes:
     """The capsules of an arm.
 
     names: names of the links, the base's first. guessed: links whose shape was guessed from the joint positions.
+    doubts: one sentence for each of these, except for a base without geometry: why, and what replaces the shape.
     """
 
     names: tuple[str, ...]
     capsules: tuple[Capsule, ...]
     guessed: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
 
 
 def shapes_of(arm: ArmDescription) -> Shapes:
@@ -60,21 +62,41 @@ def shapes_of(arm: ArmDescription) -> Shapes:
     placed = _placed(arm)
     geoms = _geoms(arm)
     capsules: list[Capsule] = []
-    guessed = []
+    guessed, doubts = [], []
     for link in range(len(names)):
         here = [each for each in placed if each[0] == link]
-        found, is_whole = _around(here, arm, link)
+        found, unread = _around(here, arm, link)
         found += [Capsule(link, *each) for geom in geoms if geom.link == link for each in _of_geom(geom)]
-        if not found or not is_whole:
+        if not found or unread:
             guessed.append(names[link])
-            found += _from_joints(arm, link, [shift for _, _, shift, _ in here]) if link > 0 else []
+            instead = _from_joints(arm, link, [shift for _, _, shift, _ in here]) if link > 0 else []
+            if unread or link > 0:
+                doubts.append(_doubt(names[link], unread, bool(found), instead, link == len(arm.joints)))
+            found += instead
         capsules += [piece for each in found for piece in _pieces(each)]
     for each in capsules:
         if not (np.isfinite(each.ends).all() and 0.0 <= each.radius < np.inf):
             raise ArmFileError(
                 f'{arm.path}: link "{names[each.link]}": a size or origin in its collision geometry is not a number'
             )
-    return Shapes(names, tuple(capsules), tuple(guessed))
+    return Shapes(names, tuple(capsules), tuple(guessed), tuple(doubts))
+
+
+def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule], is_last: bool) -> str:
+    """Say why the shape of a link is not known, and what replaces it."""
+    why = "; ".join(unread) if unread else "it has no collision or visual geometry"
+    if not instead:
+        left = "Only its other shapes are checked" if has_others else "It has no shape"
+        return f'link "{name}": {why}. {left}: how close the arm comes to it is not known.'
+    (capsule,) = instead
+    length = float(np.linalg.norm(capsule.ends[1]))
+    along = f"capsule {1e3 * length:.0f} mm long from its joint to {'its end' if is_last else 'the next one'}"
+    end = ", and the end is estimated from the centre of mass" if is_last else ""
+    return (
+        f'link "{name}": {why}. It is replaced by a {along if length > _NOTHING else "sphere at its joint"}'
+        f"{', beside its other shapes' if has_others else ''}. The radius of {1e3 * capsule.radius:.0f} mm is a guess"
+        f"{end}: its clearance is not certain."
+    )
 
 
 @dataclass(frozen=True)
@@ -143,18 +165,23 @@ def _pieces(capsule: Capsule) -> list[Capsule]:
     return [Capsule(capsule.link, np.stack(ends), capsule.radius) for ends in pairwise(points)]
 
 
-def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Capsule], bool]:
-    """Capsules around everything fixed to one moving link, and whether all its geometry could be read."""
-    found, is_whole = [], True
+def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Capsule], list[str]]:
+    """Capsules around everything fixed to one moving link, and why shapes could not be read."""
+    found, unread = [], []
     for _, rotation, translation, element in here:
         if element is None:
             continue
         for shape, turn, shift in _geometry(element):
-            around = _of_shape(shape, arm)
-            is_whole = is_whole and around is not None
+            try:
+                around = _of_shape(shape, arm)
+            except UnreadMesh as error:
+                unread.append(f'its mesh "{shape.get("filename", "")}" is not used: {error}')
+                continue
+            if around is None:
+                unread.append(f"its <{shape.tag}> is not used: no such shape is known")
             for ends, radius in around or []:
                 found.append(Capsule(link, (ends @ turn.T + shift) @ rotation.T + translation, radius))
-    return found, is_whole
+    return found, unread
 
 
 def _placed(arm: ArmDescription) -> list[Placed]:
@@ -191,7 +218,7 @@ def _geometry(link: ET.Element) -> Iterator[tuple[ET.Element, Array, Array]]:
 
 
 def _of_shape(shape: ET.Element, arm: ArmDescription) -> list[tuple[Array, float]] | None:
-    """Ends (2, 3) and radii of capsules that enclose a shape; None if the shape cannot be read."""
+    """Ends (2, 3) and radii of capsules that enclose a shape; None if no such shape is known. Raises UnreadMesh."""
     if shape.tag == "sphere":
         return [(np.zeros((2, 3)), float(shape.get("radius", "nan")))]
     if shape.tag == "cylinder":
@@ -202,12 +229,10 @@ def _of_shape(shape: ET.Element, arm: ArmDescription) -> list[tuple[Array, float
     if shape.tag == "box":
         return _of_box(np.zeros(3), np.array(_numbers(shape.get("size"), 3)))
     if shape.tag == "mesh":
-        path = find_mesh(shape.get("filename", ""), arm.path)
-        corners = None if path is None else mesh_corners(path)
-        if corners is not None:
-            corners = corners * np.array(_numbers(shape.get("scale"), 3, 1.0))
-            low, high = corners.min(axis=0), corners.max(axis=0)
-            return _of_box(0.5 * (low + high), high - low)
+        corners = mesh_corners(shape.get("filename", ""), arm.path)
+        corners = corners * np.array(_numbers(shape.get("scale"), 3, 1.0))
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        return _of_box(0.5 * (low + high), high - low)
     return None
 
 

@@ -14,7 +14,6 @@ from hil.config.chain import described_arm
 from hil.config.schema import Config
 from hil.description.arm import ArmDescription
 from hil.description.urdf import rotation_of
-from hil.errors import ConfigError
 
 Array = NDArray[np.float64]
 
@@ -81,7 +80,7 @@ class Space:
 
     @classmethod
     def of(cls, config: Config) -> "Space":
-        """Build the space of a configured arm. Raises ConfigError, ArmFileError."""
+        """Build the space of a configured arm. Raises ArmFileError."""
         arm = described_arm(config)
         return _space(_Key(config, arm))
 
@@ -212,7 +211,7 @@ def _space(key: _Key) -> Space:
         boxes,
     )
     obstacles = tuple(box.name for box in wanted.boxes)
-    ignored = _ignored(config, (*shapes.names, "floor", *obstacles))
+    ignored = {frozenset(pair) for pair in wanted.ignore}
     pairs = np.array(_pairs(shapes, link, len(obstacles), np.isfinite(floor[3])), dtype=np.int64).reshape(-1, 2)
     rest = np.array(config.arm.rest_pose)
     space = Space(shapes, obstacles, wanted.margin, (), rest, np.zeros(len(pairs)), pairs, chain, arrays)  # type: ignore[arg-type]
@@ -251,16 +250,6 @@ def _touch_as_built(
     near = (distance < margin + BUILT_NEAR).mean(axis=0) >= needed
     touching: NDArray[np.bool_] = near & (pairs[:, 1] >= 0)
     return touching
-
-
-def _ignored(config: Config, names: tuple[str, ...]) -> set[frozenset[str]]:
-    for pair in config.clearance.ignore:
-        for name in pair:
-            if name not in names:
-                raise ConfigError(
-                    f"{config.path}: clearance.ignore: unknown name {name!r}; known names are {', '.join(names)}."
-                )
-    return {frozenset(pair) for pair in config.clearance.ignore}
 
 
 def _about(axis: Array, angle: float) -> Array:

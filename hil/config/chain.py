@@ -19,7 +19,15 @@ if TYPE_CHECKING:
     from hil.config.schema import Config
 
 MOST_JOINTS = 7
+POSITION_RESERVE = 0.08
+"""Fraction of a joint's position_limit that a designed path leaves free at either end."""
+
+DEFAULT_BAND = (0.1, 1.5)
+"""Default band of a spatial arm's pilot [Hz]."""
+
+_HARMONICS = 2  # of a path, at least
 _PLANAR = 2
+_WIDER_RAD = 1e-3
 _OPTIONS = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
 
 
@@ -32,6 +40,37 @@ def described_arm(config: "Config") -> ArmDescription:
 def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
     """Warn of described inertias that no mass distribution can have, one sentence each."""
     return tuple(f"{arm.path.name}: {doubt}." for doubt in arm.doubts)
+
+
+def doubted_limits(config: "Config") -> Iterator[str]:
+    """Yield one sentence per joint whose limits in the file make no sense or do not contain the paths.
+
+    At either end, position_limit may exceed them by what a path leaves free: it stops an arm, and some arms rest on a
+    stop.
+    """
+    arm = described_arm(config)
+    wanted = config.joint_path
+    for index, (joint, described) in enumerate(zip(config.joints, arm.joints, strict=True)):
+        if described.limits is None or described.limits == (0.0, 0.0):  # the latter are not limits, but missing ones
+            continue
+        lower, upper = described.limits
+        where = f'{arm.path.name}: joint "{joint.name}": its limits are [{lower:g}, {upper:g}] rad'
+        if lower >= upper:
+            yield f"{where}, the lower one first: they are the wrong way round. They are ignored; correct them."
+            continue
+        low, high = joint.position_limit
+        free = POSITION_RESERVE * (high - low)
+        low, high = low + free, high - free
+        if wanted is not None:
+            centre, swing = wanted.centre[index], wanted.swing[index]
+            low, high = centre - swing, centre + swing
+        if low < lower - _WIDER_RAD or high > upper + _WIDER_RAD:
+            key = "position_limit" if wanted is None else "joint_path"
+            shown = f"position_limit = [{joint.position_limit[0]:g}, {joint.position_limit[1]:g}]"
+            yield (
+                f"{where}, but {key} lets it move from {low:.3g} to {high:.3g} rad ({shown}): it may run into its "
+                "stops. Narrow the one, or correct the other."
+            )
 
 
 def base_gravity(config: "Config") -> NDArray[np.float64]:
@@ -98,7 +137,17 @@ def chain_slips(config: "Config") -> Iterator[str]:
     told = [option for option in _OPTIONS if getattr(config.model, option)]
     if told:
         yield f"model.{told[0]} = true: only planar arms support this term so far; remove it"
+    yield from _ignored_slips(config)
     yield from _path_slips(config)
+
+
+def _ignored_slips(config: "Config") -> Iterator[str]:
+    arm = described_arm(config)
+    holders = {part: joint.link for joint in arm.joints for part in joint.fixed}
+    names = (arm.base, *(joint.link for joint in arm.joints), "floor", *(box.name for box in config.clearance.boxes))
+    for name in dict.fromkeys(name for pair in config.clearance.ignore for name in pair if name not in names):
+        part = f": it is a part of {holders[name]!r}" if name in holders else ""
+        yield f"clearance.ignore: {name!r} is not a known name{part}; allowed names are {', '.join(names)}"
 
 
 def _planar_slips(config: "Config") -> Iterator[str]:
@@ -118,6 +167,12 @@ def _path_slips(config: "Config") -> Iterator[str]:
         yield (
             "experiment.lines: a spatial arm follows a path, whose highest frequency is the upper end of "
             "experiment.band"
+        )
+    high = (config.experiment.band or DEFAULT_BAND)[1]
+    if config.experiment.period * high < _HARMONICS - 1e-9:
+        yield (
+            f"experiment.period = {config.experiment.period:g} s: a path needs at least {_HARMONICS} harmonics below "
+            f"the upper end of its band, {high:g} Hz: make it at least {_HARMONICS / high:.3g} s; 8 to 10 s are usual"
         )
     if config.joint_path is None:
         return

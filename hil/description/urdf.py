@@ -18,6 +18,7 @@ MOST_MASS = 100.0  # kg per link; a larger value suggests grams
 MOST_GYRATION = 2.0  # m, radius of gyration; a larger value suggests wrong units
 TURNING = ("revolute", "continuous")
 MOVABLE = (*TURNING, "prismatic", "planar", "floating")
+_LENGTHS = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,7 @@ def _links(root: ET.Element, path: Path) -> tuple[dict[str, Body], dict[str, boo
         if name in bodies:
             raise ArmFileError(f'{path}: two links are named "{name}"')
         bodies[name] = _body(element.find("inertial"), f'link "{name}"', path)
+        _check_shapes(element, f'link "{name}"', path)
     if not bodies:
         raise ArmFileError(f"{path} has no links")
     return bodies, {name: body.mass == 0.0 or body.is_physical for name, body in bodies.items()}
@@ -129,6 +131,24 @@ def _body(element: ET.Element | None, where: str, path: Path) -> Body:
             if row == column and inertia[row, row] < 0.0:
                 raise ArmFileError(f"{path}: {where}: its {key} is {inertia[row, row]:g} kg m^2; it cannot be negative")
     return Body(kilograms, np.zeros(3), inertia).moved(rotation, translation)
+
+
+def _check_shapes(link: ET.Element, where: str, path: Path) -> None:
+    """Raise ArmFileError for a wrong size or origin in a link's collision geometry, or visual if it has none."""
+    for element in link.findall("collision") or link.findall("visual"):
+        _origin(element, where, path)
+        for shape in element.find("geometry") or ():
+            if shape.tag == "mesh":
+                _three(shape, "scale", where, path)
+            for key in _LENGTHS.get(shape.tag, ()):
+                if shape.get(key) is None:
+                    raise ArmFileError(f"{path}: {where}: a {shape.tag} of its geometry has no {key}")
+                lengths = _three(shape, key, where, path) if key == "size" else [_number(shape, key, where, path)]
+                if min(lengths) < 0.0:
+                    raise ArmFileError(
+                        f'{path}: {where}: a {shape.tag} of its geometry has {key}="{shape.get(key)}": lengths [m] '
+                        "cannot be negative"
+                    )
 
 
 def _joints(root: ET.Element, bodies: dict[str, Body], path: Path) -> dict[str, _Joint]:

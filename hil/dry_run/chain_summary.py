@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from hil.config.chain import described_arm, doubted_inertias
+from hil.clearance.doubts import doubts
 from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction
 from hil.dry_run.chain_stop import LAID_DOWN, ChainStops
@@ -158,18 +158,13 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         f"{fall.moment:.1f} s into the path: {hit} after {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, "
         f"at {fall.speed:.1f} m/s.",
     ]
-    if run.shapes_guessed:
-        lines.append(
-            f"No collision geometry could be read for {', '.join(run.shapes_guessed)}: these links are replaced by "
-            "capsules from joint to joint (a base link is left out)."
-        )
     if run.as_built:
         pairs = ", ".join(f"{a} and {b}" for a, b in run.as_built)
         lines.append(
             "Parts of these links touch by design in nearly every pose and are not checked; their other parts are: "
             f"{pairs}."
         )
-    lines += [f"Warning: {warning}" for warning in doubted_inertias(described_arm(run.config))]
+    lines += [f"Warning: {doubt}" for doubt in doubts(run.config)]
     if run.share < 1.0:
         lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which is shown here.")
     if run.refused == "" and (doubt := run.doubt(run.config)):

@@ -4,7 +4,8 @@ Prior knowledge is the ensemble's mean and inflated covariance. The ensemble is 
 updated after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
 A joint that stands at its rest angle is only judged by torques that would move it to where it has been: on the way home
 it may reach the stop on which it rests before the others. One that has been on both sides of that angle has no stop
-there.
+there. One that has not left it yet may lie on a stop on the side to which gravity pulls it: unless it is commanded to
+that side, nothing is expected of it.
 """
 
 import math
@@ -59,6 +60,10 @@ class ChainWatch:
         self._observer = ChainObserver(arms.base, mean, covariance, largest, interval, _FRICTIONS)
         self._names = [joint.joint.title for joint in config.joints]
         self._rest = np.array(config.arm.rest_pose)
+        count = arms.base.count
+        gravity = arms.base.regressor(self._rest[:, None], *np.zeros((2, n, 1)))[:, 0] @ mean[:count]
+        self._friction = mean[count + n : count + 2 * n]
+        self._falls_to = np.where(np.abs(gravity) > self._friction, -np.sign(gravity), 0.0)
         self._was_below, self._was_above = np.zeros((2, n), dtype=np.bool_)
         self._commanded: deque[tuple[float, Array]] = deque(maxlen=math.ceil(WINDOW_S / interval))
         self._goal: Sequence[float] | None = None
@@ -79,20 +84,22 @@ class ChainWatch:
         if is_free:
             self._was_above |= away > LYING_RAD
             self._was_below |= away < -LYING_RAD
-        support = self._support(is_away, velocity) if is_free and not is_away.all() else None
         torque = self._constants * goal
+        support = self._support(is_away, velocity, torque) if is_free and not is_away.all() else None
         self._commanded.append((self._seen_at, torque))
         joint = self._observer.observe(position, velocity, torque, seconds, is_free, support)
         if joint >= 0:
             self._raise(joint, state)
 
-    def _support(self, is_away: NDArray[np.bool_], velocity: Array) -> Array:
+    def _support(self, is_away: NDArray[np.bool_], velocity: Array, torque: Array) -> Array:
         """The direction in which a stop may prevent motion of each joint (joints,): 1, -1, or 0.
 
-        is_away: whether each joint is away from its rest angle.
+        is_away: whether each joint is away from its rest angle. torque: commanded (joints,) [N m].
         """
         is_home = ~is_away & (np.abs(velocity) <= _STILL_RAD_S)
-        return np.asarray(is_home * (self._was_below * 1.0 - self._was_above * 1.0))
+        may_lie = ~self._was_below & ~self._was_above & (torque * self._falls_to <= self._friction)
+        towards = self._was_below * 1.0 - self._was_above * 1.0
+        return np.asarray(is_home * np.where(may_lie, self._falls_to, towards))
 
     def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]

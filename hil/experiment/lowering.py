@@ -6,6 +6,7 @@ joint that leaves the path ends it, and torque is cut.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
@@ -56,8 +57,21 @@ class Lowering:
 
     def lies(self, state: State) -> bool:
         """Whether the arm is already at rest in its rest pose."""
-        away = np.abs(np.array(state.position) - self._rest)
-        return bool(away.max() < LYING_RAD)
+        return bool(np.abs(self._away(state)).max() < LYING_RAD)
+
+    def lies_elsewhere(self, state: State) -> str:
+        """Say which joints are not in the rest pose, and where they are instead."""
+        each = zip(self._config.joints, state.position, self._away(state), strict=True)
+        found = [
+            f"{joint.name!r} is at {position:.3f} rad, {away:+.2f} rad from it"
+            for joint, position, away in each
+            if not abs(away) < LYING_RAD
+        ]
+        return ", ".join(found)
+
+    def _away(self, state: State) -> NDArray[np.float64]:
+        away: NDArray[np.float64] = np.array(state.position) - self._rest
+        return away
 
     def begin(self, state: State, goal: list[float]) -> int:
         """Start lowering from this sample; return the number of samples it takes. goal: latest goals [A or V]."""

@@ -27,6 +27,7 @@ from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
 from hil.setup.changed_settings import EXPLAINED, Settings, changed_settings, settings_now
+from hil.setup.lying import from_where_it_lies, said_of_the_rest, tolerance_now, wait_for_rest
 from hil.setup.realtime import on_time
 from hil.setup.servo_session import REBOOT_S, has_moved, servo_session
 
@@ -40,12 +41,6 @@ _MOST_UNSEEN = 20
 
 _PATIENCE_S = 0.2
 """Time for which the end of a run waits for the observer [s]."""
-
-
-_MOVED = 2.0
-
-_LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
-"""Longest wait for an arm to come to rest, interval between checks, and largest change in between [rad]."""
 
 
 def run_experiment(
@@ -69,7 +64,7 @@ def run_experiment(
     Raises:
         HilError, DriverError: if torque was switched on, the exception carries a note that says whether it is off.
     """
-    plan = plan_of(config) if plan is None else plan
+    is_given, plan = plan is not None, plan_of(config) if plan is None else plan
     if config.is_chain and not config.is_fake:
         check_clearance(config, plan)
     fakes.register_for(config.url)
@@ -83,9 +78,11 @@ def run_experiment(
             note("spatial arms have not been tested on hardware yet: keep a hand on the supply's switch")
         note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
-        if (moving := _wait_for_rest(bus) if has_moved() or config.is_chain else "") and config.is_chain:
+        if (moving := wait_for_rest(bus) if has_moved() or config.is_chain else "") and config.is_chain:
             raise ExperimentError(moving)
         _check_pose(config, bus)
+        if config.is_chain and not is_given:
+            config, plan = _from_where_it_lies(config, plan, bus, run, note)
         _write_facts(config, run, plan, bus, shown_path)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
             # Signals are deferred from before torque comes on until the servos' settings are restored.
@@ -237,27 +234,6 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
         )
 
 
-def _wait_for_rest(bus: ServoBus) -> str:
-    """Wait for an arm that still swings after an earlier run, or falls, for at most _LONGEST_REST_S.
-
-    Returns a sentence about a joint that still moves then, "" if none does.
-    """
-    clock = bus.port.clock
-    former, end = bus.read_positions(), clock.now() + _LONGEST_REST_S
-    while True:
-        clock.wait_until(clock.now() + _REST_EVERY_S)
-        latest = bus.read_positions()
-        away = [abs(now - before) for now, before in zip(latest, former, strict=True)]
-        if max(away) < _REST_WITHIN_RAD:
-            return ""
-        if clock.now() >= end:
-            return (
-                f"{bus.joints[away.index(max(away))]} is still moving after {_LONGEST_REST_S:.0f} s without torque: "
-                f"{max(away):.3f} rad in {_REST_EVERY_S:g} s. Bring the arm to rest, then start again."
-            )
-        former = latest
-
-
 def _check_pose(config: Config, bus: ServoBus) -> None:
     """Check that the arm is in its rest pose; otherwise zero_ticks, direction or the arm itself is not as described.
 
@@ -265,7 +241,7 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
     """
     if has_moved():
         _check_inside(config, bus)
-    tolerance = config.rest_tolerance * (_MOVED if has_moved() else 1.0)
+    tolerance = tolerance_now(config)
     or_there = " If that is where the arm lies without torque, set arm.rest_pose to it." if config.is_chain else ""
     for joint, position, rest in zip(bus.joints, _positions(config, bus), config.arm.rest_pose, strict=True):
         if abs(position - rest) > tolerance:
@@ -280,6 +256,19 @@ def _positions(config: Config, bus: ServoBus) -> list[float]:
     """Each joint's angle [rad], for a joint that fell within its position limits."""
     read = zip(bus.read_positions(), config.joints, strict=True)
     return [within_limits(position, joint.position_limit) for position, joint in read]
+
+
+def _from_where_it_lies(config: Config, plan: Plan, bus: ServoBus, run: RunFolder, note: Note) -> tuple[Config, Plan]:
+    """Plan the motion of a spatial arm anew if it does not lie exactly in its rest pose; save that for an estimate."""
+    lies = from_where_it_lies(config, _positions(config, bus))
+    if lies is config:
+        return config, plan
+    note(said_of_the_rest(config, lies))
+    plan = plan_of(lies)
+    if not config.is_fake:
+        check_clearance(lies, plan)
+    run.write_played(lies)
+    return lies, plan
 
 
 def _check_inside(config: Config, bus: ServoBus) -> None:

@@ -379,7 +379,8 @@ class Stream:
         except (SafetyStop, StopRequested, DriverError) as ended:
             self._told(error, f"Torque was cut while the arm was being lowered, so it fell from there: {ended}")
             return
-        done = "was lowered to its rest pose" if lowering.lies(state) else "was lowered, but not to its rest pose"
+        elsewhere = lowering.lies_elsewhere(state)
+        done = f"was lowered, but not to its rest pose: {elsewhere}" if elsewhere else "was lowered to its rest pose"
         self._told(error, f"The arm {done}.")
 
     def _way_down(self, lowering: Lowering, state: State) -> State:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.clearance.space import Space
+from hil.config.chain import DEFAULT_BAND, POSITION_RESERVE
 from hil.config.schema import Config
 from hil.errors import NoSafeTorque
 from hil.estimator.chain.excitation.fourier_path import Path
@@ -16,9 +17,6 @@ from hil.plan.chain_plan import check_rest_pose, path_plan
 from hil.plan.plan import HELD_OUT, Plan
 
 Array = NDArray[np.float64]
-
-BAND = (0.1, 1.5)
-"""Default band [Hz], if the configuration has none."""
 
 # Highest speed between rest pose and path: the smaller of this [rad/s] and this fraction of velocity_limit.
 RAMP_SPEED = 1.2
@@ -36,7 +34,7 @@ class Reserve:
     need not keep.
     """
 
-    position: float = 0.08
+    position: float = POSITION_RESERVE
     speed: float = 0.6
     torque: float = 0.65
     clearance: float = 0.01
@@ -139,7 +137,7 @@ def chain_config(config: Config) -> Config:
     farthest = np.maximum(high - rest, rest - low) * (1.0 - RESERVE.position)
     fastest = np.minimum(RAMP_SPEED, RAMP_SPEED_SHARE * np.array([joint.velocity_limit for joint in config.joints]))
     ramp = max(experiment.ramp, float((_PEAK * farthest / fastest).max()))
-    band = experiment.band or list(BAND)
+    band = experiment.band or list(DEFAULT_BAND)
     ramp = float(np.ceil(min(ramp, 0.6 * experiment.period, 60.0) * 10) / 10)
     return config.model_copy(update={"experiment": experiment.model_copy(update={"band": band, "ramp": ramp})})
 

@@ -25,6 +25,7 @@ from hil.pilot.steps import Say, Step, tells_of_the_arm
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
+from hil.setup.lying import from_where_it_lies, said_of_the_rest, wait_for_rest
 from hil.setup.servo_session import servo_session
 
 MOST_STEPS = 6
@@ -126,8 +127,13 @@ def identify_chain_in_steps(
 
     Raises what a run raises, and NoSafeTorque.
     """
-    with StopRequest(), servo_session(config, run.path, say):
-        search = ChainSearch.of(config, run, shown_path, watch, say)
+    with StopRequest(), servo_session(config, run.path, say) as bus:
+        lies = from_where_it_lies(config, bus.read_positions())
+        if lies is not config:
+            wait_for_rest(bus)
+            lies = from_where_it_lies(config, bus.read_positions())
+            say(said_of_the_rest(config, lies))
+        search = ChainSearch.of(lies, run, shown_path, watch, say)
         search.step("Pilot", "pilot", PILOT_SHARES)
         while len(search.steps) < MOST_STEPS:
             wanted = search.safe(step_config(search.config), SHARES)

@@ -12,6 +12,7 @@ from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction, Tell, predict_chain
 from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import unsafe
+from hil.dry_run.prediction import GUARDED, QUANTITIES
 from hil.errors import NoSafeTorque
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths
@@ -29,6 +30,11 @@ SMALL = 0.5
 """Fraction of the wanted share below which other paths, with more reserve, are designed."""
 
 REDESIGNS = 2
+
+OTHER_SEEDS = 2
+"""Number of paths designed from other seeds where no share of a path is safe."""
+
+_NEXT_SEED = 100
 
 
 @dataclass(frozen=True)
@@ -67,8 +73,52 @@ class SafeShares:
         most: largest share; for other paths, the share with the same amplitude. The shares are scaled to it.
 
         If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
-        kept. Raises NoSafeTorque if no share of any path is safe.
+        kept. If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.
         """
+        found, why = self._safe_of_these(config, shares, most)
+        first = self.given, self.paths, self.cap, self.last
+        for number in range(OTHER_SEEDS):
+            if found is not None:
+                return found
+            times = self._other_seed()
+            if times is None:
+                break
+            self.say(
+                f"No share of the designed path is safe for all arms: {why}. Trying another path, {number + 1} of "
+                f"{OTHER_SEEDS}."
+            )
+            most = most / times
+            found, other_why = self._safe_of_these(config, shares, most)
+            why = other_why if found is not None else why
+        if found is None:
+            self.given, self.paths, self.cap, self.last = first
+            raise NoSafeTorque(
+                f"{config.path}: no motion is safe for all arms consistent with what is known, not even "
+                f"{100 * shares[-1]:.0f} % of the designed path: {why}."
+            )
+        return found
+
+    def _other_seed(self) -> float | None:
+        """Design paths from another seed; return the ratio of their amplitude to the former, None if there are none."""
+        experiment = self.given.experiment
+        other = experiment.model_copy(update={"seed": experiment.seed + _NEXT_SEED})
+        given, former = self.given.model_copy(update={"experiment": other}), self.paths
+        try:
+            self.paths = Paths.of(given, self.belief.torque)
+        except NoSafeTorque:
+            return None
+        self.given = given
+        return self._rescaled(former)
+
+    def _rescaled(self, former: Paths) -> float:
+        """Convert the shares of the former paths to those of the present ones; return the ratio of their amplitudes."""
+        times = self.paths.amplitude_over(former)
+        self.last = self.last / times
+        self.cap = min(self.cap / times, 1.0) if self.cap < 1.0 else 1.0
+        return times
+
+    def _safe_of_these(self, config: Config, shares: tuple[float, ...], most: float) -> tuple[Found | None, str]:
+        """Find a safe share of the paths of one seed, or say why there is none."""
         most = min(most, self.cap) if self.cap < 1.0 else most
         found, why, shortage = self._largest(config, _up_to(most, shares))
         reserve = self.paths.reserve
@@ -85,17 +135,10 @@ class SafeShares:
             if other is None or (found is not None and self._worth(former, found) <= self._worth(self.paths, other)):
                 self.paths = former
             else:
-                found = other
-                most, self.last = most / times, self.last / times
-                self.cap = min(self.cap / times, 1.0) if self.cap < 1.0 else 1.0
+                found, most = other, most / self._rescaled(former)
                 self.say("Designed another path, which stays farther from the limits.")
             why = why if other is not None else other_why
-        if found is None:
-            raise NoSafeTorque(
-                f"{config.path}: no motion is safe for all arms consistent with what is known, not even "
-                f"{100 * shares[-1]:.0f} % of the designed path: {why}. {_remedy(config)}"
-            )
-        return found
+        return found, why
 
     def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
         """The first safe share of the paths, why a larger one is not, and how much clearance that one lacks [m]."""
@@ -104,7 +147,7 @@ class SafeShares:
             try:
                 plan = self.paths.plan(config, self.belief.torque, share)
             except NoHeadroom as error:  # the arm is heavier than the paths were designed for
-                why = str(error)
+                why = f"{error} {_better_known(config)}"
                 continue
             for count in (SEARCH_ARMS, ARMS):
                 foreseen = predict_chain(config, plan, self.belief.arms.first(count), self.tell)
@@ -112,10 +155,12 @@ class SafeShares:
                 shortage = max(shortage, -float(foreseen.rooms.min()))
                 if not_safe:
                     break
-            not_safe = not_safe or self._unsafe_stop(config, plan)
-            if not not_safe:
+            if not_safe:
+                why = f"{not_safe}. {_remedy(config, foreseen)}"
+            elif not_safe := self._unsafe_stop(config, plan):
+                why = not_safe
+            else:
                 return Found(share, plan, foreseen), why, shortage
-            why = not_safe
         return None, why, shortage
 
     def _worth(self, paths: Paths, found: Found) -> float:
@@ -132,14 +177,24 @@ def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(min(1.0, most / shares[0]) * share for share in shares)
 
 
-def _remedy(config: Config) -> str:
-    """Return the changes with which a user may make a path safe."""
+def _remedy(config: Config, foreseen: ChainPrediction) -> str:
+    """Return the changes with which a user may make a path safe that `unsafe` rejects."""
+    if not foreseen.is_clear:
+        helps = "A rest_pose farther from obstacles, or more room in [clearance] (floor, boxes, margin)"
+    else:
+        peaks = foreseen.peaks
+        touched = (peaks.shares[:, :GUARDED] >= 1.0).any(axis=0)
+        row = int(np.argmax((touched + peaks.limit_chance[:GUARDED]).max(axis=1)))
+        is_speed = QUANTITIES[row] == "velocity"
+        helps = "A larger velocity_limit" if is_speed else "A wider position_limit, or a rest_pose farther from it"
+    return f"{helps}, if the arm allows it, helps. {_better_known(config)}"
+
+
+def _better_known(config: Config) -> str:
     spread = 0.3 if config.arm.prior is None else config.arm.prior.spread
     return (
-        "Depending on the reason, these changes help: a rest_pose farther from limits and obstacles; a wider "
-        "position_limit; more room in [clearance] (floor, boxes, margin), if there is more; a larger "
-        f"{limit_names(config)} or velocity_limit; or masses in the URDF that are known better, with [arm.prior] "
-        f"spread below {spread:g}."
+        f"Masses in the URDF that are known better ([arm.prior] spread below {spread:g}) help too, as does a larger "
+        f"{limit_names(config)}"
     )
 
 

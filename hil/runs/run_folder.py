@@ -32,7 +32,7 @@ from hil import __version__, strict_json
 from hil.clearance.kept import keep_shapes
 from hil.config.chain import described_arm
 from hil.config.experiment import ExperimentConfig
-from hil.config.schema import Config, StabiliserConfig, parse_config
+from hil.config.schema import ArmConfig, Config, StabiliserConfig, parse_config
 from hil.description.kept_file import kept_bytes
 from hil.errors import ConfigError, RunFolderError
 from hil.next_step import command, only_steps, steps_of
@@ -100,6 +100,7 @@ _OF_A_START = frozenset(
         "config.toml",
         "experiment.json",
         "stabiliser.json",
+        "rest_pose.json",
         "starts.json",
         "run.json",
         "events.jsonl",
@@ -214,6 +215,8 @@ class RunFolder:
             played["experiment"] = ExperimentConfig(**_read_json(self.played_path))
             if self.stabiliser_path.is_file():
                 played["stabiliser"] = StabiliserConfig(**_read_json(self.stabiliser_path))
+            if self.rest_pose_path.is_file():
+                played["arm"] = ArmConfig(**{**config.arm.model_dump(), **_read_json(self.rest_pose_path)})
         except ValidationError as error:
             raise RunFolderError(
                 f"The record of the excitation next to {self.config_path} is damaged: {error}."
@@ -225,6 +228,10 @@ class RunFolder:
         folder = RunFolder.create(self.path / name, played)
         folder.write_played(played)
         return folder
+
+    @property
+    def rest_pose_path(self) -> Path:
+        return self.path / "rest_pose.json"
 
     @property
     def starts_path(self) -> Path:
@@ -245,11 +252,13 @@ class RunFolder:
 
     def write_played(self, played: Config) -> None:
         """Save the [experiment] and [stabiliser] as used, if they differ from the file (pilot, computed torque or
-        gains).
+        gains), and the pose in which a spatial arm lay.
         """
         write_json(self.played_path, played.experiment.model_dump())
         if played.stabiliser is not None:
             write_json(self.stabiliser_path, played.stabiliser.model_dump())
+        if played.is_chain:
+            write_json(self.rest_pose_path, {"rest_pose": list(played.arm.rest_pose)})
 
     def set_aside(self, name: str, played: Config) -> None:
         """Move the recording of a run of `played` to a subfolder, so that another run can use this folder."""

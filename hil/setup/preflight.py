@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from hil import fakes
+from hil.clearance.doubts import doubts
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
@@ -63,7 +64,7 @@ def check_arm(config: Config) -> Iterator[Finding]:
         if why := too_slow(config):
             yield Finding(Level.STOP, "stabiliser", "rate", f"{config.experiment.rate:g} Hz", why)
         yield from _torque_of_pilot(config)
-        yield from _rest_pose(config)
+        yield from _described(config)
         yield _latency_timer(bus)
         yield from _others(config, bus)
         all_well = True
@@ -91,8 +92,10 @@ def _torque_of_pilot(config: Config) -> Iterator[Finding]:
         yield Finding(Level.WARNING, "experiment", "torque", "pilot = true takes precedence over peak_torque", fix)
 
 
-def _rest_pose(config: Config) -> Iterator[Finding]:
-    """Whether a spatial arm is clear of itself, the floor and the boxes in its rest pose."""
+def _described(config: Config) -> Iterator[Finding]:
+    """Report what is doubtful about the description, and whether the rest pose of a spatial arm is clear."""
+    for doubt in doubts(config):
+        yield Finding(Level.WARNING, "arm", "description", "doubtful", doubt)
     if not config.is_chain:
         return
     try:

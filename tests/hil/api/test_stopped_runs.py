@@ -1,15 +1,18 @@
 """What stopped an arm, and the state of its torque, is what the caller gets: no hint takes its place."""
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from hil.api import experiment
 from hil.api.progress import Progress, forgiving
-from hil.errors import Cause, SafetyStop, StopRequested
+from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
 from hil.estimation import after_a_stop
 from hil.estimator.errors import RecordingError
 from hil.plan.plan import IDENTIFY
+from tests.support.paths import CONFIGS
 
 
 class _Run:
@@ -20,6 +23,26 @@ class _Run:
 
     def discard_if_unused(self) -> bool:
         return False
+
+
+@pytest.mark.parametrize("start", [experiment.identify, experiment.record])
+def test_doubts_are_told_before_anything_moves(
+    start: Callable[..., object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
+    for weak in ("current_limit = 0.001", "peak_torque = [0.0005, 0.0005]"):
+        text, changed = re.subn(rf"(?m)^{weak.split()[0]} = .*", weak, text, count=1)
+        assert changed
+    (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
+    told: list[Progress] = []
+
+    def move(*_: object) -> str:
+        raise ExperimentError(told[0].message)
+
+    monkeypatch.setattr(experiment, "run_experiment", move)
+    with pytest.raises(ExperimentError, match=r"Warning: current_limit of joint .* it would not move"):
+        start(tmp_path / "arm.toml", out=tmp_path / "run", on_progress=told.append)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_hint_that_fails_leaves_the_stop_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:

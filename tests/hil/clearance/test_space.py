@@ -1,12 +1,14 @@
 """Clearance of a spatial arm: capsules around its links, distances from itself, the floor and boxes."""
 
+import re
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hil.clearance.mesh import find_mesh, mesh_corners
+from hil.clearance.doubts import doubts
+from hil.clearance.mesh import find_mesh
 from hil.clearance.shapes import shapes_of
 from hil.clearance.space import Space
 from hil.config.schema import Config, load_config
@@ -72,8 +74,8 @@ def test_the_floor_can_be_elsewhere_or_missing(tmp_path: Path) -> None:
 
 def test_an_unknown_name_to_ignore_is_named(tmp_path: Path) -> None:
     text = TEXT.replace("[clearance]\n", '[clearance]\nignore = [["hand", "flor"]]\n', 1)
-    with pytest.raises(ConfigError, match="unknown name 'flor'"):
-        Space.of(configured(tmp_path, text))
+    with pytest.raises(ConfigError, match=r"clearance.ignore: 'flor' is not a known name; allowed names are .*floor"):
+        configured(tmp_path, text)
 
 
 def test_where_it_lies_it_may_be_near_but_not_nearer(tmp_path: Path) -> None:
@@ -93,8 +95,6 @@ def test_capsules_enclose_boxes_and_meshes(tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "link.stl").write_bytes(stl)
     assert find_mesh("package://robot/meshes/link.stl", tmp_path / "arm.urdf") == tmp_path / "meshes" / "link.stl"
-    found = mesh_corners(tmp_path / "meshes" / "link.stl")
-    assert found is not None
     for geometry in ('<mesh filename="package://robot/meshes/link.stl"/>', '<box size="0.2 0.06 0.02"/>'):
         origin = "0 0 0" if "mesh" in geometry else "0.1 0 0"
         arm = one_joint(tmp_path, f'<collision><origin xyz="{origin}"/><geometry>{geometry}</geometry></collision>')
@@ -104,13 +104,77 @@ def test_capsules_enclose_boxes_and_meshes(tmp_path: Path) -> None:
             assert min(outside(corner, each.ends, each.radius) for each in shapes.capsules) < 1e-6
 
 
-def test_what_cannot_be_read_is_guessed_and_named(tmp_path: Path) -> None:
-    arm = one_joint(tmp_path, '<collision><geometry><mesh filename="package://a/b.dae"/></geometry></collision>')
-    assert "tip" in shapes_of(arm).guessed
-    assert shapes_of(arm).capsules
-    broken = one_joint(tmp_path, '<collision><geometry><sphere radius="wide"/></geometry></collision>')
-    with pytest.raises((ArmFileError, ValueError)):
-        shapes_of(broken)
+@pytest.mark.parametrize(
+    ("mesh", "why"),
+    [
+        ("package://a/b.stl", "no such file"),
+        ("shape.dae", "only STL and OBJ"),
+        ("empty.stl", "no vertices"),
+        ("broken.obj", "is damaged"),
+    ],
+)
+def test_what_cannot_be_read_is_guessed_and_named(tmp_path: Path, mesh: str, why: str) -> None:
+    for name, text in (("shape.dae", "<COLLADA/>"), ("empty.stl", ""), ("broken.obj", "v 1 2 three")):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    shapes = shapes_of(one_joint(tmp_path, f'<collision><geometry><mesh filename="{mesh}"/></geometry></collision>'))
+    assert "tip" in shapes.guessed and shapes.capsules
+    (doubt,) = shapes.doubts
+    assert doubt.startswith(f'link "tip": its mesh "{mesh}" is not used: ') and why in doubt
+    assert "replaced by a capsule 200 mm long from its joint to its end. The radius of 40 mm is a guess" in doubt
+
+
+def test_a_base_whose_shape_cannot_be_read_has_none(tmp_path: Path) -> None:
+    mesh = '<collision><geometry><mesh filename="base.stl"/></geometry></collision>'
+    box = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
+    one_joint(tmp_path, box)
+    path = tmp_path / "arm.urdf"
+    path.write_text(path.read_text(encoding="utf-8").replace('<link name="base"/>', f'<link name="base">{mesh}</link>'))
+    (doubt,) = shapes_of(read_urdf(path, ["j"])).doubts
+    assert doubt.startswith('link "base"') and "It has no shape: how close the arm comes to it is not known." in doubt
+
+
+@pytest.mark.parametrize(
+    ("shape", "said"),
+    [
+        ('<sphere radius="wide"/>', "radius='wide' must be a number"),
+        ('<box size="0.1 -0.1 0.1"/>', 'a box of its geometry has size="0.1 -0.1 0.1": lengths [m] cannot be negative'),
+        ('<box size="0.1 0.1"/>', 'size="0.1 0.1" must be three numbers'),
+        ('<cylinder radius="0.1"/>', "a cylinder of its geometry has no length"),
+        ('<mesh filename="a.stl" scale="0.001"/>', 'scale="0.001" must be three numbers'),
+    ],
+)
+def test_a_wrong_size_is_named(tmp_path: Path, shape: str, said: str) -> None:
+    with pytest.raises(ArmFileError, match=re.escape(f'link "tip": {said}')):
+        one_joint(tmp_path, f"<collision><geometry>{shape}</geometry></collision>")
+
+
+LIMITS = '<limit lower="-0.94" upper="1.38"'
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        ((LIMITS, '<limit lower="1.38" upper="-0.94"'), "they are the wrong way round"),
+        ((LIMITS, '<limit lower="-0.94" upper="0.9"'), "but position_limit lets it move from"),
+        (('iyy="', 'iyy="9'), "no mass distribution can have this inertia"),
+        (("<box size=", "<mesh filename="), "replaced by a capsule"),
+        (("", ""), ""),
+    ],
+)
+def test_doubts_about_a_description(tmp_path: Path, edit: tuple[str, str], said: str) -> None:
+    config = configured(tmp_path, TEXT)
+    path = Path(str(config.arm.urdf))
+    text = path.read_text(encoding="utf-8")
+    assert edit[0] in text
+    path.write_text(text.replace(*edit), encoding="utf-8")
+    found = list(doubts(load_config(config.path)))
+    assert any(said in doubt for doubt in found) if said else not found
+
+
+def test_a_limit_that_cannot_overcome_friction_is_doubted(tmp_path: Path) -> None:
+    text, changed = re.subn(r"(?m)^current_limit = \S+", "current_limit = 0.001", TEXT, count=1)
+    (doubt,) = doubts(configured(tmp_path, text))
+    assert changed and "current_limit of joint 'joint1' = 0.001 A" in doubt and "it would not move" in doubt
 
 
 def one_joint(folder: Path, collision: str):  # type: ignore[no-untyped-def]

@@ -1,6 +1,7 @@
 """What the watch of a spatial arm judges, and what it does not."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -8,9 +9,11 @@ import numpy as np
 import pytest
 
 from hil.config.schema import Config, load_config
+from hil.dry_run.chain_prior import prior_arms
 from hil.errors import Cause, SafetyStop
 from hil.experiment import chain_watch
 from hil.experiment.chain_watch import ChainWatch
+from hil.plan.chain_model import known_chain
 from tests.support.paths import CONFIGS
 
 
@@ -59,6 +62,25 @@ def test_one_that_never_left_it_is(config: Config) -> None:
     """It is blocked from the start, or its encoder is frozen."""
     with pytest.raises(SafetyStop, match="stands still, with "):
         stands(config, 0.02, -2.0, was_away=False)
+
+
+def falling(goal: float) -> None:
+    """A joint of a well-known arm lies on its stop under this current, while joint 1 is away from its rest angle."""
+    config = load_config(CONFIGS / "fake_open_manipulator_x.toml")
+    arms = prior_arms(config, known_chain(config), 24)
+    watch = ChainWatch(config, [0.1] * 4, replace(arms, rigid=0.0 * arms.rigid + 3.0 * arms.rigid.mean(axis=0)))
+    rest = np.array(config.arm.rest_pose)
+    for number in range(200):
+        look(config, watch, (rest[0] + 0.3, *rest[1:]), (0.0, 0.0, goal, 0.0), number)
+
+
+def test_one_that_never_left_its_stop_is_not_blocked_while_nothing_is_commanded() -> None:
+    falling(0.0)
+
+
+def test_but_it_is_if_it_cannot_be_lifted_from_it() -> None:
+    with pytest.raises(SafetyStop, match=r"joint3.* stands still, with -"):
+        falling(-2.0)
 
 
 def test_the_same_joint_elsewhere_is(config: Config) -> None:

@@ -3,6 +3,7 @@
 import os
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from hil.experiment.lowering import Lowering
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress
 from hil.fakes.protocol_fake import FakeSerial
+from hil.plan.chain_plan import make_chain_plan
 from hil.runs.recording import Phase, Recorder, load_samples
 from hil.runs.run_folder import RunFolder
 from tests.support.paths import CONFIGS
@@ -63,6 +65,27 @@ def test_ctrl_c_lowers_the_arm_to_its_rest_pose(tmp_path: Path) -> None:
     assert np.abs(lowered["goal_current"][-1]).max() < 0.1  # the arm does not drop when torque is cut
     assert np.abs(lowered["velocity"][120:]).max() < 1.0  # braked, then slowly
     assert len(lowered) / 400 < 12.0
+
+
+def test_an_arm_off_its_rest_pose_starts_and_ends_where_it_lies(tmp_path: Path) -> None:
+    """The spring does not press it against the stop on which it lies, and the estimate uses the same pose."""
+    text = TEXT.replace("stops = [-1.79, 1.15]", "stops = [-1.79, 1.05]")
+    text = text.replace("start = [0.0, -1.5, 1.0, 1.15]", "start = [0.0, -1.5, 1.0, 1.05]")
+    assert text.count("1.05") == 2
+    error, samples = play(tmp_path, text, (AT_S,))
+    assert isinstance(error, StopRequested)
+    assert any("lowered to its rest pose" in note for note in error.__notes__)
+    assert np.abs(samples["goal_current"][samples["phase"] == Phase.REST]).max() < 0.05
+    assert abs(samples["position"][-1, 3] - 1.05) < 0.03
+    assert RunFolder.open(tmp_path / "run").load_config().arm.rest_pose[3] == pytest.approx(1.05, abs=0.01)
+
+
+def test_an_arm_that_does_not_reach_its_rest_pose_is_said_to_lie_elsewhere() -> None:
+    config = load_config(CONFIGS / NAME)
+    rest = config.arm.rest_pose
+    lowering = Lowering(config, make_chain_plan(config))
+    state: Any = SimpleNamespace(position=(*rest[:2], rest[2] - 0.2, rest[3]))
+    assert not lowering.lies(state) and lowering.lies_elsewhere(state) == "'joint3' is at 0.800 rad, -0.20 rad from it"
 
 
 def test_a_second_signal_cuts_torque_on_the_way_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """Spatial arms from description, limits and rest pose to the result, on the fake bus; here the smallest one."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -179,8 +180,52 @@ def test_where_little_of_a_path_is_safe_another_one_with_more_reserve_is_tried(
 def test_an_arm_too_heavy_for_any_path_is_refused_with_the_reason_and_what_helps() -> None:
     config = chain_config(load_config(LEG))
     search = search_of(config, heavier(ChainBelief.prior(config), 20.0), [])
-    with pytest.raises(NoSafeTorque, match=r"not even 90 % of the designed path: .*needs about.*these changes help"):
+    with pytest.raises(NoSafeTorque, match=r"not even 90 % of the designed path: .*needs about.*known better.*larger"):
         search.safe(step_config(search.config), (1.0, 0.9))
+
+
+def test_paths_from_other_seeds_are_tried_before_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = chain_config(load_config(LEG))
+    said: list[str] = []
+    search = search_of(config, ChainBelief.prior(config), said)
+    first, seed = search.paths, config.experiment.seed
+    monkeypatch.setattr("hil.pilot.chain_shares.REDESIGNS", 0)
+
+    def largest(_: object, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
+        is_last = search.given.experiment.seed == safe
+        return (Found(shares[0], cast("Any", None), cast("Any", None)) if is_last else None), "shank hits floor", 0.0
+
+    monkeypatch.setattr(search, "_largest", largest)
+    safe = None
+    with pytest.raises(NoSafeTorque, match=r"not even 18 % of the designed path: shank hits floor\."):
+        search.safe(search.config, (1.0, 0.18))
+    assert search.paths is first and search.given.experiment.seed == seed
+    assert [line.partition("Trying another path, ")[2] for line in said] == ["1 of 2.", "2 of 2."]
+    safe = seed + 200
+    assert search.safe(search.config, (1.0, 0.18)).share == 1.0
+    assert search.given.experiment.seed == safe and search.paths is not first
+
+
+def test_a_pilot_starts_where_the_arm_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = LEG.read_text(encoding="utf-8")
+    (tmp_path / "leg.urdf").write_bytes((CONFIGS / "leg.urdf").read_bytes())
+    (tmp_path / "leg.toml").write_text(text.replace("start = [0.0, 0.0, 0.0]", "start = [0.0, 0.0, 0.1]"), "utf-8")
+    lay: list[list[float]] = []
+
+    def of(config: Config, *_: object) -> ChainSearch:
+        lay.append(config.arm.rest_pose)
+        raise NoSafeTorque("none")
+
+    monkeypatch.setattr(ChainSearch, "of", of)
+    with pytest.raises(NoSafeTorque):
+        hil.identify(tmp_path / "leg.toml", out=tmp_path / "run")
+    assert lay[0][2] == pytest.approx(0.1, abs=0.06) and lay[0][2] > 0.02
+
+
+def test_a_period_too_short_for_a_path_is_a_mistake_in_the_file() -> None:
+    text = LEG.read_text(encoding="utf-8").replace("period = 10.0", "period = 1.0")
+    with pytest.raises(ConfigError, match=r"experiment\.period = 1 s: .* make it at least"):
+        parse_config(text, LEG)
 
 
 def test_a_path_that_is_safe_is_kept() -> None:

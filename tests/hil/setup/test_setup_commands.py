@@ -125,6 +125,10 @@ def test_a_rest_pose_inside_the_floor_is_found_by_the_check(tmp_path: Path) -> N
     (tmp_path / "arm.toml").write_text(high, encoding="utf-8")
     wrong = look(load_config(tmp_path / "arm.toml"))["arm", "rest pose"]
     assert wrong.level is Level.STOP and "arm.rest_pose puts" in wrong.fix
+    described = (tmp_path / urdf).read_text(encoding="utf-8")
+    (tmp_path / urdf).write_text(re.sub(r"<box size=", "<mesh filename=", described, count=1), encoding="utf-8")
+    doubted = look(load_config(tmp_path / "arm.toml"))["arm", "description"]
+    assert doubted.level is Level.WARNING and "is not used: there is no such file" in doubted.fix
 
 
 @pytest.mark.parametrize(

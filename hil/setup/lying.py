@@ -1,0 +1,70 @@
+"""Where a spatial arm lies before a run: the motion starts and ends there, which need not be exactly arm.rest_pose.
+
+Otherwise the stabiliser would pull the arm to arm.rest_pose at once when torque comes on, perhaps against a stop.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hil.config.schema import Config
+from hil.drivers.bus import ServoBus
+from hil.setup.servo_session import has_moved
+
+AFTER_A_RUN = 2.0
+"""Factor on the tolerance after a run: friction may hold the arm farther from its rest pose than before."""
+
+NEAR_RAD = 0.02
+"""Deviation from the rest pose that makes no difference [rad]."""
+
+_LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
+"""Longest wait for an arm to come to rest, interval between checks, and largest change in between [rad]."""
+
+
+def tolerance_now(config: Config) -> float:
+    """Largest deviation from arm.rest_pose that is allowed before this run [rad]."""
+    return config.rest_tolerance * (AFTER_A_RUN if has_moved() else 1.0)
+
+
+def wait_for_rest(bus: ServoBus) -> str:
+    """Wait for an arm that still swings after an earlier run, or falls, for at most _LONGEST_REST_S.
+
+    Returns a sentence about a joint that still moves then, "" if none does.
+    """
+    clock = bus.port.clock
+    former, end = bus.read_positions(), clock.now() + _LONGEST_REST_S
+    while True:
+        clock.wait_until(clock.now() + _REST_EVERY_S)
+        latest = bus.read_positions()
+        away = [abs(now - before) for now, before in zip(latest, former, strict=True)]
+        if max(away) < _REST_WITHIN_RAD:
+            return ""
+        if clock.now() >= end:
+            return (
+                f"{bus.joints[away.index(max(away))]} is still moving after {_LONGEST_REST_S:.0f} s without torque: "
+                f"{max(away):.3f} rad in {_REST_EVERY_S:g} s. Bring the arm to rest, then start again."
+            )
+        former = latest
+
+
+def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
+    """The configuration with the measured pose (joints,) [rad] as rest pose.
+
+    It is returned unchanged if that makes no difference, or if the arm is too far from its rest pose, so that the run
+    is refused.
+    """
+    rest, low, high = (
+        np.array(each) for each in (config.arm.rest_pose, *zip(*(j.position_limit for j in config.joints), strict=True))
+    )
+    away = np.abs(np.array(position) - rest)
+    if not NEAR_RAD < away.max() <= tolerance_now(config):
+        return config
+    lies = np.clip(position, low, high).tolist()
+    return config.model_copy(update={"arm": config.arm.model_copy(update={"rest_pose": lies})})
+
+
+def said_of_the_rest(config: Config, lies: Config) -> str:
+    """Say where the arm lies instead of in its rest pose."""
+    each = zip(config.joints, lies.arm.rest_pose, config.arm.rest_pose, strict=True)
+    away = [f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})" for joint, now, rest in each if now != rest]
+    return f"The arm does not lie in arm.rest_pose: {', '.join(away)}. The motion starts and ends where it lies."
