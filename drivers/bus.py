@@ -316,18 +316,18 @@ class ServoBus:
 
     @property
     def heard_instead(self) -> str:
-        """What was received in the last tenth of a second instead of complete replies in time, and what to do about it;
-        "" for nothing.
+        """What was received in the last 0.1 s instead of complete and timely replies, and what to do about it; "" if
+        nothing was.
         """
         exchange, since = self.prepared, self.port.clock.now() - _RECENT_S
         if exchange.late_at > since:
             return (
-                "Replies did arrive, but too late or twice: check the adapter's latency timer and what else keeps this "
-                "computer busy."
+                "Replies did arrive, but too late or twice: check the adapter's latency timer and whether other "
+                "programs keep this computer busy."
             )
         if exchange.damaged_at > since and (strange := [each for each in exchange.senders if each not in exchange.ids]):
             return (
-                f"Intact replies came with ID {', '.join(map(str, dict.fromkeys(strange)))}, which was not asked: "
+                f"Intact replies came with ID {', '.join(map(str, dict.fromkeys(strange)))}, which was not addressed: "
                 f"a servo's ID has changed, or its reply is another servo's. `hil scan {self.port.url}` lists the IDs."
             )
         if exchange.damaged_at > since and len(set(exchange.senders)) < len(exchange.senders):
@@ -337,7 +337,7 @@ class ServoBus:
                 f"`hil scan {self.port.url}` lists the IDs."
             )
         if exchange.damaged_at > since:
-            return "Bytes arrived, but damaged or incomplete: check the cables, and what else sends on the bus."
+            return "Bytes arrived, but damaged or incomplete: check the cables and what else may be sending on the bus."
         return ""
 
     @property
@@ -354,7 +354,7 @@ class ServoBus:
         seen = self.prepared.sighted
         if seen is None:
             return ""
-        # A tripped watchdog and a reboot leave 0 as well.
+        # A tripped watchdog or a reboot also leaves 0.
         who = ": another program commands it, or writes are lost" if seen.value else ""
         return (
             f"Just before, {seen.register} of {self._drives[seen.place].title} was {seen.value} although "

@@ -37,8 +37,8 @@ MOST_PATIENCE_S = 0.02
 """Upper limit of the minimum reply timeout [s]: in slow cycles too, a silent servo must not delay the others."""
 
 AFTER_LOSS = 5
-"""Number of reads of different lengths that take turns after lost replies: a reply to one of them that arrives fewer
-cycles late is recognised by its length."""
+"""Number of reads of different lengths that take turns after lost replies. A reply that arrives
+fewer than this many cycles late is recognised by its length."""
 
 _NEVER = 1 << 62
 _DOUBTS = 3
@@ -280,8 +280,8 @@ class Exchange:
         return read.unpack(received) or self._search(read, received, deadline)
 
     def _other_span(self, between: bool) -> int:
-        """Choose the span for a cycle that does not read the usual one: one of another length after a lost reply, a
-        slow one, or the status.
+        """Choose the span for a cycle that does not read the usual one: one of another length after a lost reply,
+        otherwise a slow one or the status.
         """
         if self._late_possible:
             self._late_possible = False
@@ -389,7 +389,7 @@ class _GoalWrite:
 
 
 def _of_other_lengths(spans: Sequence[Span | Sequence[Span]], servos: int) -> list[tuple[Span, ...]]:
-    """Return the usual span with more bytes in front, so that no length occurs twice."""
+    """Return variants of the usual span with more bytes in front, no two spans being of the same length."""
     taken = {one_each(span, servos)[0].size for span in spans}
     usual = one_each(spans[0], servos)
     lengths = [size for size in range(usual[0].size + 1, usual[0].size + AFTER_LOSS + len(taken)) if size not in taken]

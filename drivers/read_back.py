@@ -27,13 +27,13 @@ _RECENT = 4
 """Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
 
 REMEMBERED = 128
-"""Number of goals of which a servo may hold one if writes are lost, until the status has detected that."""
+"""Number of recent goals that a servo may still hold if writes are lost and the status has not yet detected that."""
 
 _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Numbers of read-backs of a foreign value that prove another writer, and the time in which they must occur [s].
 
-Three for a goal that this program may have written, or a servo itself: that of an earlier cycle, or 0. Then the status
-detects lost writes, a tripped watchdog or a reboot first.
+Three are required for a goal that this program may have written in an earlier cycle, and for 0, which a servo itself
+may have set: by then, the status has detected lost writes, a tripped watchdog or a reboot.
 """
 
 TRY_AGAIN_S = 0.005

@@ -239,12 +239,12 @@ class FastSyncRead:
         return [packet[start + 1] for _, start in self._intact(packet)]
 
     def _packet(self, received: bytes) -> bytes:
-        """The received bytes from the beginning of the status packet on."""
+        """The received bytes from the start of the status packet."""
         at = received.find(self._front)
         return received[at:] if at >= 0 else b""
 
     def _intact(self, packet: bytes) -> Iterator[tuple[int, int]]:
-        """The parts before the first missing or damaged one: the ID that was asked, and where its part starts."""
+        """The parts before the first missing or damaged one: the ID that was addressed, and where its part starts."""
         for servo_id, start, end in self._parts:
             if len(packet) < end or _crc(packet[: end - 2]) != int.from_bytes(packet[end - 2 : end], "little"):
                 return

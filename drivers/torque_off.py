@@ -35,7 +35,7 @@ TRIP_S = WATCHDOG_UNIT + 5e-3
 """Delay with which a watchdog may act after its timeout, since it counts in steps [s]."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
-"""Further torque-off packets and the time between them [s]: one that collides with a reply is lost."""
+"""Further torque-off packets and the time between them [s], since one that collides with a reply is lost."""
 
 
 @dataclass(frozen=True)

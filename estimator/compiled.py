@@ -1,8 +1,8 @@
 """Compiled loops whose cache on disk is invalidated by a change in any code or constant compiled into them.
 
-numba stores compiled code next to the source and only checks the date of that one file. Functions inlined from other
-modules, and constants taken from them, could therefore be older than their sources; and where a file changes while a
-program starts, old code could be stored under the new date. So the cache is stamped with the code itself, as loaded.
+numba stores compiled code next to the source and checks only the date of that one file. Functions inlined from other
+modules, and constants taken from them, could therefore be older than their sources; and if a file changes while a
+program starts, old code could be stored under the new date. So the cache is stamped with a hash of the loaded code.
 """
 
 import hashlib
@@ -63,7 +63,7 @@ def code_digest(function: Callable[..., Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return the Python function of a compiled one; anything else as it is."""
+    """Return the Python function behind a compiled one; anything else unchanged."""
     return getattr(value, "py_func", value)
 
 
@@ -74,7 +74,7 @@ def _options(function: Any) -> str:
 
 
 def _codes(code: CodeType) -> Iterator[CodeType]:
-    """Yield the code and that of the comprehensions in it."""
+    """Yield the code object and those of the functions and comprehensions in it."""
     yield code
     for value in code.co_consts:
         if isinstance(value, CodeType):
@@ -82,9 +82,9 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def _used(function: FunctionType) -> Iterator[tuple[str, Any]]:
-    """Yield names and values of the globals, and of attributes of the package's modules, that the function may use.
+    """Yield the names and values of the globals and attributes of the package's modules that the function may use.
 
-    Libraries are left out: numba stores its code per version, and numpy's functions are numba's own.
+    Libraries are left out: numba's cache depends on its version, and it implements numpy's functions itself.
     """
     names = sorted({name for code in _codes(function.__code__) for name in code.co_names})
     for name in names:
@@ -104,5 +104,5 @@ def _is_own(value: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    """Return a constant as text that differs where the constants differ."""
+    """Return a constant as text; different constants give different texts."""
     return repr(value.tolist()) if isinstance(value, np.ndarray) else repr(value)

@@ -48,7 +48,7 @@ class Estimate(FittedParameters):
     correlation_time: float = 1.0
     """Number of samples over which the residual is correlated; 1 is white. `covariance` takes it into account."""
     at_bound: tuple[str, ...] = ()
-    """Parameters at a bound that the data would exceed, and on which base parameters depend."""
+    """Parameters at a bound although the data favour values beyond it, if base parameters depend on them."""
 
 
 @one_blas_thread

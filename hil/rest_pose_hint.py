@@ -7,10 +7,11 @@ __all__ = ["rest_pose_hint", "within_limits"]
 
 
 def within_limits(position: float, limits: Sequence[float]) -> float:
-    """Return the angle that is whole turns away from `position` and within the position limits, if there is one.
+    """Return the angle within the position limits that is a whole number of turns from `position`, if there is one.
 
-    An encoder measures within a turn. The turn closest to the rest pose is assumed, but a joint that fell is at an
-    angle that it can reach. All in rad; `position` itself is returned if it is within the limits, or no other is.
+    An encoder only measures the angle within one turn. `position` assumes the turn closest to the rest pose, but a
+    joint that fell must be at an angle that it can reach. All angles are in rad; `position` is returned unchanged if it
+    is within the limits or no other turn is.
     """
     low, high = limits
     inside = [each for turn in (0, -1, 1) if low <= (each := position + turn * math.tau) <= high]

@@ -45,7 +45,7 @@ WORDS = {
     MODEL: r"any arm|repeat its motion|than (the )?model|predicted|not as planned|foreseen|the dry run",
     REFUSED: r"refus|reports no hardware error|answers? with an? error",
     STRANGER: r"another (program|master)|Drive Mode is|somebody else|not asked for|collision|other master",
-    MIXED: r"another servo's|mixed up|swapped|ID has changed|same ID|was not asked:",
+    MIXED: r"another servo's|mixed up|swapped|ID has changed|same ID|was not addressed:",
     REPEATED: r"repeated|too late or twice",
     HAND: r"pushes or holds|hit it|slips",
     DISK: r"\bdisk\b|no space|File too large|cannot be written",
@@ -155,7 +155,7 @@ _OF_FIELD = {
     "velocity": _READINGS | {LIMIT},
     "current": frozenset({TORQUE, VOLTAGE}),
 }
-"""Causes that a message may name if only one reading is forged: a wrong angle is no lost torque."""
+"""Causes that a message may name if only one reading is forged: a wrong angle, for instance, is not lost torque."""
 
 
 _INSTRUCTIONS = frozenset({FaultKind.LOST_INSTRUCTION, FaultKind.CORRUPTED_INSTRUCTION})

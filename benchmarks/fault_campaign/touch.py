@@ -84,7 +84,7 @@ def overwrite_goals(attack: Attack, port: "Middle") -> None:
             if attack.kind == Kind.RIVAL:  # the program hears it as well
                 said = encode(servo.id, Instruction.WRITE, address.to_bytes(2, "little") + goal)
                 wire = port.bus._wire
-                wire.put(said, max(port.bus.advanced_to, wire.reply_by))  # one after the other, not at the same time
+                wire.put(said, max(port.bus.advanced_to, wire.reply_by))  # in turn, not at the same time
 
 
 def _write_goal(attack: Attack, servo: EmulatedServo) -> tuple[int, bytes]:

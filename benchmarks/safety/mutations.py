@@ -4,8 +4,8 @@
 
 Each mutation changes one operator, comparison, number or boolean of a module (except in strings, annotations and zip's
 `strict`) and runs that module's tests in a child process. Mutations that no test detects survive. A mutation that makes
-a test hang counts as detected after `PATIENCE_S`. With NUMBA_DISABLE_JIT=1, compiled modules are tested without being
-compiled for each mutation, which takes longest.
+a test hang counts as detected after `PATIENCE_S`. With NUMBA_DISABLE_JIT=1, compiled modules are tested as plain
+Python, which avoids the slowest step, compiling each mutation.
 """
 
 import argparse
@@ -172,7 +172,7 @@ def _is_equivalent(line: str, what: str) -> bool:
 def _passes(module: str, source: str, cache: str) -> bool:
     """Whether the module's tests pass with this source, in a forked child that already has the libraries loaded.
 
-    cache: folder of compiled code, for modules that are not compiled themselves; compiling all others takes longest.
+    cache: folder of compiled code, reused for modules that are not compiled themselves, since compiling takes longest.
     """
     sys.stdout.flush()
     child = os.fork()
@@ -209,7 +209,7 @@ def _test_in_child(module: str, source: str, cache: str) -> None:
         exec(compile(source, module, "exec"), mutated.__dict__)
         is_compiled = "numba" in source or "estimator.compiled" in source
         with tempfile.TemporaryDirectory() as fresh:
-            # Code compiled before, without this mutation, must not be found.
+            # Code compiled earlier, without this mutation, must not be reused.
             vars(numba.config)["CACHE_DIR"] = fresh if is_compiled else cache
             code = int(pytest.main(["-q", "-x", "-n", "0", "-p", "no:cacheprovider", *TESTS[module]]))
     except BaseException:

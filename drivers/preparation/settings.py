@@ -41,8 +41,8 @@ WATCHDOG_TRIPPED = 0xFF
 def read_settings(servo: Servo) -> dict[str, int]:
     """Return the registers that an experiment may change, by name [ticks]; raises as `Servo.read`.
 
-    All are read twice, the second time in reverse order. A reply does not say which register it is of: one that belongs
-    to an earlier request would be stored, and restored, as the value of another register.
+    All are read twice, the second time in reverse order. A reply does not identify its register: one that belongs to an
+    earlier request would be stored, and later restored, as the value of another register.
     """
     names = [name for name in (*EEPROM, *RAM) if name in servo.table]
     settings = {name: servo.read(name) for name in names}
@@ -50,8 +50,8 @@ def read_settings(servo: Servo) -> dict[str, int]:
         if (again := servo.read(name)) != settings[name]:
             raise WrongReply(
                 f"{servo.title}: {name} reads {settings[name]}, then {again}: its replies are late and belong to "
-                "earlier requests, or another program changes its settings. Check the adapter, and end other programs "
-                "that use this port."
+                "earlier requests, or another program is changing its settings. Check the adapter, and close other "
+                "programs that use this port."
             )
     watchdog = servo.read("Bus Watchdog")
     # A tripped watchdog can only be cleared, which switches it off.

@@ -39,7 +39,7 @@ class PaperArm:
     length_2: float = 0.8
     gravity: float = 9.81
     viscous: float = 0.0
-    """Friction of each joint [N m s/rad]; the paper has none."""
+    """Friction of each joint [N m s/rad]; the paper's model has none."""
 
     def mass_matrix(self) -> Array:
         """Return D (2, 2) of (3) at q2 = 0, including J1 and J2, which are missing from (14) and (15) [kg m^2]."""

@@ -1,4 +1,4 @@
-"""Values of a spatial arm that contradict its description, its configuration or what is typical of servos."""
+"""Values of a spatial arm that contradict its description, its configuration or typical servo parameters."""
 
 import numpy as np
 
@@ -8,11 +8,11 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.models.conflicts import Conflict, Source, conflict, worst_first
 
 DRIVES = ("back_emf", "lag_ratio")
-"""Terms of drives that are known beforehand; the others of `SHAPES` may well be zero."""
+"""Drive terms that are known beforehand; the other terms of `SHAPES` may well be zero."""
 
 
 def chain_conflicts(names: tuple[str, ...], value: Array, std: Array, prior: Prior) -> tuple[Conflict, ...]:
-    """Return the contradictions among the parameters `names`, of which the base parameters are first, worst first."""
+    """Return the contradictions among the parameters `names`, worst first; `names` begins with the base parameters."""
     precision = prior.scale_precision
     scales = np.empty(0) if precision is None else np.sqrt(np.diag(np.linalg.inv(precision)))
     found: list[Conflict | None] = []

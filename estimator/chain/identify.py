@@ -34,8 +34,8 @@ depends on its load, behind a noisy encoder, to 1.5 or more.
 """
 
 SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005
-"""Significance level of encoder zeros that are held, and the smallest angle that is mentioned [rad]: three encoder
-steps, less than a zero is usually adjusted to.
+"""Significance level for errors of fixed encoder zeros, and the smallest error that is reported [rad]: three encoder
+steps, finer than zeros are usually adjusted.
 """
 
 BELIEVED = 0.5  # standard errors under white noise above this fraction of the prior's: values come from the prior
@@ -71,14 +71,14 @@ class ChainEstimate(FittedParameters):
     unseen: tuple[str, ...]
     """Zero errors and tilts that the data hardly determine, so that they are taken as zero."""
     doubtful_zeros: tuple[tuple[int, float], ...]
-    """Joints, from 1, whose encoder zeros the model holds although the recording shows them to be off, and by how much
-    (true minus measured angle) [rad]. Empty if they were not tested.
+    """Joints, from 1, whose encoder zeros the model holds fixed although the recording contradicts them, and their
+    errors (true minus measured angle) [rad]. Empty if they were not tested.
     """
     noise_steps: Array
     """Noise of one sample of each angle, encoder rounding included (joints,) [encoder steps]; rounding alone is 0.2887.
     """
     at_bound: tuple[str, ...] = ()
-    """Parameters at a bound that the data would exceed, and on which base parameters depend."""
+    """Parameters at a bound although the data favour values beyond it, if base parameters depend on them."""
     conflicts: tuple[Conflict, ...] = ()
     """Values far from what was known beforehand, the largest contradiction first."""
 
@@ -105,9 +105,9 @@ def identify_chain(
     """Estimate the parameters of `model` from settled periods: regression on their lines, then maximum likelihood.
 
     `prior` determines what the data do not, as listed in `ChainEstimate.from_prior`. `added`: see `fit_lines`; for a
-    model with `added_mass`. test_zeros: whether to test the encoder zeros that `model` holds
-    (`ChainEstimate.doubtful_zeros`), for a tenth more time. Raises ModelError if `model` and a period differ in their
-    number of joints, ConvergenceError if no minimum is found.
+    model with `added_mass`. test_zeros: whether to test the encoder zeros that `model` holds fixed
+    (`ChainEstimate.doubtful_zeros`), which takes a tenth longer. Raises ModelError if `model` and a period differ in
+    their number of joints, ConvergenceError if no minimum is found.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
     for period in given:
@@ -155,10 +155,10 @@ def identify_chain(
 
 
 def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int, float], ...]:
-    """Return the joints, from 1, whose held zeros are off by more than LARGE_ZERO, if that is significant.
+    """Return the joints, from 1, whose fixed zeros are significantly off, and by more than LARGE_ZERO.
 
-    A model error that widens the standard errors by the factor `systematic` can mimic zeros, so it raises the
-    threshold.
+    A model error that widens the standard errors by the factor `systematic` can mimic errors of zeros, so it raises
+    the threshold.
     """
     if held is None or held.gain <= max(systematic, 1.0) ** 2 * float(chi2.isf(SIGNIFICANCE, held.shift.size)):
         return ()

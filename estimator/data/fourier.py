@@ -13,7 +13,7 @@ SIGNAL_OVER_NOISE = 4.0  # power ratio above which a band of lines counts as sig
 BAND = 8  # lines that are evaluated together
 
 
-_DRAWS = 16  # of white noise that is interpolated, to know its standard deviation to about 1 %
+_DRAWS = 16  # of interpolated white noise, for a standard deviation accurate to about 1 %
 _AHEAD = np.array((3.0, -3.0, 1.0))
 """Weights of the three nearest samples, nearest first, for quadratic extrapolation by one sample."""
 
@@ -35,9 +35,9 @@ def lines_of(signal: Array) -> Lines:
 def noise_power(lines: Lines) -> Array:
     """Return the mean |c|^2 of the noise per line (joints,), from the upper half of the lines, without excitation.
 
-    The median of an exponentially distributed power is log 2 times its mean and robust to single lines. Odd and even
-    lines are evaluated separately: the rounding error of a motion whose second half mirrors its first has no even lines
-    at all.
+    The median of an exponentially distributed power is log 2 times its mean and robust to a few outlying lines. Odd and
+    even lines are evaluated separately: the rounding error of a motion whose second half mirrors its first has no even
+    lines at all.
     """
     upper = np.abs(lines[:, lines.shape[1] // 2 :]) ** 2
     medians = [np.median(upper[:, first::2], axis=1) for first in (0, 1)]
@@ -49,10 +49,10 @@ def white_noise(position: Array, valid: Mask | None = None) -> Array:
     """Return the standard deviation of the white noise in one period of angles (joints, samples), per joint.
 
     It is estimated from the upper quarter of the lines, far above any motion. A linear trend is removed first, since
-    the jump of a period that does not close because the arm drifts spreads over all lines.
+    the jump between the ends of a period that does not close, because the arm drifts, would spread over all lines.
 
-    valid: samples that were received (joints, samples); the others hold a linear interpolation, which is less noisy at
-    fast lines. White noise that is interpolated in the same way shows by how much.
+    valid: samples that were received (joints, samples); the others are interpolated linearly, which reduces noise at
+    high frequencies. White noise interpolated in the same way shows by how much.
     """
     noise = _upper_noise(without_jump(position))
     if valid is None or valid.all():
@@ -62,14 +62,14 @@ def white_noise(position: Array, valid: Mask | None = None) -> Array:
 
 
 def without_jump(position: Array) -> Array:
-    """Return a period (joints, samples) less the linear trend by which it fails to close."""
+    """Return a period (joints, samples) without the linear trend that keeps it from closing."""
     samples = position.shape[1]
     closed: Array = position - _jump(position)[:, None] * (np.arange(samples) / samples)
     return closed
 
 
 def slow_part(position: Array, lines: int) -> Array:
-    """Return the part of a period (joints, samples) that consists of its first `lines` lines."""
+    """Return the first `lines` Fourier lines of a period (joints, samples), as samples."""
     kept = np.fft.rfft(position, axis=1)
     kept[:, lines:] = 0.0
     return np.asarray(np.fft.irfft(kept, position.shape[1], axis=1))
@@ -83,7 +83,7 @@ def _upper_noise(position: Array) -> Array:
 
 
 def _interpolated_noise(valid: Mask) -> float:
-    """Return the noise that is left of white noise of 1 if only the samples `valid` (samples,) are not interpolated."""
+    """Return the estimate for white noise with a standard deviation of 1, interpolated except at `valid` (samples,)."""
     if valid.all() or not valid.any():
         return 1.0
     index = np.arange(valid.size)

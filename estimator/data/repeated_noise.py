@@ -1,17 +1,17 @@
 """Noise of the angles from the difference between two passes of the same periodic motion.
 
-Whatever repeats with the motion cancels: the motion itself, however fast, and the error of any model of it. What is
-left of a rounded angle depends on its noise. Without noise, both passes are rounded alike and nothing is left; the more
-noise there is before rounding, the more of the rounding error differs as well. With independent Gaussian noise of
+Whatever repeats with the motion cancels: the motion itself, however fast, and the error of any model of it. What
+remains of a rounded angle depends on its noise. Without noise, both passes are rounded alike and nothing remains; the
+more noise there is before rounding, the more of the rounding error differs as well. With independent Gaussian noise of
 standard deviation s, a slow drift d from one pass to the next, and angles spread evenly over the steps, half the mean
 square of the fast part of the difference is
 
     s^2 + 1/12 - sum over k of exp(-(2 pi k s)^2) cos(2 pi k d) / (2 pi^2 k^2)   [steps^2],
 
 where the sum is the part of the rounding error's power 1/12 that repeats (Fourier series of the rounding error; B.
-Widrow and I. Kollar, Quantization Noise, 2008). The drift is the slow part of the difference; friction that changes
-causes it. Solved for s, this gives the error of one reading, s^2 + 1/12. Passes that differ for other reasons make it
-larger, so it is an upper bound.
+Widrow and I. Kollar, Quantization Noise, 2008). The drift is the slow part of the difference and is caused by
+changing friction. Solving for s gives the error variance of one reading, s^2 + 1/12. It is an upper bound, since other
+differences between the passes increase it.
 """
 
 from collections.abc import Sequence
@@ -35,8 +35,8 @@ _HEIGHTS = 1.0 / (2.0 * np.pi**2 * _ORDERS**2)
 _HEIGHTS *= ROUNDING / _HEIGHTS.sum()  # the series is truncated
 _REPEATS = _HEIGHTS * np.exp(-((2.0 * np.pi * _ORDERS * _STD[:, None]) ** 2))
 """Power of each order of the rounding error that repeats at each of `_STD`, without drift (stds, orders) [steps^2]."""
-_SLOW = 1.0 / 16.0  # fraction of the lines that drift may have
-_MOST_NOISE = 1.0  # exponent of the correction for the drift's noise, beyond which an order counts as drifted apart
+_SLOW = 1.0 / 16.0  # fraction of the lines that drift may occupy
+_MOST_NOISE = 1.0  # exponent of the correction for noise in the drift; above it, an order counts as decorrelated
 
 
 def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> Array | None:
@@ -58,7 +58,7 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
     repeats = np.array([_repeating(*joint) for joint in zip(differs, kept, strict=True)])
     received = np.mean([np.isfinite(each).mean(axis=1) for each in passes], axis=0)
     count = np.maximum(averaged * received, 1.0)
-    # Drift by half a step makes the errors of successive passes opposite, but not those of all.
+    # Drift by half a step reverses the rounding error between successive passes, but not across all passes.
     noise: Array = step * np.sqrt((differs + repeats) / count + (1.0 - 1.0 / count) * np.maximum(repeats, 0.0))
     return noise
 
@@ -90,10 +90,10 @@ def _power(difference: Array) -> Array:
 
 
 def _not_drifted(difference: Array, differs: Array) -> Array:
-    """Return the fraction (joints, orders) of each order of the rounding error that repeats in spite of drift.
+    """Return the fraction (joints, orders) of each order of the rounding error that repeats despite drift.
 
     difference: between two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,); a fraction of it
-    is noise of the drift, whose effect is divided out.
+    is noise in the estimated drift, whose effect is divided out.
     """
     filled = _filled(difference)
     closed = without_jump(filled)

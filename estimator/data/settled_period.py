@@ -161,7 +161,7 @@ def _check_values(period: SettledPeriod) -> None:
     if not (period.rate > 0.0 and np.isfinite(period.command_to_sample) and np.all(period.position_step > 0.0)):
         raise RecordingError(
             f"rate {period.rate:g} 1/s and position_step {period.position_step} rad must be positive, "
-            f"command_to_sample {period.command_to_sample:g} s finite"
+            f"and command_to_sample {period.command_to_sample:g} s must be finite"
         )
     if period.samples < FEWEST_SAMPLES:
         raise RecordingError(f"the period has {period.samples} samples; at least {FEWEST_SAMPLES} are needed")

@@ -91,7 +91,7 @@ class Coordinates:
     def ranges(self, value: Array) -> tuple[Array, Array]:
         """Return the lower and upper bounds (parameters,) of the parameters `value` (parameters,).
 
-        Widths have none: below its floor a Coulomb step is as good as none.
+        Widths have no bounds: a Coulomb step narrower than its lower limit is as good as a sharp one.
         """
         positive = np.array([term_of(name).range == "positive" for name in self.names])
         lower, upper = np.where(positive, 0.0, -np.inf), np.full(value.size, np.inf)

@@ -48,7 +48,7 @@ class Expected:
 
     @classmethod
     def nothing(cls, size: int) -> "Expected":
-        """Return no prior on any of `size` coordinates."""
+        """Return a prior that constrains none of `size` coordinates."""
         return cls(np.zeros(size), np.zeros(size))
 
     def cost(self, x: Array) -> float:

@@ -59,7 +59,7 @@ class Fit:
     iterations: int
     """Number of simulations with derivatives."""
     at_bound: tuple[str, ...] = ()
-    """Parameters at a bound that the data would exceed, and on which base parameters depend."""
+    """Parameters at a bound although the data favour values beyond it, if base parameters depend on them."""
 
 
 @dataclass(frozen=True)
@@ -293,7 +293,7 @@ def _fit(
 
 
 def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Array) -> tuple[str, ...]:
-    """Return the parameters at a bound that the data would exceed, if base parameters depend on them.
+    """Return the parameters at a bound although the data favour values beyond it, if base parameters depend on them.
 
     std: standard errors of the parameters `value` (parameters,).
     """

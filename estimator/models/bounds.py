@@ -1,10 +1,10 @@
-"""Parameters at the edge of their range, although the data ask for values beyond it.
+"""Parameters at a bound of their range, although the data favour values beyond it.
 
 A fit cannot leave the physical range: an inertia stays positive, a coupling below the geometric mean of its inertias.
-Where the model is wrong or the recording says little, the best value may lie beyond. The fit then ends at the edge,
-with a standard error that knows nothing of it, and the other parameters absorb what is missing. A parameter that is
-truly zero, such as Stribeck friction that a joint lacks, ends there as well and does no harm: the undamped step of the
-normal equations, in the parameters themselves, tells one from the other.
+Where the model is wrong or the recording carries little information, the best value may lie outside. The fit then ends
+at the bound, which its standard error does not reflect, and the other parameters absorb the difference. A parameter
+whose true value is zero, such as the Stribeck term of a joint without Stribeck friction, also ends there but does no
+harm: the undamped step of the normal equations, in the parameters themselves, distinguishes the two cases.
 """
 
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ import numpy as np
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.models.terms import kind_of, term_of
 
-SURE = 3.0  # standard errors by which the best value lies beyond the range
-NEAR = 0.1  # distance from the edge, relative to the step beyond it, within which a fit has ended there
+SURE = 3.0  # standard errors by which the best value must lie outside the range
+NEAR = 0.1  # distance from the bound, relative to the step beyond it, within which a fit has ended there
 FAINTEST = 1e-140  # influence of a coordinate below which its square is not a number
-MOVED = 1.0  # standard errors by which the edge moves another parameter that then depends on it
+MOVED = 1.0  # standard errors by which the bound must shift another parameter for it to count as dependent
 
 
 def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, Array]:
@@ -39,9 +39,9 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
 
 
 def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Array) -> Mask:
-    """Return which parameters (parameters,) lie at an edge of their range and are driven beyond it by the data.
+    """Return which parameters (parameters,) lie at a bound, `lower` or `upper`, and are driven beyond it by the data.
 
-    std: standard errors of independent errors. Those that account for the misfit would hide it where the edge is what
+    std: standard errors for independent errors. Those that account for the misfit would hide it where the bound itself
     causes the misfit.
     """
     best, near = value + step, NEAR * np.abs(step)
@@ -62,11 +62,11 @@ def bound_sentence(names: Sequence[str]) -> str:
         return ""
     late = any(kind_of(name) == "back_emf" for name in names)
     cause = (
-        "back-EMF that lags takes as much of the joint's inertia as a motor can lose, so the inertia and the lag may "
-        "be wrong: check the joint's mode and model, and that nothing else delays its torque"
+        "The lagging back-EMF already cancels as much of the joint's inertia as is physically possible, so the inertia "
+        "and the lag may be wrong: check the joint's mode and servo model, and that nothing else delays its torque"
         if late
-        else "an effect that the model lacks, or too little motion, drives it there, and distorts other values: use "
-        "wider and faster motion, and look for the cause above"
+        else "An effect missing from the model, or too little motion, causes this and distorts other values: use wider "
+        "and faster motion, and look for a cause among the findings above"
     )
     it, its = ("are", "their") if len(names) > 1 else ("is", "its")
-    return f"{', '.join(names)} {it} at {its} bound, beyond which the recording asks to go: {cause}."
+    return f"{', '.join(names)} {it} at {its} bound, although the data favour values beyond it. {cause}."

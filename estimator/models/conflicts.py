@@ -1,7 +1,7 @@
-"""Values that contradict what was known before: many standard deviations away from the file's or from typical ones.
+"""Values that contradict prior knowledge: many standard deviations from the configuration's or from typical ones.
 
-A fit without a missing effect, such as play in the gears, lets other parameters imitate it. Some of these are known
-beforehand, and a value that is far from what was known reveals the imitation, which standard errors do not.
+If the model lacks an effect, such as gear backlash, other parameters of the fit imitate it. Some of these are known
+beforehand, and a value far from the known one reveals the imitation, which standard errors do not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,24 +21,24 @@ nor one tooth of a horn explains.
 LARGE_SPREAD = 0.3  # standard deviation of a logarithm that is printed as a factor
 Trust = Literal["yes", "with care", "no"]
 Source = Literal["file", "description", "servos"]
-"""Origin of an expectation: the configuration, the description of the links (URDF), or what is typical of servos."""
+"""Origin of an expected value: the configuration, the description of the links (URDF), or typical servo parameters."""
 _GIVEN = ("torque_scale", "zero")
 """Terms whose expected values come from the configuration: torque_constant and zero_ticks."""
 _SOURCES: dict[Source, str] = {
-    "file": "which the file implies",
-    "description": "which the description of the arm implies",
+    "file": "as implied by the configuration",
+    "description": "as implied by the description of the arm",
     "servos": "typical of servos",
 }
 _CHECKS = {
-    "torque_scale": "check the model, torque_constant and torque_constant_std of each joint, or measure the constants "
-    "with `hil calibrate`",
+    "torque_scale": "check the servo model, torque_constant and torque_constant_std of each joint, or measure the "
+    "constants with `hil calibrate`",
     "zero": "check zero_ticks and the horn's position",
     "base_tilt": "check arm.base",
     "encoder": "check the encoder and its magnet",
     "stribeck_velocity": "use slower motion to separate friction near standstill",
 }
-_DRIVE = "check the joint's model and mode"
-_LINK = "correct the mass, centre of mass and inertia of that link there, or find what the arm carries"
+_DRIVE = "check the joint's servo model and mode"
+_LINK = "correct the mass, centre of mass and inertia of that link there, or check what the arm carries"
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Conflict:
     """Standard deviation of `expected`, relative to it if `relative`."""
     relative: bool
     deviations: float
-    """Distance in standard deviations, those of `value` and `expected` together."""
+    """Distance in combined standard deviations of `value` and `expected`."""
     source: Source
 
     @property
@@ -66,7 +66,7 @@ class Conflict:
 
     @property
     def said(self) -> str:
-        """A sentence with the values and the advice."""
+        """A sentence with the values and what to check."""
         spread = f"+- {self.spread:.2g}"
         if self.relative:
             wide = self.spread > LARGE_SPREAD
@@ -82,7 +82,7 @@ class Conflict:
 def conflict(
     name: str, value: float, std: float, expected: float, spread: float, *, relative: bool, source: Source | None = None
 ) -> Conflict | None:
-    """Return the contradiction between `value` and `expected`, None if there is none.
+    """Return the contradiction between `value` and `expected`; None if there is none.
 
     relative: `spread` is the standard deviation of the logarithm.
     """
@@ -103,8 +103,8 @@ def conflicts(
 ) -> tuple[Conflict, ...]:
     """Return the contradictions among the parameters of a planar arm, the largest first.
 
-    torque_scale_std: relative standard deviation of the ratio of torque constants by parameter, if the file gives it;
-    otherwise that of `hil.estimator.models.terms`.
+    torque_scale_std: relative standard deviation of the ratio of torque constants, by parameter, if the file gives it;
+    otherwise, that of `hil.estimator.models.terms`.
     """
     found = []
     for name, each, error in zip(names, value.tolist(), std.tolist(), strict=True):
@@ -124,10 +124,10 @@ def worst_first(found: Sequence[Conflict | None]) -> tuple[Conflict, ...]:
 
 
 def contradicted(found: Sequence[Conflict], explained: bool) -> str:
-    """Return "no", "with care" or "" for contradictions: by how much they lower the verdict.
+    """Return the best verdict that the contradictions allow: "no", "with care", or "" for any.
 
-    explained: whether the model explains the motion. If it does not, and a value that was known is far off, an effect
-    that the model lacks has distorted it, and with it presumably all others.
+    explained: whether the model explains the motion. If it does not, and a known value is far off, an effect missing
+    from the model has distorted it, and presumably all others as well.
     """
     of_file = [each for each in found if each.source == "file"]
     if of_file:
@@ -136,7 +136,7 @@ def contradicted(found: Sequence[Conflict], explained: bool) -> str:
 
 
 def lowered(trust: Trust, at_most: str) -> Trust:
-    """Return the lower of a verdict and that of `contradicted`."""
+    """Return the lower of a verdict and the result of `contradicted`."""
     if at_most == "no":
         return "no"
     return "with care" if at_most and trust == "yes" else trust
@@ -148,7 +148,7 @@ def conflict_sentences(found: Sequence[Conflict], explained: bool) -> tuple[str,
         return tuple(each.said for each in found)
     return (
         *(each.said for each in found),
-        "Since the motion is not explained either, an effect that the model lacks probably distorts these values, and "
-        "with them the others. Remove it (play of the gears, a loose screw or horn, a dragging cable, a weak supply) "
+        "Since the model does not explain the motion either, an effect missing from it probably distorts these values "
+        "and the others as well. Eliminate it (gear backlash, a loose screw or horn, a dragging cable, a weak supply) "
         "and identify again.",
     )

@@ -22,7 +22,7 @@ from hil.estimator.selection.validation import Validation
 
 EXPLAINED = 1.06  # ratio of residual to noise up to which the model explains the motion
 GOOD_PREDICTION, USABLE_PREDICTION = 0.01, 0.05  # prediction error relative to the motion's RMS
-LEAST_PERCENT = 0.01  # smallest prediction error that is stated: differences below the noise are not resolved
+LEAST_PERCENT = 0.01  # smallest prediction error that is reported; smaller ones are lost in the noise
 MUCH_LEFT = 5.0  # ratio of residual to noise above which parameters are doubtful without a held-out check
 WELL_KNOWN, WEAK = 0.02, 0.1  # relative standard error
 LITTLE_EFFECT = 0.02  # standard error of a parameter's torque, relative to the joint's, below which it hardly matters
@@ -57,8 +57,8 @@ class Evidence:
     """Evidence in addition to the estimate and its validation."""
 
     held_out: Array | None = None
-    """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,), without the noise
-    of the encoders.
+    """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,), excluding encoder
+    noise.
 
     Where friction has changed since the fitted motion, the prediction uses one factor per joint taken from the held-out
     motion itself.
@@ -83,7 +83,7 @@ class Evidence:
     torque_limit: str = ""
     """The setting that limited the torque, for advice; "" if the user chose peak_torque."""
     conflicts: tuple[Conflict, ...] = field(default=())
-    """Values far from what was known beforehand."""
+    """Values far from those known beforehand."""
 
 
 def judge(estimate: Estimate, validation: Validation, evidence: Evidence) -> Verdict:
@@ -267,7 +267,7 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
     if held_out is None:
         return ("It was not validated on a held-out motion: set experiment.held_out = true.",)
     worst = _percent(held_out)
-    said = f"It predicts a held-out motion to within {worst} of that motion's RMS, encoder noise not counted"
+    said = f"It predicts a held-out motion to within {worst} of that motion's RMS, excluding encoder noise"
     if as_fitted is None or _percent(as_fitted) == worst:
         return (f"{said}.",)
     return (

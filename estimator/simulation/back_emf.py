@@ -82,8 +82,9 @@ def neglected(physics: Physics) -> dict[str, float]:
 
 
 def limited(parameters: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the names of the back-EMFs that would take more of their joint's inertia than the simulation allows
-    (`LEAST_INERTIA`). The estimated inertia then contains a loss that was not simulated.
+    """Return the names of the back-EMFs that would cancel more of their joint's inertia than the simulation allows
+    (`LEAST_INERTIA`). The loss that is simulated is then smaller than the parameters imply, which
+    biases the estimated inertia.
     """
     physics = Physics.of(parameters)
     found = []

@@ -39,7 +39,7 @@ _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 
 
 def obeyed_current(memory: Memory) -> int:
-    """Goal Current as the drive obeys it [ticks]: a goal from before Current Limit was lowered is limited too."""
+    """Goal Current as the drive applies it [ticks]: goals written before Current Limit was lowered are limited too."""
     goal, limit = memory.get("Goal Current"), memory.get("Current Limit")
     return max(-limit, min(limit, goal))
 

@@ -17,7 +17,7 @@ PRESENT_END = 147
 
 STATE_START = 126
 STATE_END = 136
-"""Address of the first and the address after the last of Present Current, Velocity and Position."""
+"""Start and end addresses of the block Present Current, Velocity and Position (end exclusive)."""
 
 _TICKS_PER_RAD = TICKS_PER_TURN / math.tau
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM

@@ -1,4 +1,4 @@
-"""Handling of standard output that its reader closed early, or that is full. Results are already in their folder."""
+"""Handling of standard output whose reader closed it early or whose disk is full. Results have been saved by then."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""Detection of unit mistakes, such as degrees for radians, mm for m, or mA for A: such a file is valid but dangerous.
+"""Detection of unit errors, such as degrees for radians, mm for m, or mA for A: such a file is valid but dangerous.
 
 Every physical quantity is compared, with a wide margin, with what a servo of that model could move: external gears,
 light plastic links and heavy test rigs pass; a factor due to a wrong unit does not.
@@ -39,7 +39,7 @@ _LEVER_M = 0.05
 
 
 def implausible(config: "Config") -> Iterator[str]:
-    """Yield one sentence for each quantity that looks like a unit mistake."""
+    """Yield one sentence for each quantity that looks like a unit error."""
     for joint in config.joints:
         yield from _joint(joint)
     yield from _angles("arm.rest_pose", config.arm.rest_pose)
@@ -75,11 +75,11 @@ def _joint(joint: "JointConfig") -> Iterator[str]:
         )
     volts = max(stall.voltage for stall in model.stalls)
     fastest = volts / model.back_emf
-    # The stall figures imply an up to twice as fast motor, and files that rely on that are not unit mistakes.
+    # The stall figures imply a motor up to twice as fast, and files that rely on them do not contain unit errors.
     most = _SPEED * max(fastest, volts / model.torque_per_ampere.low)
     if joint.velocity_limit > most:
         yield (
-            f"velocity_limit of {where} = {joint.velocity_limit:g} rad/s: without load, an {joint.model} turns at "
+            f"velocity_limit of {where} = {joint.velocity_limit:g} rad/s: the no-load speed of {joint.model} is "
             f"{fastest:.2g} rad/s at {volts:g} V{_meant(joint.velocity_limit, 'rad/s', most)}"
         )
     stall = max(stall.voltage if pwm else stall.current for stall in model.stalls)

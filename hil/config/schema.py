@@ -331,8 +331,8 @@ def load_config(path: str | PathLike[str]) -> Config:
 def parse_config(text: str, path: Path, *, recorded: bool = False) -> Config:
     """Check the text of a TOML file read from `path`. Raises ConfigError.
 
-    recorded: the file is the copy in a run folder, perhaps that of an older version, whose configurations of spatial
-    arms could contain arm.link_lengths, without effect.
+    recorded: whether the file is the copy in a run folder, which may be of an older version; configurations of spatial
+    arms could then contain arm.link_lengths, which had no effect.
     """
     try:
         values = parse_toml(text, path)
@@ -363,7 +363,7 @@ def parse_config(text: str, path: Path, *, recorded: bool = False) -> Config:
 
 
 def _without_lengths(path: Path, values: dict[str, Any]) -> Config:
-    """The configuration without arm.link_lengths for a spatial arm; they belong to a planar one."""
+    """The configuration, without arm.link_lengths if the arm is spatial; only planar arms have them."""
     lengths = {key: value for key, value in values["arm"].items() if key != "link_lengths"}
     with suppress(ValidationError):
         spatial = Config(path=path, **{**values, "arm": lengths})

@@ -197,8 +197,8 @@ def _verdict(
         error = float(np.max(held_out))
         joint = config.joints[int(np.argmax(held_out))].name
         sentences.append(
-            f"A held-out path is predicted to within {100 * error:.2f} % of its motion, {joint} worst, encoder noise "
-            "not counted."
+            f"A held-out path is predicted to within {100 * error:.2f} % of its motion ({joint} worst), excluding "
+            "encoder noise."
         )
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
     if estimate.doubtful_zeros:
@@ -243,19 +243,21 @@ def _verdict(
 
 
 def about_zeros(config: Config, estimate: ChainEstimate) -> str:
-    """Say that encoder zeros were not fitted, and which ones the recording contradicts; empty if they were."""
+    """State that encoder zeros were not fitted, and which ones the recording contradicts; empty if they were fitted."""
     if estimate.model.zeros or estimate.model.joints == 1:
         return ""
     held = "The encoder zeros were taken from the configuration and not identified"
     if not estimate.doubtful_zeros:
         return (
-            f"{held}: an error of a zero that this motion does not reveal makes the values of links wrong, although "
-            "their torques are right. `hil pose` shows the angles for a check by hand."
+            f"{held}: a zero error that this motion does not reveal makes the link parameters wrong, although the "
+            "torques are right. Use `hil pose` to check the angles by hand."
         )
-    off = ", ".join(f"{config.joints[joint - 1].name} by about {by:.2g} rad" for joint, by in estimate.doubtful_zeros)
+    off = ", ".join(
+        f"{config.joints[joint - 1].name} is off by about {by:.2g} rad" for joint, by in estimate.doubtful_zeros
+    )
     return (
-        f"{held}, but the recording contradicts them: {off} (true minus measured angle). The values of these links are "
-        "wrong: correct zero_ticks, or identify the zeros with [model] zeros = true."
+        f"{held}, but the recording contradicts them: {off} (true minus measured angle). The parameters of these links "
+        "are wrong: correct zero_ticks, or identify the zeros with [model] zeros = true."
     )
 
 

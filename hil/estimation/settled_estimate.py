@@ -167,7 +167,7 @@ def _as_fitted(
     estimate: Estimate, other: SettledPeriod | None, drift: Drift | None, *, beyond_noise: bool = False
 ) -> NDArray[np.float64] | None:
     """Relative prediction error of the held-out period with the friction of the fitted period; None if it did not
-    change. beyond_noise: without the noise of the encoders.
+    change. beyond_noise: whether to exclude encoder noise.
     """
     if other is None or drift is None or not drift.is_seen:
         return None

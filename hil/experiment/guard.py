@@ -50,7 +50,7 @@ class Guard:
     interval: time between two exchanges [s]; by default, that between two samples. patience: how long an exchange waits
     for missing replies [s].
 
-    heard_instead: returns what arrived instead of replies, with what to do about it; "" if nothing did.
+    heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did.
 
     left_by_a_run: whether the arm is where an immediately preceding run left it. One that was stopped at a limit may
     have come to rest slightly beyond it: such a joint may move back in, but no farther out.
@@ -312,7 +312,7 @@ class Guard:
             index,
             Cause.FROZEN,
             f"reports a velocity of {state.velocity[index]:+.2f} rad/s that does not fit its position, "
-            f"{state.position[index]:.3f} rad: one of the two readings is frozen or wrong, or its horn slips. Check "
+            f"{state.position[index]:.3f} rad: one of the two readings is frozen or wrong, or the horn slips. Check "
             "the horn, the encoder and its magnet; replace the servo if necessary.",
         )
 

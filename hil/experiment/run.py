@@ -139,7 +139,7 @@ def _play(
         if not isinstance(error, TorqueNotOff):
             error.add_note(str(bus.torque_off_report))
         cause = error.__context__ if isinstance(error, TorqueNotOff) else error
-        note(f"stopped: {cause or 'at its end:'} {bus.torque_off_report}")
+        note(f"stopped: {cause or 'end of the run.'} {bus.torque_off_report}")
         if isinstance(error, TorqueNotOff):
             _try_again(bus, note)
             error.args = (str(bus.torque_off_report),)
@@ -253,7 +253,7 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
 
 
 def _positions(config: Config, bus: ServoBus) -> list[float]:
-    """Each joint's angle [rad], for a joint that fell within its position limits."""
+    """Each joint's angle [rad]; of the possible turns, one within the position limits if there is one."""
     read = zip(bus.read_positions(), config.joints, strict=True)
     return [within_limits(position, joint.position_limit) for position, joint in read]
 

@@ -105,9 +105,9 @@ def _same_word(one: str, other: str) -> bool:
 
 
 def _rotor(model: ChainArmModel, number: int) -> float:
-    """A joint's rotor inertia [kg m^2]: as identified or, where it is part of a sum, as usual for its servos.
+    """A joint's rotor inertia [kg m^2]: as identified or, if only a sum containing it is, typical of its servos.
 
-    A guess that is far too small would be made up for by a link that is far too heavy.
+    If this guess is far too small, the link has to be far too heavy to compensate.
     """
     if (known := model.values.get(f"armature_{number}", 0.0)) > 0.0:
         return known

@@ -40,13 +40,11 @@ class PlayedPeriod:
 
     @property
     def relative_error(self) -> NDArray[np.float64]:
-        """RMS prediction error, noise of the encoders included, relative to the RMS of the motion about its mean
-        (joints,).
-        """
+        """RMS prediction error, encoder noise included, relative to the RMS of the motion about its mean (joints,)."""
         return relative_error(self.position, self.predicted)
 
     def error_beyond(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same without the noise of the encoders (joints,) [rad], which no model predicts (joints,)."""
+        """Like `relative_error`, but excluding the encoders' `noise` (joints,) [rad], which no model predicts."""
         return relative_error(self.position, self.predicted, noise)
 
 

@@ -25,7 +25,7 @@ from hil.runs.background import Background
 from hil.runs.file_size import check_array
 
 _CHUNK_BYTES = 1 << 20
-_SMALL_BYTES = 4 << 20  # of a file next to the recording that is kept in memory meanwhile
+_SMALL_BYTES = 4 << 20  # largest file next to the recording whose contents are kept in memory during the run
 _POPULATE_WRITE = 23  # MADV_POPULATE_WRITE
 _TOUCH_S = 1.0
 _libc = ctypes.CDLL(None)

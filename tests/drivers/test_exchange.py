@@ -255,13 +255,13 @@ def test_a_late_answer_is_not_taken_for_the_next_one(late_by: str, fast: bool) -
     assert list(cycle([0, 0]).servos) == [None, None]
     if late_by == "before the next cycle":
         wire.waiting = late
-    # The request after a loss asks for one more byte, so that answers to the lost one are known by their length.
+    # The request after a loss asks for one more byte, so that replies to the lost one are recognised by their length.
     reply = cycle([0, 0])
     assert (reply.span, reply.servos) == (0, [(0, 0, 0, 20), (0, 0, 0, 21)])
 
 
 def asked(wire: Wire) -> list[int]:
-    """Number of bytes that each request asks every servo for."""
+    """Number of bytes that each request asks of every servo."""
     reads = [packet for sent in wire.written for packet in Framer().feed(sent) if packet.instruction != 0x83]
     return [int.from_bytes(read.body[2:4], "little") for read in reads]
 
@@ -272,7 +272,7 @@ def asked(wire: Wire) -> list[int]:
 def test_replies_that_are_all_some_cycles_late_are_never_taken_for_new_ones(
     cycles_late: int, fast: bool, modes: Mode
 ) -> None:
-    """Each arrives while another request is waited for; the positions tell to which one it belongs."""
+    """Each arrives while the reply to another request is awaited; the positions show which request it belongs to."""
     tables = [XM430] * 2
     wire = Wire()
     cycles = Exchange(wire, (1, 2), XM430["Goal Current"], spans(modes, tables), 0.0, fast=fast, slow_every=1000)
@@ -280,7 +280,7 @@ def test_replies_that_are_all_some_cycles_late_are_never_taken_for_new_ones(
         cycles.cycle([0, 0])
     every = asked(wire)
     for number, size in enumerate(every[:-cycles_late]):
-        assert size != every[number + cycles_late], "a late reply has the length of the one waited for"
+        assert size != every[number + cycles_late], "a late reply has the length of the awaited one"
     wire = Wire([b""] * cycles_late + [_padded(size, at, fast) for at, size in enumerate(every)])
     cycles = Exchange(wire, (1, 2), XM430["Goal Current"], spans(modes, tables), 0.0, fast=fast, slow_every=1000)
     assert [list(cycles.cycle([0, 0]).servos) for _ in range(12)] == [[None, None]] * 12

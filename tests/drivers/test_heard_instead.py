@@ -33,7 +33,7 @@ def both(first: int, second: int, *, fast: bool) -> bytes:
 
 @pytest.mark.parametrize("fast", [False, True])
 def test_intact_replies_with_an_id_that_was_not_asked_are_not_called_damaged(fast: bool) -> None:
-    assert said(both(7, 2, fast=fast), fast=fast).startswith("Intact replies came with ID 7, which was not asked")
+    assert said(both(7, 2, fast=fast), fast=fast).startswith("Intact replies came with ID 7, which was not addressed")
 
 
 @pytest.mark.parametrize("fast", [False, True])

@@ -71,7 +71,7 @@ def test_a_goal_written_once_is_no_proof(fake_config: Make, when: int) -> None:
 
 @pytest.mark.parametrize("when", [20, 21, 22])
 def test_nor_is_a_goal_of_ours_from_long_ago_seen_twice(fake_config: Make, when: int) -> None:
-    """Lost writes leave it, which the status detects."""
+    """Lost writes leave it, and the status detects those."""
     times = iter(range(10_000))
 
     def twice(servos: Any) -> None:
@@ -97,7 +97,7 @@ def test_a_foreign_goal_is_told_from_the_first_sighting_until_some_time_after_th
 
 
 def test_of_a_goal_of_0_no_other_program_is_accused(fake_config: Make) -> None:
-    """A tripped watchdog or a reboot leaves it."""
+    """A tripped watchdog or a reboot also leaves 0."""
     with driven(fake_config(interval=INTERVAL)) as bus:
 
         def once(servos: Any) -> None:

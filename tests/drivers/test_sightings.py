@@ -13,7 +13,7 @@ OURS, FOREIGN = 40, -7
 MODE, OTHER_MODE = 0, 3
 SENT = [[10, 20], [30, OURS]]
 LONG_AGO = 55
-"""A goal from before the recent ones."""
+"""A goal older than the recent ones."""
 
 
 def read_back() -> ReadBack:

@@ -1,4 +1,4 @@
-"""Prediction errors relative to the motion, with and without the noise of the encoders."""
+"""Prediction errors relative to the motion, with and without encoder noise."""
 
 import numpy as np
 import pytest

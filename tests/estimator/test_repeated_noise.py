@@ -57,7 +57,7 @@ def test_missing_samples_are_bridged_and_single_passes_say_nothing() -> None:
 
 @pytest.mark.parametrize("lost", [0.05, 0.15])
 def test_lost_samples_do_not_make_the_noise_smaller(lost: float) -> None:
-    """Interpolated samples have less fast noise than received ones."""
+    """Interpolated samples have less high-frequency noise than received ones."""
     several = passes(0.8, 6)
     for index, each in enumerate(several):
         each[np.random.default_rng(index).random(each.shape) < lost] = np.nan
@@ -74,7 +74,7 @@ def test_lost_samples_do_not_make_the_noise_smaller(lost: float) -> None:
 @pytest.mark.parametrize("std", [0.0, 0.13, 0.5])
 @pytest.mark.parametrize("drift", [0.3, 1.0, 3.0])
 def test_drift_is_not_noise(std: float, drift: float) -> None:
-    """A slow change from pass to pass rounds them differently, without any noise."""
+    """A slow change from pass to pass makes them round differently even without noise."""
     rng = np.random.default_rng(7)
     shape = 1.0 + 0.5 * np.sin(2.0 * np.pi * 3.0 * np.arange(SAMPLES) / SAMPLES)
     moved = [fast_motion() + each * drift * shape for each in range(5)]

@@ -90,7 +90,7 @@ def blocks(title: str) -> list[tuple[str, str]]:
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """A copy of the code that may be changed, with the compiled loops: it recompiles only what changes."""
+    """A copy of the code that may be modified, with the compiled loops, so that only what changes is recompiled."""
     unwanted = shutil.ignore_patterns("*.pyc", *FOLDERS)
     shutil.copytree(ROOT / "hil", tmp_path / "hil", ignore=unwanted)
     for folder in FOLDERS:

@@ -1,4 +1,4 @@
-"""What a recording says about encoder zeros that a fit has held: a score test, without another fit.
+"""Score test of encoder zeros that a fit held fixed; no further fit is needed.
 
 The sum of squares is evaluated once more at the minimum, with the zeros among its coordinates. One step of its normal
 equations estimates the zeros and how much fitting them would lower the sum (Rao's score test).
@@ -17,18 +17,18 @@ from hil.estimator.fit.levenberg_marquardt import Minimum
 
 @dataclass(frozen=True)
 class HeldZeros:
-    """Encoder zeros of all joints but the first, as far as the recording shows them."""
+    """Encoder zeros of all joints but the first, as far as the recording reveals them."""
 
     shift: Array
-    """Estimated true minus measured angle (joints - 1,) [rad]; about 0 where gravity does not reveal it."""
+    """Estimated true minus measured angle (joints - 1,) [rad]; close to 0 where gravity does not reveal it."""
     gain: float
-    """Decrease of the sum of squares that is expected from fitting them, in units of white noise."""
+    """Expected decrease of the sum of squares if they were fitted, in units of white noise."""
 
 
 def held_zeros(problem: ChainProblem, x: Array, unfinished: float) -> HeldZeros:
     """Estimate the zeros that `problem` holds at 0, from its minimum `x`.
 
-    unfinished: decrease of the sum of squares that is expected without them.
+    unfinished: expected decrease of the sum of squares without fitting them.
     """
     model = replace(problem.model, zeros=True)
     names, size = model.names, len(model.names)

@@ -1,4 +1,4 @@
-"""Distance from where a fit has stopped to its minimum."""
+"""Distance from the point where a fit stopped to its minimum."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ def remaining(minimum: Minimum, coordinates: ChainCoordinates) -> tuple[Array, f
     """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations predict.
 
     Where the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
-    A width at its floor stays there.
+    A friction width at its lower bound stays there.
     """
     at, least = minimum.at, np.full(minimum.x.size, -np.inf)
     least[: len(coordinates.names)] = coordinates.room_below(minimum.x)

@@ -4,11 +4,11 @@ The observer starts stiff, so that the simulation can follow the motion with sta
 the fit improves. Most iterations use coarse integration steps; the last ones use fine steps. The noise level of each
 joint is itself estimated before the final iterations, in which outliers are downweighted (Huber).
 
-Where joints often stick, stage 1 can be far off in friction, and hence in the links and torque scales that share a
-joint's torque with it. While the shape of friction is held, softening the observer then leads the fit into another
-minimum, a curved valley in which it stops short. So if the motion is not explained when the observer is soft, a second
-start is made from the prior's links, with the shape of friction free as soon as the stiffest observer follows, and the
-better one is continued.
+Where joints often stick, stage 1's estimate of friction can be far off, and with it the link parameters and torque
+scales, which are correlated with friction. Softening the observer while the shape of friction is fixed then leads the
+fit into another minimum, in a curved valley where it stops short. So if the soft observer does not explain the motion,
+a second start is made from the prior's links, with the shape of friction free as soon as the stiffest observer follows
+the motion. The better of the two fits is continued.
 """
 
 from collections.abc import Sequence
@@ -76,9 +76,9 @@ class ChainOptions:
     other_initial_widths: tuple[float, ...] = (0.005, 0.001)
     """Initial widths of further fits, tried as long as no fit explains the motion [rad/s]."""
     poor: float = 1.2
-    """Root of the mean weighted squared residual above which a second start is made: 1 is noise alone."""
+    """RMS weighted residual above which a second start is made; 1 for noise alone."""
     test_zeros: bool = False
-    """Whether encoder zeros that the model holds are tested, which takes one more simulation with sensitivities."""
+    """Whether to test the encoder zeros that the model holds fixed; takes one more simulation with sensitivities."""
     min_initial_lag: float = 5e-4
     """Minimum initial guess of the lag [s]."""
     reach: float = 0.3
@@ -142,10 +142,10 @@ class ChainFit:
     neglected: Array
     """Covariance due to what the model of voltage-driven joints neglects (parameters, parameters) [SI]."""
     at_bound: tuple[str, ...] = ()
-    """Parameters at a bound that the data would exceed, and on which base parameters depend."""
+    """Parameters at a bound although the data favour values beyond it, if base parameters depend on them."""
     held_zeros: HeldZeros | None = None
-    """What the recording says about encoder zeros that the model holds; None if it fits them, has one joint, or this
-    was not asked for.
+    """Result of the test of the encoder zeros that the model holds fixed; None if it fits them, has one joint, or no
+    test was requested.
     """
 
     @property
@@ -215,7 +215,7 @@ def fit_periods(
 
 
 def _started(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
-    """Return the problem with resolved friction, its rough minimum, and the number of simulations.
+    """Return the problem with friction near standstill resolved, its rough minimum, and the number of simulations.
 
     x: stage 1's result. Raises ConvergenceError if the stiffest observer does not follow the motion.
     """
@@ -228,7 +228,7 @@ def _started(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Cha
     with suppress(ConvergenceError):
         other, again, more = _softened_later(coarse, x, options)
         spent += more
-        # A softer observer leaves larger residuals of the same errors, by about the ratio of the frequencies.
+        # The same errors leave larger residuals under a softer observer, by about the ratio of the frequencies.
         if _level(other, again.x) * other.softness < level * softness:
             return other, again, spent
     return problem, found, spent
@@ -252,7 +252,7 @@ def _resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple
     and the number of simulations.
     """
     resolved = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
-    # An early fit may be far off: where it makes a joint much too light, the step must not stay wide for good.
+    # An early fit may be far off: where it makes a joint much too light, the step must not remain too long permanently.
     floor = np.clip(resolved, options.width_floor, options.initial_width)
     bounded = replace(coarse.coordinates, width_floor=floor)
     soft = bounded.raised(soft)
@@ -262,7 +262,7 @@ def _resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple
 
 
 def _level(problem: ChainProblem, x: Array) -> float:
-    """Return the root of the mean weighted squared residual at `x`: 1 is noise alone."""
+    """Return the RMS weighted residual at `x`; 1 for noise alone."""
     return float(np.sqrt(replace(problem, prior_weight=0.0).cost(x) / _counted(problem)))
 
 
@@ -313,7 +313,7 @@ def _tempered(problem: ChainProblem, x: Array) -> ChainProblem:
 
 
 def _counted(problem: ChainProblem) -> float:
-    """Return the number of samples that are compared, repeated readings counted as in the sum of squares."""
+    """Return the number of samples compared; repeated readings count as in the sum of squares."""
     counted = (
         np.square(weight * period.noise)[:: problem.every]
         for weight, period in zip(problem.weights, problem.periods, strict=True)
@@ -427,7 +427,7 @@ def _fit(
 
 
 def _at_bound(problem: ChainProblem, minimum: Minimum, value: Array, std: Array) -> tuple[str, ...]:
-    """Return the parameters at a bound that the data would exceed, if base parameters depend on them.
+    """Return the parameters at a bound although the data favour values beyond it, if base parameters depend on them.
 
     std: standard errors of the parameters `value` (parameters,).
     """

@@ -19,7 +19,7 @@ MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's,
 PART = 0.1
 """Smallest part that a joint has in the motion whose inertia is lost to be named."""
 MOST_LOST = 0.5
-"""Largest fraction of a joint's inertia by which a lagging back-EMF makes it move like a lighter one."""
+"""Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
 _ARMATURE = 10  # of a link's parameters
 _POSES = np.random.default_rng(4).uniform(-np.pi, np.pi, (6, 7))  # in which inertias are compared (poses, joints)
 
@@ -49,10 +49,10 @@ def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[
 
 
 def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -> tuple[str, ...]:
-    """Return the names of the lagging back-EMFs that would take more inertia than the simulation allows.
+    """Return the names of the lagging back-EMFs that would cancel more inertia than the simulation allows.
 
-    The estimated inertias then contain a loss that was not simulated, or less of it. A back-EMF is only named if that
-    loss exceeds the standard errors (base parameters or more,) of what the joint's rotor contributes to.
+    The loss that is simulated is then smaller than the parameters imply, which biases the estimated inertias. A
+    back-EMF is only named if its loss exceeds a standard error in `std` (base parameters or more,).
     """
     generating = _generating(base.chain.joints, parameters)
     most, parts = _most_lost(base, parameters, generating)

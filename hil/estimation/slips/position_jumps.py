@@ -42,7 +42,7 @@ def jump_warnings(config: Config, facts: RunFacts, samples: NDArray[np.void]) ->
 def jump_disturbances(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tuple[str, ...]:
     """A sentence for the verdict that names the joints whose position jumped, if any.
 
-    Jumps after the last multisine do not count: nothing after it is used.
+    Jumps after the last multisine are ignored: nothing after it is used.
     """
     used = np.flatnonzero(samples["phase"] == Phase.PERIODIC)
     found = zip(config.joints, _jumps(config, facts, samples[: used[-1] + 1 if used.size else 0]), strict=True)

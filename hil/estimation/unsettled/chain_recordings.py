@@ -203,7 +203,7 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     if found.at_bound:
         trust = "with care" if trust == "yes" else trust
         sentences.append(bound_sentence(found.at_bound))
-    # A regression says nothing about missing effects.
+    # A regression alone does not reveal missing effects.
     explained = not found.simulated or (
         float(found.residual_over_noise.max()) <= EXPLAINED and found.systematic <= SYSTEMATIC
     )

@@ -1,4 +1,4 @@
-"""What is stored of a servo's settings, and when nothing is."""
+"""Which settings of a servo are stored, and when none are."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ XM430 = load_control_table("XM430-W350")
 
 
 class Servo:
-    """Each register holds a number of its own; from the n-th read on, replies are one request behind."""
+    """Each register holds a different number; from the n-th read on, replies are one request behind."""
 
     table, title = XM430, "The servo"
 
@@ -33,7 +33,7 @@ def test_every_register_is_stored_and_a_tripped_watchdog_as_one_that_is_off() ->
 
 @pytest.mark.parametrize("behind", [range(100), range(1, 100), range(13, 100), range(1), range(5, 6), range(2, 20)])
 def test_nothing_is_stored_if_replies_belong_to_earlier_requests(behind: range) -> None:
-    """Each of them would be restored as the value of another register."""
+    """Each would be restored as the value of another register."""
     servo: Any = Servo(behind)
     with pytest.raises(WrongReply, match="its replies are late and belong to earlier requests"):
         read_settings(servo)

@@ -1,4 +1,4 @@
-"""Encoder zeros that a fit holds: what the recording says about them."""
+"""Test of encoder zeros that a fit holds fixed."""
 
 from dataclasses import replace
 
@@ -28,5 +28,5 @@ def test_only_significant_and_large_zeros_are_doubted() -> None:
     shift = np.array([0.02, -0.03, 0.5 * LARGE_ZERO])
     assert doubtful_zeros(HeldZeros(shift, 40.0), 0.8) == ((2, 0.02), (3, -0.03))
     assert doubtful_zeros(HeldZeros(shift, 10.0), 0.8) == ()
-    assert doubtful_zeros(HeldZeros(shift, 40.0), 3.0) == ()  # a model error as large may mimic them
+    assert doubtful_zeros(HeldZeros(shift, 40.0), 3.0) == ()  # a model error of the same size may mimic them
     assert doubtful_zeros(None, 1.0) == ()

@@ -143,8 +143,8 @@ def test_filtered_least_squares_takes_any_recording(setup: bench.Setup, period: 
 
 
 def test_wrong_torque_constants_are_found(setup: bench.Setup, period: SettledPeriod) -> None:
-    """Joints share links, so constants that are off by different factors are consistent with no arm: their ratios
-    differ from 1 by more than ten standard errors.
+    """Joints share links, so no arm is consistent with constants that are off by different factors: their ratios differ
+    from 1 by more than ten standard errors.
     """
     wrong = np.array([1.0, 1.03, 0.97, 1.02])
     assumed = replace(period, torque=period.torque * wrong[:, None])

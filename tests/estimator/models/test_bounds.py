@@ -1,4 +1,4 @@
-"""Parameters at the edge of their range: named if the data press them against it and others depend on them."""
+"""Parameters at a bound: named if the data push them against it and others depend on them."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ NAMES = ("inertia_1", "viscous_1", "load_1")
 
 
 def pressed(truth: float, seed: int) -> tuple[Array, Array, Array]:
-    """Fit two positive parameters and one that is at zero, where `truth` is its true value."""
+    """Fit two positive parameters and one that ends at zero, whose true value is `truth`."""
     rng = np.random.default_rng(seed)
     Y = rng.standard_normal((400, 3))
     Y[:, 2] += 0.7 * Y[:, 1]

@@ -1,4 +1,4 @@
-"""Values far from the file's or from typical ones: named, and the verdict lowered."""
+"""Values far from the configuration's or from typical ones are named and lower the verdict."""
 
 import numpy as np
 import pytest

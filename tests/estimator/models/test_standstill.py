@@ -131,7 +131,7 @@ def test_it_is_suspect_while_the_torque_is_outside_the_band() -> None:
 
 @pytest.mark.parametrize(("torque", "distance"), [(0.0, -1.5), (1.0, 1.5)])
 def test_earlier_torques_are_judged_by_the_present_estimates(torque: float, distance: float) -> None:
-    """Residuals are then -0.1 and -2.1 N m, and -1.6 or -0.6 now."""
+    """The residuals were -0.1 and -2.1 N m; now they are -1.6 or -0.6 N m."""
     rest = standstill.memory(1, 2)[0]
     standstill.look(rest, 0.3, 1.0, 1.0, np.array([0.5, 1.0]), np.zeros(2))
     standstill.look(rest, 0.3, 1.0, -1.0, np.array([0.4, 3.0]), np.zeros(2))

@@ -1,4 +1,4 @@
-"""Unit mistakes are refused by name; values of real arms are accepted."""
+"""Unit errors are refused by name; values of real arms are accepted."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ SLIPS = [
     ),
     ("velocity_limit = 10.0 ", "velocity_limit = 360.0 ", r"velocity_limit.*degrees/s, write 6\.28"),
     ("velocity_limit = 10.0 ", "velocity_limit = 46.0 ", r"velocity_limit.*rpm, write 4\.817"),
-    ("velocity_limit = 10.0 ", "velocity_limit = 46.0 ", r"without load, an XM430-W350 turns at 5\.9 rad/s at 14\.8 V"),
+    ("velocity_limit = 10.0 ", "velocity_limit = 46.0 ", r"the no-load speed of XM430-W350 is 5\.9 rad/s at 14\.8 V"),
     ("current_limit = 0.69 ", "current_limit = 6.9 ", r"current_limit of joint 'shoulder'.*stall current.* is 2\.7 A"),
     ("torque_constant = 1.81 ", "torque_constant = 0.0051 ", r"torque_constant.*published"),
     ("torque_constant = 1.81 ", "torque_constant = 18.5 ", r"torque_constant.*kgf cm"),

@@ -339,7 +339,7 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
     estimate.doubtful_zeros = ((3, 0.021),)
     shifted = _verdict(config, estimate, known, np.full(4, 1e-3), [])
     assert shifted.trust == "with care"
-    assert any("contradicts them: joint3 by about 0.021 rad" in each for each in shifted.sentences)
+    assert any("contradicts them: joint3 is off by about 0.021 rad" in each for each in shifted.sentences)
     estimate.doubtful_zeros = ()
     estimate.at_bound = ("back_emf_2",)
     bounded = _verdict(config, estimate, known, np.full(4, 1e-3), [])
@@ -351,7 +351,7 @@ def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
 
 
 def test_a_torque_constant_far_from_the_file_lowers_the_verdict(run: RunFolder) -> None:
-    """With care if the motion is explained, no if something is missing; links are only named."""
+    """ "With care" if the motion is explained, "no" if something is missing; link values are only named."""
     config = run.load_config()
     known = known_chain(config)
     prior = replace(known.prior, scale_precision=np.eye(3) / 0.1**2)

@@ -97,7 +97,7 @@ def test_nor_does_it_keep_others_from_being_judged(config: Config) -> None:
 
 
 class Observer:
-    """Records what the watch passes on, and finds the joint `found`."""
+    """Records what the watch passes on, and reports the joint `found`."""
 
     def __init__(self, *given: Any) -> None:
         self.given = given
@@ -128,7 +128,7 @@ def test_parameters_are_in_units_of_the_commanded_torque() -> None:
 
 
 def test_the_prior_is_the_ensemble_widened() -> None:
-    """By half as much again, 5 % of each value, and half of the dry friction for the offset."""
+    """Widened by half as much again, 5 % of each value, and half of the dry friction for the offset."""
     mean, covariance = chain_watch.observed_parameters(TWO)
     assert mean.tolist() == pytest.approx([0.6, 0.5, 0.75, 0.05, 0.05, 0.15, 0.1, 0.25, 0.15])
     wanted = (0.05 * mean) ** 2
@@ -146,7 +146,7 @@ def watch(config: Config, monkeypatch: pytest.MonkeyPatch) -> ChainWatch:
 
 
 def sees(config: Config, watch: ChainWatch, at: float, **changed: Any) -> Any:
-    """What the observer sees of a sample at this time [s]; angles are relative to the rest pose."""
+    """What the observer is given for a sample at this time [s]; angles are relative to the rest pose."""
     away = np.array(changed.pop("away", (0.0, 0.0, 0.0)))
     said = {
         "missing": (False,) * 3,

@@ -63,7 +63,7 @@ def test_a_frozen_encoder_is_seen_between_lost_replies(arm: Arm) -> None:
     with pytest.raises(SafetyStop) as stop:
         for number in range(60):
             guard.look(at(number, MISSING if number % 2 else fast))
-    assert stop.value.cause is Cause.FROZEN and "or its horn slips. Check the horn, the encoder" in str(stop.value)
+    assert stop.value.cause is Cause.FROZEN and "or the horn slips. Check the horn, the encoder" in str(stop.value)
 
 
 def test_replies_may_be_missing_but_not_too_many_in_a_row(arm: Arm) -> None:
@@ -91,7 +91,7 @@ def test_silence_of_all_servos_points_to_what_they_share(arm: Arm, missing: tupl
 
 @pytest.mark.parametrize("missing", [(False, True), (True, True)])
 def test_what_was_heard_instead_replaces_the_remedy_for_silence(arm: Arm, missing: tuple[bool, bool]) -> None:
-    """Otherwise the message says that nothing was heard, and then that replies arrived."""
+    """Otherwise the message would say first that nothing was heard, then that replies arrived."""
     guard = Guard(arm(), heard_instead=lambda: "Replies did arrive, but too late.")
     with pytest.raises(SafetyStop, match=r"allows 15 ms\. Replies did arrive, but too late\.$") as stop:
         for number in range(10):

@@ -1,4 +1,4 @@
-"""Five arms of the population, covering all models and orientations, are identified without help."""
+"""Five arms of the population, covering all servo models and orientations, are identified without help."""
 
 from pathlib import Path
 

@@ -76,7 +76,7 @@ def test_a_knock_that_the_velocity_follows_late_is_no_jump() -> None:
 
 
 def test_a_jump_after_the_last_used_sample_casts_no_doubt() -> None:
-    """Such as a horn knocked while the arm comes to rest; the warning still names it."""
+    """For example, the horn is knocked while the arm comes to rest; the warning still names the jump."""
     time, position, velocity = swing(200.0, 1.0, 0.0, 4)
     samples = np.zeros(len(time), sample_type(1))
     samples["deadline"], samples["velocity"][:, 0] = time, velocity
