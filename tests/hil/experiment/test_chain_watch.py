@@ -112,9 +112,8 @@ class Observer:
 
 def arms(drive: Any, rigid: Any) -> Any:
     names = ["mass_1", "inertia_2", "moment_2"]
-    return SimpleNamespace(
-        drive=np.array(drive), rigid=np.array(rigid), size=len(rigid), base=SimpleNamespace(names=names)
-    )
+    base = SimpleNamespace(names=names, count=3, regressor=lambda angle, *_: np.zeros((len(angle), 1, 3)))
+    return SimpleNamespace(drive=np.array(drive), rigid=np.array(rigid), size=len(rigid), base=base)
 
 
 #                viscous     dry friction  offset      -           scale of the commanded torque

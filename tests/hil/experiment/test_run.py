@@ -147,7 +147,7 @@ def test_a_fault_of_the_program_stops_the_arm(arm: Arm, tmp_path: Path, ports: l
     ("change", "said"),
     [
         (("[-3.1, 3.1]", "[-0.5, 0.5]"), r"'elbow' \(ID 2.*outside its position limit \[-0\.5, 0\.5\]"),
-        (("velocity_limit = 15.0", "velocity_limit = 2.0"), r"'shoulder' \(ID 1.*velocity limit 2"),
+        (("velocity_limit = 15.0", "velocity_limit = 2.0"), r"'shoulder' \(ID 1.*velocity limit of 2"),
     ],
 )
 def test_a_limit_stops_the_arm_at_the_sample_that_passed_it(
