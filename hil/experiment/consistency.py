@@ -18,6 +18,10 @@ servo are known:
 A reading that jumps back and forth, as with a stuck bit, cancels in those memories. Therefore each single interval is
 also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
 
+A velocity that stays exactly the same was that of the joint all the while, except for the last `LAG_S` at most. So the
+distance covered until then must equal the velocity times the time. A velocity that freezes near its peak is found by
+this sooner than by the memories, in which a lag could explain the difference.
+
 Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to twice the
 values estimated by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
 
@@ -63,6 +67,14 @@ usual differences.
 STEPS, STEPS_S = 4, 0.5
 """Number of jumps that counts as a fault, and the longest time between them [s]."""
 
+BLOCK_S, MOST_BLOCKS = 0.0099, 3
+"""Shortest time after which the distance covered under an unchanged velocity is noted [s], and the number of such notes
+that are kept: together `LAG_S`.
+"""
+
+SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
+"""Velocity below which it may well stay the same while a joint sticks and slips, and its resolution [rad/s]."""
+
 SCALE, MORE_SCALE = 0.06, 0.02
 CURVED = 0.35
 """Allowance for the velocity between samples, as a fraction of its change times the interval. A wave with only four
@@ -86,6 +98,15 @@ square: mean square of the usual differences [rad^2]. age: time since the beginn
 succession. since: time since the latest one [s].
 """
 
+_SAME = np.dtype(
+    [(name, "f8") for name in ("seconds", "moved", "unknown", "since", "count", "d1", "t1", "d2", "t2", "d3", "t3")]
+)
+"""Motion since the velocity last changed.
+
+seconds, moved, unknown: time, change of position and its uncertainty [s, rad, rad]. since: time since the last note
+[s]. count: number of notes. d1, t1 to d3, t3: the latest three notes of `moved` and `seconds`.
+"""
+
 MEMORY = np.dtype(
     [
         *((name, "f8") for name in ("position", "velocity")),
@@ -93,6 +114,7 @@ MEMORY = np.dtype(
         *((name, "f8") for name in ("learnt_for", "lag_squared", "scale_squared", "crossed", "lag_product")),
         *((name, "f8") for name in ("scale_product", "lag", "scale")),
         ("steps", _STEPS),
+        ("same", _SAME),
         ("short", _FADING),
         ("long", _FADING),
     ]
@@ -125,6 +147,7 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
         _restart(short, velocity)
         _restart(memory.long, velocity)
         _forget_sums(memory)
+        _begin_same(memory.same)
         return False
     moved = position - former
     turned = abs(velocity - before)
@@ -133,6 +156,10 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
     unknown = unsure * abs(velocity)
     known = LAG_S * turned + SCALE * abs(moved) + curved + unknown
     if _has_jumped(memory.steps, abs(difference) - known, seconds):
+        return True
+    if velocity != before or abs(velocity) < SLOW_RAD_S:
+        _begin_same(memory.same)
+    elif _is_frozen(memory.same, moved, velocity, seconds, unknown, memory.scale):
         return True
     _add(short, SHORT_S, moved, difference, velocity, seconds, curved, unknown)
     if _is_wrong(short, UNSURE_RAD, velocity, memory.lag, memory.scale):
@@ -186,6 +213,36 @@ def _learn(memory: Any, velocity: float, seconds: float) -> None:
     scale = (memory.scale_product * memory.lag_squared - memory.lag_product * memory.crossed) / determinant
     memory.lag = min(LAG_S, 2.0 * max(lag, 0.0) + MORE_LAG_S)
     memory.scale = min(SCALE, 2.0 * abs(scale) + MORE_SCALE)
+
+
+def _begin_same(same: Any) -> None:
+    same.seconds = same.moved = same.unknown = same.since = same.count = 0.0
+
+
+def _is_frozen(same: Any, moved: float, velocity: float, seconds: float, unknown: float, scale: float) -> bool:
+    """Process an interval over which the velocity has not changed; return whether it is frozen.
+
+    moved, unknown: change of position and its uncertainty [rad]. scale: largest accepted scale error.
+    """
+    same.seconds += seconds
+    same.moved += moved
+    same.unknown += unknown
+    same.since += seconds
+    if same.since < BLOCK_S:
+        return False
+    notes = min(np.ceil(LAG_S / same.since - 0.05), float(MOST_BLOCKS))
+    covered, time = same.d1, same.t1
+    if notes >= 2.0:
+        covered, time = same.d2, same.t2
+    if notes >= 3.0:
+        covered, time = same.d3, same.t3
+    known = same.count >= notes
+    same.d3, same.t3, same.d2, same.t2 = same.d2, same.t2, same.d1, same.t1
+    same.d1, same.t1 = same.moved, same.seconds
+    same.count += 1.0
+    same.since = 0.0
+    allowed = UNSURE_RAD + scale * abs(covered) + RESOLUTION_RAD_S * time + same.unknown
+    return bool(known and abs(covered - velocity * time) > allowed)
 
 
 def _has_jumped(steps: Any, step: float, seconds: float) -> bool:
@@ -251,7 +308,7 @@ def _is_wrong(fading: Any, unsure: float, velocity: float, lag: float, scale: fl
 
 
 _inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
-_restart, _add, _is_wrong, _has_jumped, _forget_sums = map(
-    _inner, (_restart, _add, _is_wrong, _has_jumped, _forget_sums)
+_restart, _add, _is_wrong, _has_jumped, _forget_sums, _begin_same, _is_frozen = map(
+    _inner, (_restart, _add, _is_wrong, _has_jumped, _forget_sums, _begin_same, _is_frozen)
 )
 _looks_long, _learn, look, lost = map(_inner, (_looks_long, _learn, look, lost))

@@ -88,7 +88,12 @@ def test_errors_name_file_key_value_and_what_is_allowed(tmp_path: Path, old: str
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(b"[port]\n", "no [fake] table"), (b"fake = 3\n", "no [fake] table"), (b"[fake", "not valid TOML"), (b"\xff", "read")],
+    [
+        (b"[port]\n", "no [fake] table"),
+        (b"fake = 3\n", "no [fake] table"),
+        (b"[fake", "not valid TOML"),
+        (b"\xff", "read"),
+    ],
 )
 def test_files_that_are_no_description(tmp_path: Path, content: bytes, said: str) -> None:
     path = tmp_path / "arm.toml"

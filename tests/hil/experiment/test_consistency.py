@@ -58,6 +58,44 @@ def test_a_velocity_that_stays_at_zero(rate: int, speed: float) -> None:
     assert 0.0 <= when - 1.0 <= 0.15 + 1e-9
 
 
+@pytest.mark.parametrize("rate", (100, 400, 1000))
+@pytest.mark.parametrize("phase", [0.3, 0.5, 1.3, 1.5])
+def test_a_velocity_that_freezes_while_the_joint_accelerates(rate: int, phase: float) -> None:
+    """In the first moments of a run any lag is possible, and would explain the difference for a fifth of a second."""
+    frozen_at = phase / 4 / 1.5
+
+    def speed(now: float) -> float:
+        return 3.8 * math.sin(math.tau * 1.5 * now)
+
+    def angle(now: float) -> float:
+        return -3.8 / (math.tau * 1.5) * math.cos(math.tau * 1.5 * now)
+
+    when = seen_after(rate, angle, lambda now: speed(min(now, frozen_at)))
+    assert 0.0 < when - frozen_at <= 0.12
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("lag", [0.0, 0.015, 0.03])
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.004])
+def test_a_velocity_that_stays_the_same_until_the_joint_turns_round_is_accepted(
+    rate: int, lag: float, noise: float
+) -> None:
+    """A motor at the limit of its supply, say: a steady pace, and a sudden reversal."""
+    random = Random(3)
+
+    def angle(now: float) -> float:
+        return 1.5 * now if now < 2.0 else 3.0 + 1.5 * (now - 2.0) - 20.0 * (now - 2.0) ** 2
+
+    def velocity(now: float) -> float:
+        return 1.5 if now < 2.0 + lag else 1.5 - 40.0 * (now - lag - 2.0)
+
+    look = Consistency()
+    for index in range(int(2.15 * rate)):
+        now = index / rate
+        position = quantised(angle(now) + noise * random.gauss(0.0, 1.0), STEP)
+        assert not look.look(position, quantised(velocity(now), TICK), 1 / rate), now
+
+
 @pytest.mark.parametrize("rate", RATES)
 @pytest.mark.parametrize(("scale", "lag"), [(0.5, 0.0), (1.5, 0.0), (-1.0, 0.0), (1.0, 0.15)])
 def test_a_velocity_that_is_scaled_turned_round_or_old(rate: int, scale: float, lag: float) -> None:
