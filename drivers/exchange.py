@@ -37,8 +37,9 @@ MOST_PATIENCE_S = 0.02
 """Upper limit of the minimum reply timeout [s]: in slow cycles too, a silent servo must not delay the others."""
 
 AFTER_LOSS = 5
-"""Number of reads of different lengths that take turns after lost replies. A reply that arrives
-fewer than this many cycles late is recognised by its length."""
+"""Number of reads of different lengths that take turns after lost replies. A reply that arrives fewer than this many
+cycles late is recognised by its length.
+"""
 
 _NEVER = 1 << 62
 _DOUBTS = 3

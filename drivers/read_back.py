@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Sequence
+from itertools import islice
 from random import Random
 from typing import NamedTuple
 
@@ -126,7 +127,7 @@ class ReadBack:
                 if answer is not None and answer[-1] != mode and len(answer) > 1
             ]
         # A servo that received its neighbour's goal is not commanded by another master.
-        own = set().union(*list(sent)[-_RECENT:])
+        own = set().union(*islice(reversed(sent), _RECENT))
         return [
             (place, answer[-1])
             for place, answer in enumerate(servos)

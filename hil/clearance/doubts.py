@@ -6,7 +6,6 @@ from hil.clearance.space import Space
 from hil.config.chain import described_arm, doubted_inertias, doubted_limits
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
-from hil.drivers.servo_model import Mode
 from hil.drivers.servo_prior import servo_prior
 
 
@@ -30,7 +29,7 @@ def _weak(joint: JointConfig) -> str:
     torque = joint.goal_limit * joint.torque_per_goal
     if torque > friction:
         return ""
-    unit = "V" if joint.drive_mode is Mode.PWM else "A"
+    unit = joint.drive_mode.goal_unit
     return (
         f"{joint.goal_limit_name} of joint {joint.name!r} = {joint.goal_limit:g} {unit} allows at most {torque:.2g} "
         f"N m, less than the typical dry friction of its servos, {friction:.2g} N m: it would not move. At least "

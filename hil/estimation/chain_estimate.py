@@ -202,11 +202,11 @@ def _verdict(
         )
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
     if estimate.doubtful_zeros:
-        trust = "with care" if trust == "yes" else trust
+        trust = lowered(trust, "with care")
     if said := about_zeros(config, estimate):
         sentences.append(said)
     if disturbances:
-        trust = "with care" if trust == "yes" else trust
+        trust = lowered(trust, "with care")
         sentences += disturbances
     if still:
         trust = "no"
@@ -215,22 +215,22 @@ def _verdict(
             "joint_path.swing and speed there, and check that nothing blocks it."
         )
     if estimate.from_prior:
-        trust = "with care" if trust == "yes" else trust
+        trust = lowered(trust, "with care")
         sentences.append(
             f"The recording hardly determines {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
             "wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
         )
     if said := vague(known.prior, known.base.names, estimate.std, estimate.from_prior):
-        trust = "with care" if trust == "yes" else trust
+        trust = lowered(trust, "with care")
         sentences.append(said)
     if not estimate.reached:
-        trust = "with care" if trust == "yes" else trust
+        trust = lowered(trust, "with care")
         sentences.append(
             "The fit stopped short of its minimum, where a joint sticks and breaks away; the standard errors include "
             "the distance that remains. Use faster motion ([joint_path]), so that fewer joints stick."
         )
     if estimate.at_bound:
-        trust = "with care" if trust == "yes" else trust
+        trust = lowered(trust, "with care")
         sentences.append(bound_sentence(estimate.at_bound))
     trust = lowered(trust, contradicted(estimate.conflicts, explained))
     sentences += conflict_sentences(estimate.conflicts, explained)

@@ -1,20 +1,28 @@
 """Plausibility checks: identified values that are impossible or contradict the configuration."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hil.config.schema import Config
 from hil.estimator.identify import Estimate
-from hil.estimator.models.conflicts import Conflict, conflicts
+from hil.estimator.models.conflicts import LARGE_RATIO, Conflict, conflicts
 
 DEVIATIONS = 4.0  # standard errors
 LENGTH_TOLERANCE = 0.05  # relative; link lengths are measured with a ruler
 FLAT = 0.02  # of the largest commanded torque, below which gravity counts as absent
-RATIO = 0.35  # largest plausible deviation of a torque constant ratio from 1
 
 
-def doubts(config: Config, estimate: Estimate, largest_torque: float) -> tuple[str, ...]:
-    """One sentence per contradiction; `largest_torque` is the largest commanded torque [N m]."""
-    found = [*_length(config, estimate), *_weight(config, estimate, largest_torque), *_constants(config, estimate)]
+def doubts(
+    config: Config, estimate: Estimate, largest_torque: float, known: Sequence[Conflict] = ()
+) -> tuple[str, ...]:
+    """One sentence per contradiction, except for those in `known`, which say so themselves.
+
+    largest_torque: largest commanded torque [N m].
+    """
+    found = [*_length(config, estimate), *_weight(config, estimate, largest_torque)]
+    if all(each.name != "torque_scale_2" for each in known):
+        found += _constants(estimate)
     return tuple(found)
 
 
@@ -65,12 +73,10 @@ def conflicts_of(config: Config, estimate: Estimate) -> tuple[Conflict, ...]:
     return conflicts(estimate.names, estimate.value, estimate.std, given)
 
 
-def _constants(config: Config, estimate: Estimate) -> list[str]:
+def _constants(estimate: Estimate) -> list[str]:
     ratio = estimate.parameters.get("torque_scale_2", 1.0)
-    if abs(np.log(max(ratio, 1e-6))) < np.log1p(RATIO):
+    if abs(np.log(max(ratio, 1e-6))) < np.log1p(LARGE_RATIO):
         return []
-    if any(each.name == "torque_scale_2" for each in conflicts_of(config, estimate)):
-        return []  # says so itself
     return [
         f"The torque of joint 2 appears to be {ratio:.2g} times what its torque constant implies: check the model "
         "and the torque_constant of both joints."

@@ -84,14 +84,14 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
         played[HELD_OUT] = _predicted(estimate, other, drift, is_corrected)
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     as_fitted = _as_fitted(estimate, other, drift)
-    beyond = None if other is None else played[HELD_OUT].error_beyond(other.noise)
     validation = validate(period, estimate)
-    wrong = doubts(config, estimate, float(np.abs(period.torque).max()))
+    conflicts = conflicts_of(config, estimate)
+    wrong = doubts(config, estimate, float(np.abs(period.torque).max()), conflicts)
     notes = supply_notes(config, supply_sag(config, samples))
     limit = torque_limit(config, samples)
     evidence = Evidence(
-        beyond,
-        _as_fitted(estimate, other, drift, beyond_noise=True),
+        None if other is None else played[HELD_OUT].error_beyond(other.noise),
+        None if other is None or as_fitted is None else as_fitted.error_beyond(other.noise),
         left_out,
         drift,
         torque,
@@ -100,11 +100,11 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
         notes,
         tried_all=choice is not None,
         torque_limit=limit,
-        conflicts=conflicts_of(config, estimate),
+        conflicts=conflicts,
     )
     judged = judge(estimate, validation, evidence)
     checks = Checks(
-        describe_validation(validation, held_out, as_fitted),
+        describe_validation(validation, held_out, None if as_fitted is None else as_fitted.relative_error),
         describe_verdict(judged),
         (*warnings_of(config, facts, samples, period), *cut_short),
         None if choice is None else describe_choice(choice),
@@ -163,16 +163,11 @@ def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift | None, is
     return PlayedPeriod(other.rate, other.torque, other.position, predicted)
 
 
-def _as_fitted(
-    estimate: Estimate, other: SettledPeriod | None, drift: Drift | None, *, beyond_noise: bool = False
-) -> NDArray[np.float64] | None:
-    """Relative prediction error of the held-out period with the friction of the fitted period; None if it did not
-    change. beyond_noise: whether to exclude encoder noise.
-    """
+def _as_fitted(estimate: Estimate, other: SettledPeriod | None, drift: Drift | None) -> PlayedPeriod | None:
+    """The held-out period predicted with the friction of the fitted period; None if it did not change."""
     if other is None or drift is None or not drift.is_seen:
         return None
-    noise = other.noise if beyond_noise else None
-    return relative_error(other.position, predict_period(estimate, other), noise)
+    return PlayedPeriod(other.rate, other.torque, other.position, predict_period(estimate, other))
 
 
 def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDArray[np.float64]:

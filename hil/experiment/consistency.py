@@ -67,9 +67,9 @@ usual differences.
 STEPS, STEPS_S = 4, 0.5
 """Number of jumps that counts as a fault, and the longest time between them [s]."""
 
-BLOCK_S, MOST_BLOCKS = 0.0099, 3
-"""Shortest time after which the distance covered under an unchanged velocity is noted [s], and the number of such notes
-that are kept: together `LAG_S`.
+BLOCK_S = 0.0099
+"""Shortest time after which the distance covered under an unchanged velocity is noted [s]: the latest three such notes
+reach back by `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
@@ -230,7 +230,7 @@ def _is_frozen(same: Any, moved: float, velocity: float, seconds: float, unknown
     same.since += seconds
     if same.since < BLOCK_S:
         return False
-    notes = min(np.ceil(LAG_S / same.since - 0.05), float(MOST_BLOCKS))
+    notes = np.ceil(LAG_S / same.since - 0.05)
     covered, time = same.d1, same.t1
     if notes >= 2.0:
         covered, time = same.d2, same.t2

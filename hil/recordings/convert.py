@@ -48,8 +48,8 @@ def convert(table: Table, columns: Columns) -> Converted:
     time = _time(table, whole)
     ticks = 0.0 if whole.ticks_per_turn is None else 2.0 * np.pi / whole.ticks_per_turn
     position = np.stack([_quantity(table, name, "position", whole.position_unit, ticks) for name in whole.position])
-    # The unit as the user stated it: that of `whole` may be guessed.
-    refuse_degrees(table.source, time, position, whole.model_copy(update={"position_unit": columns.position_unit}))
+    if columns.position_unit is None:  # that of `whole` may be guessed
+        refuse_degrees(table.source, whole.position, time, position)
     if whole.angles == "absolute":
         position = np.diff(position, axis=0, prepend=0.0)
     torque = np.stack([_torque(table, whole, joint) for joint in range(len(whole.position))])

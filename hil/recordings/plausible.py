@@ -5,11 +5,11 @@ everything if [columns] states the unit.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config.csv_columns import Columns
 from hil.drivers.servo_model import fastest_no_load
 from hil.errors import CsvError
 
@@ -28,16 +28,17 @@ _OVER_S, _USUAL = 0.02, 0.9
 """Time over which speeds are measured, so that noise hardly counts [s], and the fraction of them that is slower."""
 
 
-def refuse_degrees(source: str, time: Values, position: Values, columns: Columns) -> None:
-    """Raise CsvError if `position` (joints, samples) [rad] is beyond what servos do. time: (samples,) [s]."""
-    if columns.position_unit is not None:
-        return
+def refuse_degrees(source: str, names: Sequence[str], time: Values, position: Values) -> None:
+    """Raise CsvError if `position` (joints, samples) [rad] is beyond what servos do.
+
+    names: columns of the positions. time: (samples,) [s].
+    """
     fastest = TIMES_NO_LOAD * fastest_no_load()
-    for name, row in zip(columns.position or (), position, strict=True):
+    for name, row in zip(names, position, strict=True):
         known = np.isfinite(row) & np.isfinite(time)
-        speed, path = _speed(time[known], row[known]), float(np.abs(np.diff(row[known])).sum())
         if not known.any():
             continue
+        speed, path = _speed(time[known], row[known]), float(np.abs(np.diff(row[known])).sum())
         low, high = float(row[known].min()), float(row[known].max())
         rotates = high - low > _ONE_WAY * path
         if speed > fastest:

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from hil.estimator.arrays import Array
+from hil.estimator.arrays import Array, Mask
 
 POSITIVE = {
     "viscous": 1e-3,
@@ -145,7 +145,7 @@ class ChainCoordinates:
         return tuple(kind_of(name) for name in self.names)
 
     @cached_property
-    def positive(self) -> Array:
+    def positive(self) -> Mask:
         """Whether each parameter is positive (parameters,)."""
         return np.array([kind in POSITIVE for kind in self._kinds])
 

@@ -193,15 +193,15 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         )
         trust = "no" if error > TORQUE_WRONG else "with care" if error > TORQUE_FORETOLD else trust
     if found.from_prior:
-        trust = "with care" if trust == "yes" else trust
+        trust = lowered(trust, "with care")
         sentences.append(
             f"The recordings hardly determine {', '.join(found.from_prior)}: these values come from the URDF."
         )
     if said := vague(prior, names, found.std, found.from_prior):
-        trust = "with care" if trust == "yes" else trust
+        trust = lowered(trust, "with care")
         sentences.append(said)
     if found.at_bound:
-        trust = "with care" if trust == "yes" else trust
+        trust = lowered(trust, "with care")
         sentences.append(bound_sentence(found.at_bound))
     # A regression alone does not reveal missing effects.
     explained = not found.simulated or (
@@ -210,7 +210,7 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     trust = lowered(trust, contradicted(found.conflicts, explained))
     sentences += conflict_sentences(found.conflicts, explained)
     if not found.reached:
-        trust = "with care" if trust == "yes" else trust
+        trust = lowered(trust, "with care")
         sentences.append(
             "The fit stopped short of its minimum, where a joint sticks and breaks away; the standard errors include "
             "the distance that remains. Record faster motion, so that fewer joints stick."

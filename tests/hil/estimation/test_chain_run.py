@@ -10,6 +10,7 @@ from xml.etree import ElementTree as ET
 import mujoco
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from rich.console import Console
 
 import hil
@@ -32,7 +33,7 @@ from hil.experiment.run import run_experiment
 from hil.export.formats import export
 from hil.export.posterior import draw_arms
 from hil.export.source import Source
-from hil.plan.chain_model import known_chain
+from hil.plan.chain_model import KnownChain, known_chain
 from hil.plan.chain_plan import make_chain_plan
 from hil.results.parts import Quantity
 from hil.results.result import SettledResult
@@ -311,22 +312,27 @@ def test_an_unfinished_calibration_says_so() -> None:
     assert "stopped short of its minimum" in said[1]
 
 
+def explained(known: KnownChain, std: NDArray[np.float64]) -> Any:
+    """What the verdict needs of an estimate with these standard errors that leaves nothing unexplained."""
+    return SimpleNamespace(
+        model=ChainModel(known.base),
+        std=std,
+        over_noise=np.ones(4),
+        noise_steps=0.29 * np.ones(4),
+        systematic=0.8,
+        reached=True,
+        from_prior=(),
+        unseen=(),
+        at_bound=(),
+        conflicts=(),
+        doubtful_zeros=(),
+    )
+
+
 def test_an_unfinished_fit_is_trusted_with_care(run: RunFolder) -> None:
     config = run.load_config()
     known = known_chain(config)
-    explained = 0.29 * np.ones(4)
-    estimate: Any = SimpleNamespace(
-        **{"std": 0.01 * known.prior.std, "over_noise": np.ones(4), "noise_steps": explained, "systematic": 0.8},
-        **{
-            "from_prior": (),
-            "unseen": (),
-            "reached": True,
-            "model": ChainModel(known.base),
-            "at_bound": (),
-            "conflicts": (),
-            "doubtful_zeros": (),
-        },
-    )
+    estimate = explained(known, 0.01 * known.prior.std)
     verdicts = []
     for estimate.reached in (True, False):
         verdicts.append(_verdict(config, estimate, known, np.full(4, 1e-3), []))
@@ -364,11 +370,7 @@ def test_a_torque_constant_far_from_the_file_lowers_the_verdict(run: RunFolder) 
     value[-2] = 1.0
     link = chain_conflicts(names, value, std, prior)
     assert [each.name for each in link] == [known.base.names[0]]
-    estimate: Any = SimpleNamespace(
-        **{"std": 0.01 * known.prior.std, "over_noise": np.ones(4), "noise_steps": 0.29 * np.ones(4)},
-        **{"from_prior": (), "unseen": (), "reached": True, "model": ChainModel(known.base), "at_bound": ()},
-        **{"doubtful_zeros": ()},
-    )
+    estimate = explained(known, 0.01 * known.prior.std)
     found = {}
     for estimate.systematic in (0.8, 3.0):
         for estimate.conflicts in (ratio, link):
@@ -386,18 +388,7 @@ def test_a_value_less_certain_than_the_description_is_trusted_with_care(run: Run
     known = known_chain(config)
     std = 0.01 * known.prior.std
     std[2] = 1.1 * known.prior.std[2]
-    estimate: Any = SimpleNamespace(
-        **{"std": std, "over_noise": np.ones(4), "noise_steps": 0.29 * np.ones(4), "systematic": 0.8},
-        **{
-            "from_prior": (),
-            "unseen": (),
-            "reached": True,
-            "model": ChainModel(known.base),
-            "at_bound": (),
-            "conflicts": (),
-            "doubtful_zeros": (),
-        },
-    )
+    estimate = explained(known, std)
     verdict = _verdict(config, estimate, known, np.full(4, 1e-3), [])
     assert verdict.trust == "with care"
     assert known.base.names[2] in verdict.sentences[-1]
