@@ -128,10 +128,10 @@ def identify_chain_in_steps(
     Raises what a run raises, and NoSafeTorque.
     """
     with StopRequest(), servo_session(config, run.path, say) as bus:
+        if from_where_it_lies(config, bus.read_positions()) is not config:
+            wait_for_rest(bus)
         lies = from_where_it_lies(config, bus.read_positions())
         if lies is not config:
-            wait_for_rest(bus)
-            lies = from_where_it_lies(config, bus.read_positions())
             say(said_of_the_rest(config, lies))
         search = ChainSearch.of(lies, run, shown_path, watch, say)
         search.step("Pilot", "pilot", PILOT_SHARES)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hil.dry_run.chain_summary import chain_dry_run_lines, unsafe
 from hil.errors import Cause, ConfigError, DidNotMove, NoSafeTorque, NotSettled, SafetyStop
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.estimator.chain.excitation.path_design import Design
+from hil.pilot import chain_search
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import RESERVE, Paths, Reserve, chain_config
 from hil.pilot.chain_rehearsal import rehearse
@@ -331,3 +333,26 @@ def test_a_dry_run_of_more_arms_than_the_prior_has_draws_further_ones() -> None:
     assert arms.size == belief.arms.size + 3
     np.testing.assert_array_equal(arms.rigid[:5], belief.at_least(5).rigid)
     assert not (arms.rigid[-2:] == arms.rigid[1:3]).all(axis=1).any()
+
+
+class _Begun(Exception):
+    pass
+
+
+@pytest.mark.parametrize(("settled", "told"), [(0.0, 0), (0.1, 1)])
+def test_an_arm_that_settles_in_its_rest_pose_is_not_said_to_lie_elsewhere(
+    monkeypatch: pytest.MonkeyPatch, settled: float, told: int
+) -> None:
+    config = load_config(LEG)
+    rest = np.array(config.arm.rest_pose)
+    bus = Mock(read_positions=Mock(side_effect=[rest + 0.1, rest + settled]))
+    session = MagicMock()
+    session.return_value.__enter__.return_value = bus
+    said: list[str] = []
+    monkeypatch.setattr(chain_search, "servo_session", session)
+    monkeypatch.setattr(chain_search, "wait_for_rest", lambda _: "")
+    monkeypatch.setattr(chain_search.ChainSearch, "of", Mock(side_effect=_Begun))
+    with pytest.raises(_Begun):
+        chain_search.identify_chain_in_steps(config, Mock(), LEG, Mock(), said.append)
+    assert len(said) == told
+    assert all("does not lie in arm.rest_pose: '" in each for each in said)
