@@ -56,6 +56,7 @@ class Cause(Enum):
     JUMP = "encoder jump"
     NOT_FOLLOWING = "current does not follow"
     OUT_OF_VOLTAGE = "supply too low for this speed"
+    GOALS_CHANGED = "goals changed on the way"
     TORQUE_OFF = "torque lost"
     WATCHDOG = "servo's watchdog"
     GOALS_LOST = "goals not accepted"
@@ -72,7 +73,9 @@ class Cause(Enum):
     @property
     def allows_braking(self) -> bool:
         """Whether the measured velocity and the commanded current can still be trusted."""
-        return self in {Cause.POSITION, Cause.VELOCITY, Cause.OUT_OF_VOLTAGE, Cause.TEMPERATURE, Cause.VOLTAGE}
+        limits = {Cause.POSITION, Cause.VELOCITY, Cause.TEMPERATURE, Cause.VOLTAGE}
+        # A joint with weakened goals carries less current than commanded, but in the commanded direction.
+        return self in limits or self in {Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED}
 
     @property
     def allows_lowering(self) -> bool:
@@ -140,11 +143,16 @@ class ExperimentError(HilError):
 
 
 class SafetyStop(ExperimentError):
-    """The guard stopped the arm, or a dry run ruled out starting it. Example: joint 2 exceeded its position limit."""
+    """The guard stopped the arm, or a dry run ruled out starting it. Example: joint 2 exceeded its position limit.
+
+    overruled: a servo held goals or settings that this program had not written, so the motion was not that of the
+    commanded torque and reveals nothing about the arm.
+    """
 
     def __init__(self, message: str, cause: Cause) -> None:
         super().__init__(message)
         self.cause = cause
+        self.overruled = False
 
 
 class StopRequested(ExperimentError):

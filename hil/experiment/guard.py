@@ -261,19 +261,22 @@ class Guard:
         has_own_goal = self._status.other_goal(index) is None
         if has_own_goal and model and model.is_out_of_voltage(commanded, carried, velocity):
             slower = f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s"
+            said = f"{said} at {velocity:.2f} rad/s"
             if model.is_out_of_voltage(commanded, carried, velocity, self._supply[index]):
-                why = (
-                    "at that speed its supply cannot drive more current against the back-EMF. Lower velocity_limit to "
-                    f"{slower}, or raise the supply voltage."
+                self._stop(
+                    index,
+                    Cause.OUT_OF_VOLTAGE,
+                    f"{said}: at that speed its supply cannot drive more current against the back-EMF. Lower "
+                    f"velocity_limit to {slower}, or raise the supply voltage.{self._lower_torque}",
                 )
-            else:
-                # Published figures are too uncertain to rule the supply out: the stop is the same.
-                why = (
-                    f"by the published figures {self._supply[index]:.1f} V would drive it at that speed. Its goals are "
-                    "changed on the way or by another program, or its supply sags: check these, or lower "
-                    f"velocity_limit to {slower}."
-                )
-            self._stop(index, Cause.OUT_OF_VOLTAGE, f"{said} at {velocity:.2f} rad/s: {why}{self._lower_torque}")
+            # Published figures are too uncertain to rule the supply out: the arm is braked all the same.
+            self._stop(
+                index,
+                Cause.GOALS_CHANGED,
+                f"{said}: by the published figures {self._supply[index]:.1f} V would drive it at that speed. Its goals "
+                "are changed on the way or by another program, or its supply sags: check these. If neither is so, its "
+                f"motor is weaker than published: lower velocity_limit to {slower}.",
+            )
         seconds = self._joints[index]["found"]
         self._stop(
             index,

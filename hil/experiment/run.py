@@ -193,6 +193,7 @@ def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException) 
         changed = changed_settings(before, settings_now(bus))
         if changed:
             stop.args = (f"{changed} Symptom: {stop}",)
+            stop.overruled = True
 
 
 @contextmanager

@@ -41,7 +41,7 @@ from hil.setup.servo_session import has_moved
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
 _BY_OTHER_GOALS = {
-    *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.UNEXPECTED),
+    *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
 """Causes of a stop that another program's goals may have."""
@@ -140,6 +140,7 @@ class Stream:
         except ExperimentError as error:
             if isinstance(error, SafetyStop) and error.cause in _BY_OTHER_GOALS and self._bus.commanded_by_another:
                 error.add_note(self._bus.commanded_by_another)
+                error.overruled = True
             if self._lowering is not None and may_lower(self._config, error):
                 self._lower(self._lowering, error)
             elif may_brake(self._config, error):

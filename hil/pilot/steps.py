@@ -157,15 +157,18 @@ class Player:
 def tells_of_the_arm(error: ExperimentError) -> bool:
     """Whether the error is informative about the arm, so that another run may follow: limit, no motion, no steady
     motion, a period that differs from the one before.
+
+    What another program or a change of goals on the way has caused is not: a further run with less torque or speed
+    would only hide it.
     """
     if isinstance(error, SafetyStop):
-        return error.cause in _AT_A_LIMIT or error.cause is Cause.UNLIKE_BEFORE
+        return not error.overruled and (error.cause in _AT_A_LIMIT or error.cause is Cause.UNLIKE_BEFORE)
     return isinstance(error, NotSettled | DidNotMove)
 
 
 def _stood_still(config: Config, folder: RunFolder, error: ExperimentError) -> bool:
     """Whether the only unexpected thing was a joint that did not move at all: friction is larger than assumed."""
-    if not isinstance(error, SafetyStop) or error.cause is not Cause.UNEXPECTED:
+    if not isinstance(error, SafetyStop) or error.cause is not Cause.UNEXPECTED or error.overruled:
         return False
     position = load_samples(folder.samples_path, len(config.joints))["position"]
     step = np.array([joint.joint.servo.position_unit for joint in config.joints])

@@ -19,6 +19,7 @@ EXPLAINED = frozenset(
         Cause.JUMP,
         Cause.NOT_FOLLOWING,
         Cause.OUT_OF_VOLTAGE,
+        Cause.GOALS_CHANGED,
         Cause.FROZEN,
         Cause.UNEXPECTED,
         Cause.UNLIKE_BEFORE,

@@ -78,7 +78,10 @@ def test_a_joint_that_gets_faster_ends_it(arm: Arm, more: float, goes_on: bool, 
     assert (slow.goals(MOVING._replace(velocity=(0.0, sign * (0.2 + more)))) is not None) is goes_on
 
 
-ALLOWED = {Cause.POSITION, Cause.VELOCITY, Cause.OUT_OF_VOLTAGE, Cause.TEMPERATURE, Cause.VOLTAGE}
+ALLOWED = {
+    *(Cause.POSITION, Cause.VELOCITY, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED),
+    *(Cause.TEMPERATURE, Cause.VOLTAGE),
+}
 
 
 @pytest.mark.parametrize("cause", Cause)

@@ -14,6 +14,7 @@ import pytest
 import serial
 
 from hil.config.schema import Config, parse_config
+from hil.drivers.bus import ServoBus
 from hil.drivers.errors import TorqueNotOff, WrongModel
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
 from hil.experiment import work
@@ -142,7 +143,19 @@ def test_settings_that_another_program_changed_are_the_cause_that_is_named(
     stop, _ = run_until_stopped(arm(), tmp_path / "run", happens, plan)
     assert str(stop).startswith("Another program changed the settings of a servo during the run (joint 'elbow'")
     assert f"{register} is {value} and was 0" in str(stop) and "Symptom: " in str(stop)
+    assert stop.overruled
     assert_stopped(ports[0])
+
+
+@pytest.mark.parametrize("said", ["Just before, Goal Current of joint 'elbow' was -9 although 3 had been written.", ""])
+def test_a_foreign_goal_just_before_a_stop_is_noted(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ServoBus, "commanded_by_another", said)
+    monkeypatch.setattr(ModelWatch, "look", lambda *_: None)
+    stop, _ = run_until_stopped(arm(), tmp_path / "run", once(lambda: swing_elbow(ports, 25.0)), plan)
+    assert stop.cause is Cause.VELOCITY
+    assert stop.overruled == bool(said) and (said in stop.__notes__) == bool(said)
 
 
 @pytest.mark.parametrize(

@@ -187,10 +187,19 @@ def test_stopping_a_joint_that_broke_free_does_not_cap_the_torque(config: Config
         (DidNotMove("stuck"), True),
         (SafetyStop("hot", Cause.TEMPERATURE), False),
         (SafetyStop("frozen", Cause.FROZEN), False),
+        (SafetyStop("supply", Cause.OUT_OF_VOLTAGE), True),
+        (SafetyStop("weakened", Cause.GOALS_CHANGED), False),
     ],
 )
 def test_which_ends_of_a_run_are_informative(error: ExperimentError, informative: bool) -> None:
     assert tells_of_the_arm(error) is informative
+
+
+@pytest.mark.parametrize("cause", [Cause.POSITION, Cause.VELOCITY, Cause.OUT_OF_VOLTAGE, Cause.UNLIKE_BEFORE])
+def test_no_stop_of_a_joint_that_another_program_commanded_is_informative(cause: Cause) -> None:
+    stop = SafetyStop("another program", cause)
+    stop.overruled = True
+    assert not tells_of_the_arm(stop)
 
 
 def unlike(search: Search, times: int) -> list[Played]:
