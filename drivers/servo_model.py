@@ -253,7 +253,7 @@ _MODELS = (
         "XC330-T288",
         1.0e-3,
         (Stall(9.0, 0.61, 0.76), Stall(11.1, 0.80, 0.92), Stall(12.0, 0.88, 1.00)),
-        _no_load(12.0, 65.0),
+        _no_load(11.1, 65.0),
         min_voltage=5.5,
         fast_sync_read_firmware=46,
         senses_supply=True,

@@ -1,19 +1,22 @@
 """Facts that the SDK's control tables leave out: access, factory values and ranges of registers, and motor constants.
 
-Source: ROBOTIS e-Manual, pages x/<model> (revisions of 2020 to 2024). Three entries differ from what some revisions
-print. The range of Min Voltage Limit, given there as 110 to 300 around a factory value of 95, is 95 to 160 here as on
-the sister models. Protocol Type only accepts 2, because a fake servo does not support any other. Drive Mode accepts bit
-3 (Torque On by Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the others.
+Source: ROBOTIS e-Manual, pages x/<model> and, for the motors, _data/dxl_x_info.yml and
+_includes/common/compatible_dxl/ of its repository ROBOTIS-GIT/emanual (revisions of 2018 to 2024). Where they differ
+from what some revisions print: the range of Min Voltage Limit, given there as 110 to 300 around a factory value of 95,
+is 95 to 160 here as on the sister models. Protocol Type only accepts 2, because a fake servo does not support any
+other. Drive Mode accepts bit 3 (Torque On by Goal Update), which is on the page of the XL430-W250 but missing from
+older revisions of the others. Velocity Limit of the XH430-W210 is that of the XD430-T210, whose control table is
+identical by the manual; the oldest page of the XH430-W210 prints 360.
 
 Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
-tens of percent, which is enough to make a position move look right. The XC330-T288's stall current is uncertain.
-
-A model without its own facts uses those of a sister model, named in `STANDS_FOR`: its factory values and ranges are
-uncertain.
+tens of percent, which is enough to make a position move look right. The XC330s' stall currents are uncertain: their
+sensor is in the supply line.
 """
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,24 +28,41 @@ class RegisterFacts:
     writable: bool = True
 
 
+class Motor(NamedTuple):
+    """A motor's figures as published for the nominal voltage [V]: stall current [A], no-load speed of the output
+    shaft [rev/min].
+    """
+
+    voltage_v: float
+    stall_a: float
+    no_load_rpm: float
+
+    @property
+    def resistance_ohm(self) -> float:
+        """Resistance between its terminals [ohm]."""
+        return round(self.voltage_v / self.stall_a, 1)
+
+    @property
+    def back_emf_v_s(self) -> float:
+        """Back-EMF per velocity of the output shaft [V s/rad]."""
+        return float(f"{self.voltage_v / (self.no_load_rpm * math.tau / 60):.3g}")
+
+
 @dataclass(frozen=True, slots=True)
 class ModelFacts:
     """What distinguishes one model.
 
+    motor: its motor at the nominal voltage.
+    differs: registers whose facts differ from those of the X series.
     current_unit_a: current per tick of Goal and Present Current [A].
     fast_read_firmware: first firmware with fast reads and Control Table Backup.
-    resistance_ohm: resistance of the motor [ohm].
-    back_emf_v_s: back-EMF per velocity of the output shaft [V s/rad].
-    differs: registers whose facts differ from those of the X series.
     """
 
-    current_unit_a: float
-    fast_read_firmware: int
-    resistance_ohm: float
-    back_emf_v_s: float
+    motor: Motor
     differs: Mapping[str, RegisterFacts] = field(default_factory=dict)
+    current_unit_a: float = 2.69e-3
+    fast_read_firmware: int = 45
     operating_modes: frozenset[int] = frozenset({0, 1, 3, 4, 5, 16})
-    nominal_voltage_v: float = 12.0
     senses_supply: bool = False
     """Whether Present Current is the supply current instead of the motor current (330 series)."""
     indirect: tuple[tuple[int, int, int], ...] = ((168, 224, 28), (578, 634, 28))
@@ -129,113 +149,111 @@ X_SERIES: Mapping[str, RegisterFacts] = {
     "Backup Ready": _READ_ONLY,
 }
 
-_330 = {
-    "Baud Rate": _Facts(1, (0, 6)),
-    "Temperature Limit": _Facts(70, (0, 100)),
-}
+
+def _volts(low: int, factory_low: int, high: int) -> dict[str, RegisterFacts]:
+    return {"Max Voltage Limit": _Facts(high, (low, high)), "Min Voltage Limit": _Facts(factory_low, (low, high))}
+
+
+def _gains(
+    *, velocity_i: int = 1920, velocity_p: int = 100, d: int = 0, i: int = 0, p: int = 800
+) -> dict[str, RegisterFacts]:
+    return {
+        "Velocity I Gain": _Facts(velocity_i, _GAIN),
+        "Velocity P Gain": _Facts(velocity_p, _GAIN),
+        "Position D Gain": _Facts(d, _GAIN),
+        "Position I Gain": _Facts(i, _GAIN),
+        "Position P Gain": _Facts(p, _GAIN),
+    }
+
+
+def _x430(motor: Motor, velocity: int, current: int = 1193, p: int = 800) -> ModelFacts:
+    """XM, XH, XD and XW models, also the 540 series. velocity, current: the factory's limits [ticks]."""
+    differs = {"Velocity Limit": _Facts(velocity, (0, 1023)), "Current Limit": _Facts(current, (0, current))}
+    return ModelFacts(motor, differs | _gains(p=p))
+
+
+def _x330(motor: Motor, velocity: int, current: int, differs: Mapping[str, RegisterFacts]) -> ModelFacts:
+    common = {
+        "Baud Rate": _Facts(1, (0, 6)),
+        "Temperature Limit": _Facts(70, (0, 100)),
+        "Velocity Limit": _Facts(velocity, (0, 2047)),
+        "Current Limit": _Facts(current, (0, current)),
+    }
+    return ModelFacts(
+        motor,
+        {**common, **differs},
+        current_unit_a=1.0e-3,
+        fast_read_firmware=46,
+        indirect=((168, 208, 20),),
+        older_indirect=((168, 224, 20),),
+    )
+
+
+def _xl330(motor: Motor, velocity: int, gains: Mapping[str, RegisterFacts]) -> ModelFacts:
+    return _x330(motor, velocity, 1750, {**_volts(31, 35, 70), "Shutdown": _Facts(53), **gains})
+
+
+def _xc330(motor: Motor, velocity: int, gains: Mapping[str, RegisterFacts]) -> ModelFacts:
+    """M models for 5 V, T models for 12 V."""
+    if motor.voltage_v < _LEAST_OF_T:
+        facts = _x330(motor, velocity, 2352, {**_volts(31, 35, 70), **gains})
+    else:
+        facts = _x330(motor, velocity, 910, {**_volts(55, 55, 140), "PWM Slope": _Facts(255, (1, 255)), **gains})
+    return replace(facts, senses_supply=True)
+
+
+def _voltage_driven(motor: Motor, differs: Mapping[str, RegisterFacts]) -> ModelFacts:
+    """Models without a current sensor."""
+    return ModelFacts(motor, differs, current_unit_a=0.0, operating_modes=frozenset({1, 3, 4, 16}))
+
+
+_LEAST_OF_T = 9.0  # V
 
 FACTS: Mapping[str, ModelFacts] = {
-    "XM430-W350": ModelFacts(2.69e-3, 45, 5.2, 2.49),
-    "XM430-W210": ModelFacts(2.69e-3, 45, 5.2, 1.49, {"Velocity Limit": _Facts(330, (0, 1023))}),
-    "XH430-W350": ModelFacts(
-        2.69e-3,
-        45,
-        9.2,
-        3.82,
-        {
-            "Current Limit": _Facts(648, (0, 648)),
-            "Velocity Limit": _Facts(130, (0, 1023)),
-            "Position P Gain": _Facts(900, _GAIN),
-        },
-    ),
-    "XM540-W270": ModelFacts(
-        2.69e-3,
-        45,
-        2.7,
-        3.82,
-        {"Current Limit": _Facts(2047, (0, 2047)), "Velocity Limit": _Facts(128, (0, 1023))},
-    ),
-    "XL330-M288": ModelFacts(
-        1.0e-3,
-        46,
-        3.4,
-        0.464,
-        {
-            **_330,
-            "Max Voltage Limit": _Facts(70, (31, 70)),
-            "Min Voltage Limit": _Facts(35, (31, 70)),
-            "Current Limit": _Facts(1750, (0, 1750)),
-            "Velocity Limit": _Facts(445, (0, 2047)),
-            "Shutdown": _Facts(53),
-            "Velocity I Gain": _Facts(1600, _GAIN),
-            "Velocity P Gain": _Facts(180, _GAIN),
-            "Position P Gain": _Facts(400, _GAIN),
-        },
-        nominal_voltage_v=5.0,
-        indirect=((168, 208, 20),),
-        older_indirect=((168, 224, 20),),
-    ),
-    "XC330-T288": ModelFacts(
-        1.0e-3,
-        46,
-        13.9,
-        1.63,
-        {
-            **_330,
-            "Max Voltage Limit": _Facts(140, (55, 140)),
-            "Min Voltage Limit": _Facts(55, (55, 140)),
-            "Current Limit": _Facts(910, (0, 910)),
-            "Velocity Limit": _Facts(320, (0, 2047)),
-            "PWM Slope": _Facts(255, (1, 255)),
-            "Velocity I Gain": _Facts(1200, _GAIN),
-            "Velocity P Gain": _Facts(40, _GAIN),
-            "Position P Gain": _Facts(900, _GAIN),
-        },
-        nominal_voltage_v=11.1,
-        senses_supply=True,
-        indirect=((168, 208, 20),),
-        older_indirect=((168, 224, 20),),
-    ),
-    "XL430-W250": ModelFacts(
-        0.0,
-        45,
-        8.5,
-        1.86,
+    "XM430-W350": _x430(Motor(12.0, 2.3, 46), 200),
+    "XM430-W210": _x430(Motor(12.0, 2.3, 77), 330),
+    "XH430-W350": _x430(Motor(12.0, 1.3, 30), 130, 648, p=900),
+    "XM540-W270": _x430(Motor(12.0, 4.4, 30), 128, 2047),
+    "XL330-M288": _xl330(Motor(5.0, 1.47, 103), 445, _gains(velocity_i=1600, velocity_p=180, p=400)),
+    "XC330-T288": _xc330(Motor(11.1, 0.80, 65), 320, _gains(velocity_i=1200, velocity_p=40, p=900)),
+    "XL430-W250": _voltage_driven(
+        Motor(11.1, 1.3, 57),
         {
             "Temperature Limit": _Facts(72, (0, 100)),
-            "Max Voltage Limit": _Facts(140, (60, 140)),
-            "Min Voltage Limit": _Facts(60, (60, 140)),
+            **_volts(60, 60, 140),
             "Velocity Limit": _Facts(265, (0, 1023)),
-            "Velocity I Gain": _Facts(1000, _GAIN),
-            "Position D Gain": _Facts(4000, _GAIN),
-            "Position P Gain": _Facts(640, _GAIN),
+            **_gains(velocity_i=1000, d=4000, p=640),
         },
-        operating_modes=frozenset({1, 3, 4, 16}),
-        nominal_voltage_v=11.1,
+    ),
+    "XH430-W210": _x430(Motor(12.0, 1.3, 50), 210, 648, p=900),
+    "XD430-T350": _x430(Motor(12.0, 1.3, 30), 130, 648, p=900),
+    "XD430-T210": _x430(Motor(12.0, 1.3, 50), 210, 648, p=900),
+    "XW430-T333": _x430(Motor(12.0, 1.3, 31), 139, 2047, p=900),
+    "XM540-W150": _x430(Motor(12.0, 4.4, 53), 230, 2047),
+    "XH540-W270": _x430(Motor(12.0, 4.9, 39), 167, 2047),
+    "XH540-W150": _x430(Motor(12.0, 4.9, 70), 300, 2047),
+    "XD540-T270": _x430(Motor(12.0, 4.9, 39), 167, 2047),
+    "XD540-T150": _x430(Motor(12.0, 4.9, 70), 300, 2047),
+    "XW540-T260": _x430(Motor(12.0, 4.9, 40), 167, 2047),
+    "XW540-T140": _x430(Motor(12.0, 4.9, 72), 304, 2047),
+    "XL330-M077": _xl330(Motor(5.0, 1.47, 383), 1620, _gains(velocity_i=400, velocity_p=40, i=400, p=400)),
+    "XC330-T181": _xc330(Motor(11.1, 0.80, 104), 510, _gains(velocity_i=1200, velocity_p=40, p=900)),
+    "XC330-M181": _xc330(Motor(5.0, 1.80, 129), 545, _gains(velocity_i=1400, d=500, p=1200)),
+    "XC330-M288": _xc330(Motor(5.0, 1.80, 81), 350, _gains(velocity_i=1600, velocity_p=50, d=500, p=1100)),
+    "XC430-W150": _voltage_driven(
+        Motor(12.0, 1.4, 106),
+        {
+            **_volts(60, 60, 160),
+            "Moving Threshold": _Facts(20, (0, 1023)),
+            "Velocity Limit": _Facts(460, (0, 1023)),
+            **_gains(p=460),
+        },
+    ),
+    "XC430-W240": _voltage_driven(
+        Motor(12.0, 1.4, 70), {**_volts(60, 60, 160), "Velocity Limit": _Facts(306, (0, 1023)), **_gains(p=700)}
     ),
 }
-
-STANDS_FOR: Mapping[str, str] = {
-    "XH430-W210": "XM430-W210",
-    "XD430-T210": "XM430-W210",
-    "XD430-T350": "XH430-W350",
-    "XW430-T200": "XM430-W210",
-    "XW430-T333": "XM430-W350",
-    "XM540-W150": "XM540-W270",
-    "XH540-W150": "XM540-W270",
-    "XH540-W270": "XM540-W270",
-    "XD540-T150": "XM540-W270",
-    "XD540-T270": "XM540-W270",
-    "XW540-T140": "XM540-W270",
-    "XW540-T260": "XM540-W270",
-    "XL330-M077": "XL330-M288",
-    "XC330-M181": "XC330-T288",
-    "XC330-M288": "XC330-T288",
-    "XC330-T181": "XC330-T288",
-    "XC430-W150": "XL430-W250",
-    "XC430-W240": "XL430-W250",
-}
-"""Models without their own facts, and the sister model whose factory values and ranges they assume."""
+"""Every model of the X series for 5 to 12 V that the SDK has a number for, and one motor."""
 
 _STRENGTH = (0, 1023)
 

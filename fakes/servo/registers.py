@@ -20,7 +20,6 @@ from hil.fakes.servo.model_facts import (
     NEVER,
     OTHER_SERIES,
     REVERSES_ALL,
-    STANDS_FOR,
     X_SERIES,
     ModelFacts,
     RegisterFacts,
@@ -100,7 +99,7 @@ def load_model(name: str, firmware: int = DEFAULT_FIRMWARE) -> EmulatedModel:
 def _load_model(name: str, older: bool) -> EmulatedModel:
     if name not in model_names().values():
         raise KeyError(name)
-    facts = FACTS.get(STANDS_FOR.get(name, name))
+    facts = FACTS.get(name)
     if facts is None:
         return _unknown(name)
     return _x_series(name, facts, (facts.older_indirect or facts.indirect) if older else facts.indirect)
@@ -123,9 +122,9 @@ def _x_series(name: str, facts: ModelFacts, indirect: tuple[tuple[int, int, int]
         current_unit_a=facts.current_unit_a,
         operating_modes=facts.operating_modes,
         fast_read_firmware=facts.fast_read_firmware,
-        nominal_voltage_v=facts.nominal_voltage_v,
-        resistance_ohm=facts.resistance_ohm,
-        back_emf_v_s=facts.back_emf_v_s,
+        nominal_voltage_v=facts.motor.voltage_v,
+        resistance_ohm=facts.motor.resistance_ohm,
+        back_emf_v_s=facts.motor.back_emf_v_s,
         senses_supply=facts.senses_supply,
         indirect=indirect,
         reverses_all=name.startswith(REVERSES_ALL),

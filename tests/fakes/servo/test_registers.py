@@ -29,19 +29,45 @@ def test_xm430_w350_is_the_manuals() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "number", "current_limit"),
+    ("name", "number", "current_limit", "velocity_limit", "gains"),
     [
-        ("XM430-W210", 1030, 1193),
-        ("XH430-W350", 1000, 648),
-        ("XM540-W270", 1120, 2047),
-        ("XL330-M288", 1200, 1750),
-        ("XC330-T288", 1220, 910),
+        ("XM430-W210", 1030, 1193, 330, (1920, 100, 0, 0, 800)),
+        ("XH430-W350", 1000, 648, 130, (1920, 100, 0, 0, 900)),
+        ("XH430-W210", 1010, 648, 210, (1920, 100, 0, 0, 900)),
+        ("XW430-T333", 1270, 2047, 139, (1920, 100, 0, 0, 900)),
+        ("XM540-W270", 1120, 2047, 128, (1920, 100, 0, 0, 800)),
+        ("XM540-W150", 1130, 2047, 230, (1920, 100, 0, 0, 800)),
+        ("XH540-W150", 1110, 2047, 300, (1920, 100, 0, 0, 800)),
+        ("XW540-T140", 1180, 2047, 304, (1920, 100, 0, 0, 800)),
+        ("XL330-M288", 1200, 1750, 445, (1600, 180, 0, 0, 400)),
+        ("XL330-M077", 1190, 1750, 1620, (400, 40, 0, 400, 400)),
+        ("XC330-T288", 1220, 910, 320, (1200, 40, 0, 0, 900)),
+        ("XC330-T181", 1210, 910, 510, (1200, 40, 0, 0, 900)),
+        ("XC330-M181", 1230, 2352, 545, (1400, 100, 500, 0, 1200)),
+        ("XC330-M288", 1240, 2352, 350, (1600, 50, 500, 0, 1100)),
     ],
 )
-def test_other_models(name: str, number: int, current_limit: int) -> None:
+def test_other_models(name: str, number: int, current_limit: int, velocity_limit: int, gains: tuple[int, ...]) -> None:
     model = load_model(name)
     assert model.number == number
-    assert model.registers["Current Limit"].initial == current_limit
+    assert model.registers["Current Limit"].initial == model.registers["Current Limit"].maximum == current_limit
+    assert model.registers["Velocity Limit"].initial == velocity_limit
+    kinds = ("Velocity I", "Velocity P", "Position D", "Position I", "Position P")
+    assert tuple(model.registers[f"{kind} Gain"].initial for kind in kinds) == gains
+
+
+@pytest.mark.parametrize(
+    ("name", "voltage", "velocity_limit", "position_p", "moving"),
+    [("XC430-W150", (60, 160), 460, 460, 20), ("XC430-W240", (60, 160), 306, 700, 10)],
+)
+def test_models_without_current_sensor(
+    name: str, voltage: tuple[int, int], velocity_limit: int, position_p: int, moving: int
+) -> None:
+    registers = load_model(name).registers
+    assert (registers["Min Voltage Limit"].initial, registers["Max Voltage Limit"].initial) == voltage
+    wanted = {"Velocity Limit": velocity_limit, "Position P Gain": position_p, "Moving Threshold": moving}
+    assert {each: registers[each].initial for each in wanted} == wanted
+    assert "Current Limit" not in registers
 
 
 def test_xl430_has_no_current() -> None:
