@@ -2,7 +2,6 @@
 
 import json
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
@@ -19,6 +18,7 @@ from hil.next_step import command, only_steps, steps_of
 from hil.results.json_form import FormError, from_json
 from hil.results.parts import ArmFacts, ChainFacts, Quantity
 from hil.results.result import SCHEMA, Result, SettledResult, result_from_json
+from hil.toml_file import TomlFileError, parse_toml, read_toml_text
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -27,12 +27,13 @@ def _read(path: Path) -> dict[str, Any]:
     if path.is_dir() and not file.is_file():
         raise ResultError(_no_result(path))
     try:
-        text = file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise ResultError(f"{file} cannot be read: {reason}.") from error
+        text = read_toml_text(file)
+    except TomlFileError as error:
+        raise ResultError(str(error)) from error
     try:
-        result = tomllib.loads(text) if file.suffix == ".toml" else json.loads(text)
+        result = parse_toml(text, file) if file.suffix.lower() == ".toml" else json.loads(text)
+    except TomlFileError as error:
+        raise ResultError(f"{error}\nRecreate it with hil export RUN --format toml.") from error
     except (ValueError, RecursionError) as error:
         raise ResultError(f"{file} is incomplete or damaged: {error}. Recreate it with hil estimate RUN.") from error
     if not isinstance(result, dict) or "schema" not in result:

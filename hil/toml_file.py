@@ -57,10 +57,10 @@ def _not_toml(path: Path, error: Exception, text: str) -> str:
     kind = other.get(path.suffix.lower())
     if kind is not None:
         return f"{path}: judging by its name, it is {kind}; hil's files are TOML. `hil init` writes one."
-    lines = text.splitlines()
+    lines = text.split("\n")
     place = re.search(r"at line (\d+)", str(error))
     number = int(place[1]) if place else len(lines)
-    if again := _given_twice(str(error), lines, number):
+    if again := _given_twice(str(error), text, number):
         return f"{path}: not valid TOML: {again}."
     if place is None or not 0 < number <= len(lines):
         return f"{path}: not valid TOML: {error}."
@@ -69,39 +69,61 @@ def _not_toml(path: Path, error: Exception, text: str) -> str:
     return f"{path}: not valid TOML: {error}:\n  {line}" + (f"\n{cause}" if cause else "")
 
 
-def _given_twice(error: str, lines: list[str], number: int) -> str:
-    """Name the key or table that line `number` gives for a second time; "" if the error is another one."""
+def _given_twice(error: str, text: str, number: int) -> str:
+    """Name the key or table that the statement ending on line `number` gives for a second time; "" for other errors."""
     if not error.startswith(("Cannot overwrite", "Cannot declare")):
         return ""
-    own = _given_in(lines, number)
-    if own is None:
-        return ""
-    first = next((each for each in range(1, number) if _given_in(lines, each) == own), None)
-    table, key = own
-    shown = key or table
-    where = f" in {table}" if key and table else ""
-    if first is not None:
-        return f"{shown} is given twice{where}, in lines {first} and {number}. Delete one of them"
-    return f"{shown} in line {number} is already given{where}, in another form. Delete one of them"
-
-
-def _given_in(lines: list[str], number: int) -> tuple[str, str] | None:
-    """Table, as in a message, and key that a line gives, counted from 1; None for other lines.
-
-    The key of a header is "". Each [[header]] begins another table of the same name.
-    """
+    lines, begins = text.split("\n"), _beginnings(text)
+    number = max((each for each in begins if each <= number), default=number)
     table = ""
-    for count, line in enumerate(lines[:number], 1):
-        if header := _HEADER.match(line):
-            table = f"[{header[2]}]" if header[1] == "[" else f"the [[{header[2]}]] of line {count}"
-    line = lines[number - 1] if 0 < number <= len(lines) else ""
-    if _HEADER.match(line):
-        return table, ""
-    key = _KEY.match(line)
-    return None if key is None else (table, key[1])
+    given: dict[tuple[str, str], int] = {}
+    for count in begins:
+        header, key = _HEADER.match(lines[count - 1]), _KEY.match(lines[count - 1])
+        if header is None and key is None:
+            continue
+        what = key[1] if key else f"{header[1]}{header[2]}{header[3]}" if header else ""
+        within = table if key else ""
+        if count == number:
+            return _repeated(what, within, number, given.get((within, what)))
+        given[within, what] = count
+        if header:
+            table = what
+        if header and header[1] == "[[":  # this table, and those in it, are new ones
+            given = {each: at for each, at in given.items() if not _is_within(each, header[2])}
+            table = f"the {what} of line {count}"
+    return ""
 
 
-_HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]")
+def _repeated(what: str, table: str, number: int, first: int | None) -> str:
+    where = f" in {table}" if table else ""
+    if first is None:
+        return f"{what} in line {number} is already given{where}, in another form. Delete one of them"
+    return f"{what} is given twice{where}, in lines {first} and {number}. Delete one of them"
+
+
+def _is_within(given: tuple[str, str], name: str) -> bool:
+    """Whether a table and key belong to the tables `name`; the key of a header is the header, its table ""."""
+    table, key = given
+    return re.match(rf"(?:the )?\[\[?{re.escape(name)}[\].]", table or key) is not None
+
+
+def _beginnings(text: str) -> list[int]:
+    """Numbers of the lines, from 1, on which a statement begins: those within a value of several lines do not count."""
+    found, line, depth = [1], 1, 0
+    for token in _TOKEN.findall(text):
+        line += token.count("\n")
+        depth += (token in "[{") - (token in "]}")
+        if token == "\n" and depth <= 0:
+            found.append(line)
+    return found
+
+
+_TOKEN = re.compile(
+    r'"""(?:\\.|[^\\])*?"""|\'\'\'.*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*|[\[\]{}\n]', re.DOTALL
+)
+"""Strings, comments, brackets and line ends."""
+
+_HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*(\]\]?)")
 _KEY = re.compile(r"^\s*([\w.\"'-]+)\s*=")
 _NUMBER = r"[-+]?\d[\d_.]*(?:[eE][-+]?\d+)?"
 _SYNTAX = (

@@ -86,10 +86,15 @@ def _interpolated_noise(valid: Mask) -> float:
     """Return the estimate for white noise with a standard deviation of 1, interpolated except at `valid` (samples,)."""
     if valid.all() or not valid.any():
         return 1.0
+    return float(np.sqrt(np.mean(np.square(_upper_noise(interpolated_noise(valid))))))
+
+
+def interpolated_noise(valid: Mask) -> Array:
+    """Return white noise with a standard deviation of 1 (draws, samples), interpolated except at `valid` (samples,)."""
     index = np.arange(valid.size)
     drawn = np.random.default_rng(_DRAWS).standard_normal((_DRAWS, valid.size))
     drawn[:, ~valid] = [np.interp(index[~valid], index[valid], row[valid]) for row in drawn]
-    return float(np.sqrt(np.mean(np.square(_upper_noise(drawn)))))
+    return drawn
 
 
 def _jump(position: Array) -> Array:

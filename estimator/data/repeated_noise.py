@@ -12,6 +12,10 @@ where the sum is the part of the rounding error's power 1/12 that repeats (Fouri
 Widrow and I. Kollar, Quantization Noise, 2008). The drift is the slow part of the difference and is caused by
 changing friction. Solving for s gives the error variance of one reading, s^2 + 1/12. It is an upper bound, since other
 differences between the passes increase it.
+
+That is the noise if it is white before rounding. Noise that a servo has filtered is stronger at low frequencies; what
+it has there in excess of the fast part is measured by the same difference, except where drift may be
+(`coloured_noise`).
 """
 
 from collections.abc import Sequence
@@ -20,9 +24,9 @@ from itertools import pairwise
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.data.fourier import slow_part, white_noise, without_jump
+from hil.estimator.data.fourier import interpolated_noise, slow_part, white_noise, without_jump
 
-__all__ = ["agreed_noise", "repeated_noise"]
+__all__ = ["agreed_noise", "coloured_noise", "repeated_noise"]
 
 FEWEST = 32  # samples of a pass
 ROUNDING = 1.0 / 12.0  # steps^2
@@ -36,6 +40,8 @@ _HEIGHTS *= ROUNDING / _HEIGHTS.sum()  # the series is truncated
 _REPEATS = _HEIGHTS * np.exp(-((2.0 * np.pi * _ORDERS * _STD[:, None]) ** 2))
 """Power of each order of the rounding error that repeats at each of `_STD`, without drift (stds, orders) [steps^2]."""
 _SLOW = 1.0 / 16.0  # fraction of the lines that drift may occupy
+_CHANGE = 0.03  # largest relative change of the motion from pass to pass
+_OCTAVE = 4.0  # largest ratio of the powers of noise in successive octaves: that of a first-order filter
 _MOST_NOISE = 1.0  # exponent of the correction for noise in the drift; above it, an order counts as decorrelated
 
 
@@ -61,6 +67,65 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
     # Drift by half a step reverses the rounding error between successive passes, but not across all passes.
     noise: Array = step * np.sqrt((differs + repeats) / count + (1.0 - 1.0 / count) * np.maximum(repeats, 0.0))
     return noise
+
+
+def coloured_noise(passes: Sequence[Array], averaged: int = 1) -> Array | None:
+    """Return the standard deviation of one mean sample's noise in excess of white noise (joints,) [rad].
+
+    It is 0 unless significant. On the lines on which the motion may have changed from pass to pass, the noise is
+    assumed to exceed that of the octave above by as much as that exceeds the next one's; if its correlation is long, it
+    is underestimated. Arguments and None: as for `repeated_noise`.
+    """
+    if len(passes) < 2 or passes[0].shape[1] < FEWEST:
+        return None
+    found = [[_excess(*joint) for joint in zip(*each, strict=True)] for each in pairwise(passes)]
+    excess, error = np.mean(found, axis=0).T / (2.0 * averaged)
+    noise: Array = np.sqrt(np.where(excess > AGREE * error, excess, 0.0))
+    return noise
+
+
+def _excess(former: Array, later: Array) -> tuple[float, float]:
+    """Return the power of the difference of two passes (samples,) beyond that of its fast part, and its standard error
+    if the noise is white.
+    """
+    difference = later - former
+    valid = np.isfinite(difference)
+    power = _spectrum(without_jump(_filled(difference[None])))
+    fast = float(power[0, _fastest(power) :].mean())
+    motion = _filled(0.5 * (former + later)[None])
+    window = np.hanning(valid.size) * np.sqrt(8.0 / 3.0)
+    strong = np.flatnonzero(2.0 * _CHANGE**2 * _spectrum(window * (motion - motion.mean()))[0] > fast)
+    slow = max(int(_SLOW * power.shape[1]), int(strong[-1]) + 1 if strong.size else 1, 1)
+    if 4 * slow > _fastest(power) or not valid.any():
+        return 0.0, 0.0
+    excess = float(_beyond_fast(power, slow)[0])
+    if not valid.all():  # interpolation leaves less of fast noise than of slow noise
+        like = _spectrum(interpolated_noise(valid))
+        excess -= fast * float(np.mean(_beyond_fast(like, slow)) / np.mean(like[:, _fastest(like) :]))
+    return excess, fast * float(np.sqrt((0.75 + 0.75**2 / 0.25) / power.shape[1]))
+
+
+def _spectrum(signal: Array) -> Array:
+    """Return the power of each line of signals (rows, samples), the mean of which is the variance of white noise."""
+    power: Array = np.square(np.abs(np.fft.rfft(signal, axis=1))) / signal.shape[1]
+    return power
+
+
+def _fastest(power: Array) -> int:
+    """Return the first line of the fastest quarter of a spectrum (rows, lines)."""
+    return 3 * power.shape[1] // 4
+
+
+def _beyond_fast(power: Array, slow: int) -> Array:
+    """Return the power of signals beyond that of white noise as in their fastest quarter (rows,); power: their spectrum
+    (rows, lines), whose first `slow` lines may contain more than noise.
+    """
+    fastest = _fastest(power)
+    fast, above = power[:, fastest:].mean(axis=1), power[:, slow : 2 * slow].mean(axis=1)
+    steeper = np.clip(above / np.maximum(power[:, 2 * slow : 4 * slow].mean(axis=1), 1e-300), 1.0, _OCTAVE)
+    below = slow * np.minimum(steeper * above, power[:, 1 : slow + 1].mean(axis=1))
+    beyond: Array = (below + power[:, slow:fastest].sum(axis=1) - fastest * fast) / power.shape[1]
+    return beyond
 
 
 def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:

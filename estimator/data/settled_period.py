@@ -53,6 +53,8 @@ class SettledPeriod:
     """Standard deviation of one sample's error from the difference between successive periods (joints,) [rad], if known
     (`hil.estimator.data.repeated_noise`).
     """
+    coloured_noise: Array | None = None
+    """The part of that error which is not white (joints,) [rad], from the same difference, if known."""
     stabiliser: Stabilised | None = None
     """The software stabiliser, if one produced part of `torque`.
 
@@ -67,7 +69,8 @@ class SettledPeriod:
     valid: Mask = field(init=False)
     """Whether each sample was received (joints, samples)."""
     noise: Array = field(init=False)
-    """Standard deviation of one sample's error (joints,) [rad]: the measured white noise, at least that of rounding.
+    """Standard deviation of one sample's error (joints,) [rad]: the measured white noise, at least that of rounding,
+    and coloured noise.
 
     The fastest lines of a motion sampled slowly are no noise: what repeats from period to period does not count.
     """
@@ -79,7 +82,8 @@ class SettledPeriod:
         _check_motion(self)
         rounding = self.position_step / np.sqrt(12.0)
         white = agreed_noise(white_noise(self.filled(), self.valid), self.repeated_noise, self.samples)
-        object.__setattr__(self, "noise", np.maximum(white, rounding))
+        coloured = 0.0 if self.coloured_noise is None else self.coloured_noise
+        object.__setattr__(self, "noise", np.hypot(np.maximum(white, rounding), coloured))
 
     @property
     def joints(self) -> int:
@@ -151,7 +155,7 @@ def _check_shapes(period: SettledPeriod) -> None:
     per_joint = (period.position.shape[0],)
     if period.position_step.shape != per_joint:
         raise ShapeError(f"position_step has shape {period.position_step.shape}; it must be {per_joint}: one per joint")
-    for name in ("position_std", "repeated_noise"):
+    for name in ("position_std", "repeated_noise", "coloured_noise"):
         std = getattr(period, name)
         if std is not None and std.shape != per_joint:
             raise ShapeError(f"{name} has shape {std.shape}; it must be {per_joint}: one per joint")

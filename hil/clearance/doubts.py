@@ -32,6 +32,6 @@ def _weak(joint: JointConfig) -> str:
     unit = joint.drive_mode.goal_unit
     return (
         f"{joint.goal_limit_name} of joint {joint.name!r} = {joint.goal_limit:g} {unit} allows at most {torque:.2g} "
-        f"N m, less than the typical dry friction of its servos, {friction:.2g} N m: it would not move. At least "
-        f"{2.0 * friction / joint.torque_per_goal:.2g} {unit} are needed to move it, more to lift a load."
+        f"N m, no more than the typical dry friction of its servos, {friction:.2g} N m: it probably would not move. "
+        f"About {2.0 * friction / joint.torque_per_goal:.2g} {unit} move it without a load, more lift one."
     )

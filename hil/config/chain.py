@@ -56,7 +56,8 @@ def doubted_limits(config: "Config") -> Iterator[str]:
         lower, upper = described.limits
         where = f'{arm.path.name}: joint "{joint.name}": its limits are [{lower:g}, {upper:g}] rad'
         if lower >= upper:
-            yield f"{where}, the lower one first: they are the wrong way round. They are ignored; correct them."
+            wrong = ": they are equal" if lower == upper else ", the lower one first: they are the wrong way round"
+            yield f"{where}{wrong}. They are ignored; correct them."
             continue
         low, high = joint.position_limit
         free = POSITION_RESERVE * (high - low)

@@ -8,6 +8,9 @@ from hil.config.table import BusId, OneOrList, Range, Table
 from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import SERVO_MODELS, Mode, servo_model
 
+USUAL_TORQUE_SPREAD = 0.1
+"""Relative standard deviation of the torque constant among servos of one model."""
+
 
 class JointConfig(Table):
     """`[[joints]]`: one joint, from the base outwards."""
@@ -106,6 +109,14 @@ class JointConfig(Table):
     @property
     def torque_per_goal_std(self) -> float:
         return self.torque_per_volt_std if self.drive_mode is Mode.PWM else self.torque_constant_std
+
+    @property
+    def torque_spread(self) -> float:
+        """Relative standard deviation of the torque per goal: as given, or that among servos of one model."""
+        name = "torque_per_volt_std" if self.drive_mode is Mode.PWM else "torque_constant_std"
+        if name not in self.model_fields_set:
+            return USUAL_TORQUE_SPREAD
+        return self.torque_per_goal_std / self.torque_per_goal
 
     @property
     def goal_limit_name(self) -> str:

@@ -13,7 +13,7 @@ from hil.drivers.servo_prior import servo_prior
 from hil.estimator.chain.model.dynamics import TERMS
 from hil.estimator.chain.model.late_torque import MOST_LOST
 from hil.estimator.chain.simulation.rollout import ChainArms
-from hil.plan.chain_model import KnownChain
+from hil.plan.chain_model import KnownChain, torque_constant_stds
 
 Array = NDArray[np.float64]
 
@@ -38,8 +38,7 @@ def prior_arms(config: Config, known: KnownChain, count: int, seed: int = 0) -> 
     drive[:, 2] = OFFSET_PER_COULOMB * drive[:, 1] * random.standard_normal((count, n))
     drive[0, 2] = 0.0
     drive[:, 3] = COULOMB_WIDTH
-    scale = np.array([joint.torque_per_goal_std / joint.torque_per_goal for joint in config.joints])
-    drive[:, 4] = _log_normal(random, np.ones(n), scale, count)
+    drive[:, 4] = _log_normal(random, np.ones(n), torque_constant_stds(config), count)
     drive[:, 5] = _log_normal(random, *friction["lag"], count)
     rotors = _log_normal(random, *friction["armature"], count)
     # The back-EMF of voltage-driven joints lags too, so that they move like lighter ones.

@@ -66,15 +66,21 @@ def unsafe(config: Config, foreseen: ChainPrediction) -> str:
     peaks = foreseen.peaks
     if not foreseen.is_clear:
         return f"too little clearance, {foreseen}"
-    touched = (peaks.shares[:, :GUARDED] >= 1.0).any(axis=0)
-    chance = peaks.limit_chance[:GUARDED]
-    if touched.any() or peaks.stop_chance > config.safety.limit_chance:
-        row, joint = np.unravel_index(int(np.argmax(touched + chance)), chance.shape)
+    if (peaks.shares[:, :GUARDED] >= 1.0).any() or peaks.stop_chance > config.safety.limit_chance:
+        row, joint = nearest_limit(peaks)
         return (
-            f"joint {config.joints[int(joint)].name!r} reaches {QUANTITIES[int(row)]} "
+            f"joint {config.joints[joint].name!r} reaches {QUANTITIES[row]} "
             f"{peaks.quantile[row, joint]:.3g} (limit {peaks.limits[row, joint]:.3g}) in 1 of 100 arms"
         )
     return ""
+
+
+def nearest_limit(peaks: Prediction) -> tuple[int, int]:
+    """Return the index in QUANTITIES, and the joint, whose limit the arms are most likely to reach."""
+    touched = (peaks.shares[:, :GUARDED] >= 1.0).any(axis=0)
+    chance = peaks.limit_chance[:GUARDED]
+    row, joint = np.unravel_index(int(np.argmax(touched + chance)), chance.shape)
+    return int(row), int(joint)
 
 
 def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from hil.dry_run.prior import base_draws
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
+from hil.plan.chain_model import torque_constant_stds
 from hil.results.result import Result
 
 Array = NDArray[np.float64]
@@ -57,7 +58,7 @@ def prior_ensemble(config: Config, count: int, seed: int = 0) -> Ensemble:
 def scale_draws(config: Config, count: int, seed: int = 0) -> Array:
     """Draw ratios of true to assumed torque constants (count, joints)."""
     random = np.random.default_rng((seed, 6))
-    spread = np.array([joint.torque_per_goal_std / joint.torque_per_goal for joint in config.joints])
+    spread = torque_constant_stds(config)
     drawn: Array = np.exp(np.sqrt(np.log1p(spread**2)) * random.standard_normal((count, len(config.joints))))
     return drawn
 

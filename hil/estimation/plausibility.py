@@ -7,6 +7,7 @@ import numpy as np
 from hil.config.schema import Config
 from hil.estimator.identify import Estimate
 from hil.estimator.models.conflicts import LARGE_RATIO, Conflict, conflicts
+from hil.plan.chain_model import torque_constant_stds
 
 DEVIATIONS = 4.0  # standard errors
 LENGTH_TOLERANCE = 0.05  # relative; link lengths are measured with a ruler
@@ -68,8 +69,8 @@ def _weight(config: Config, estimate: Estimate, largest_torque: float) -> list[s
 
 def conflicts_of(config: Config, estimate: Estimate) -> tuple[Conflict, ...]:
     """Values of `estimate` that are far from what the configuration and typical servos imply."""
-    unsure = [joint.torque_per_goal_std / joint.torque_per_goal for joint in config.joints]
-    given = {"torque_scale_2": float(np.linalg.norm(unsure))} if len(unsure) == 2 and all(unsure) else {}
+    unsure = torque_constant_stds(config)
+    given = {"torque_scale_2": float(np.linalg.norm(unsure))} if unsure.size == 2 and unsure.any() else {}
     return conflicts(estimate.names, estimate.value, estimate.std, given)
 
 

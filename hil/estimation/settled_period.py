@@ -10,7 +10,7 @@ from hil.errors import RecordingCutShort
 from hil.estimation.lateness import acting_torque, lateness, velocity_of
 from hil.estimation.supply import supply_sag, torque_factor
 from hil.estimator.data.periodicity import settling_difference
-from hil.estimator.data.repeated_noise import repeated_noise
+from hil.estimator.data.repeated_noise import coloured_noise, repeated_noise
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.simulation.closed_loop import Stabilised
 from hil.plan.stabiliser import feedback_of, feedback_torque
@@ -69,11 +69,13 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
         before=_state_at(samples, int(np.flatnonzero(chosen)[begin - count]), experiment.rate),
     )
     on_time = angle - velocity_of(period) * _by_period(late[None], count)
+    passes = _passes(position, first, on_time)
     return replace(
         period,
         position=_mean_of_periods(on_time),
         position_std=scatter(on_time),
-        repeated_noise=repeated_noise(_passes(position, first, on_time), period.position_step, experiment.periods),
+        repeated_noise=repeated_noise(passes, period.position_step, experiment.periods),
+        coloured_noise=coloured_noise(passes, experiment.periods),
     )
 
 

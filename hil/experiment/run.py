@@ -261,7 +261,7 @@ def _positions(config: Config, bus: ServoBus) -> list[float]:
 
 def _from_where_it_lies(config: Config, plan: Plan, bus: ServoBus, run: RunFolder, note: Note) -> tuple[Config, Plan]:
     """Plan the motion of a spatial arm anew if it does not lie exactly in its rest pose; save that for an estimate."""
-    lies = from_where_it_lies(config, _positions(config, bus))
+    lies = from_where_it_lies(config, bus.read_positions())
     if lies is config:
         return config, plan
     note(said_of_the_rest(config, lies))

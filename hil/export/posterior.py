@@ -188,8 +188,9 @@ def _is_physical(model: ArmModel) -> bool:
 
 
 def _torque_spread(model: ArmModel) -> float:
-    """Relative standard deviation of the common torque factor: that of the best-known joint."""
-    return min(joint.torque_per_goal_std / joint.torque_per_goal for joint in model.joints)
+    """Relative standard deviation of the common torque factor: that of the best-known joint; 0 if none is known."""
+    known = [joint.torque_per_goal_std / joint.torque_per_goal for joint in model.joints if joint.torque_per_goal_std]
+    return min(known, default=0.0)
 
 
 def _model(model: ArmModel, names: tuple[str, ...], row: Array, factor: float) -> ArmModel:

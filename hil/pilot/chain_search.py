@@ -128,8 +128,8 @@ def identify_chain_in_steps(
     Raises what a run raises, and NoSafeTorque.
     """
     with StopRequest(), servo_session(config, run.path, say) as bus:
-        if from_where_it_lies(config, bus.read_positions()) is not config:
-            wait_for_rest(bus)
+        if from_where_it_lies(config, bus.read_positions()) is not config and (moving := wait_for_rest(bus)):
+            raise ExperimentError(moving)
         lies = from_where_it_lies(config, bus.read_positions())
         if lies is not config:
             say(said_of_the_rest(config, lies))

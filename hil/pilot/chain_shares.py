@@ -11,8 +11,8 @@ import numpy as np
 from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction, Tell, predict_chain
 from hil.dry_run.chain_stop import foreseen_stops
-from hil.dry_run.chain_summary import unsafe
-from hil.dry_run.prediction import GUARDED, QUANTITIES
+from hil.dry_run.chain_summary import nearest_limit, unsafe
+from hil.dry_run.prediction import QUANTITIES
 from hil.errors import NoSafeTorque
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths
@@ -182,10 +182,7 @@ def _remedy(config: Config, foreseen: ChainPrediction) -> str:
     if not foreseen.is_clear:
         helps = "A rest_pose farther from obstacles, or more room in [clearance] (floor, boxes, margin)"
     else:
-        peaks = foreseen.peaks
-        touched = (peaks.shares[:, :GUARDED] >= 1.0).any(axis=0)
-        row = int(np.argmax((touched + peaks.limit_chance[:GUARDED]).max(axis=1)))
-        is_speed = QUANTITIES[row] == "velocity"
+        is_speed = QUANTITIES[nearest_limit(foreseen.peaks)[0]] == "velocity"
         helps = "A larger velocity_limit" if is_speed else "A wider position_limit, or a rest_pose farther from it"
     return f"{helps}, if the arm allows it, helps. {_better_known(config)}"
 

@@ -57,8 +57,12 @@ def known_chain(config: Config) -> KnownChain:
 
 
 def torque_constant_stds(config: Config) -> Array:
-    """Relative standard deviation of each joint's torque constant (joints,), 0 where the configuration gives none."""
-    return np.array([joint.torque_per_goal_std / joint.torque_per_goal for joint in config.joints])
+    """Relative standard deviation of each joint's torque constant (joints,); all 0 if the configuration gives none.
+
+    If it gives those of some joints, the others' are the usual ones.
+    """
+    given = any(joint.torque_per_goal_std for joint in config.joints)
+    return np.array([joint.torque_spread if given else 0.0 for joint in config.joints])
 
 
 def described_torque(config: Config, known: KnownChain) -> ChainTorque:

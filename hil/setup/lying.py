@@ -9,6 +9,7 @@ import numpy as np
 
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
+from hil.rest_pose_hint import within_limits
 from hil.setup.servo_session import has_moved
 
 AFTER_A_RUN = 2.0
@@ -48,23 +49,27 @@ def wait_for_rest(bus: ServoBus) -> str:
 
 
 def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
-    """The configuration with the measured pose (joints,) [rad] as rest pose.
+    """The configuration with the measured pose (joints,) [rad] as rest pose, as far as position_limit contains it.
 
     It is returned unchanged if that makes no difference, or if the arm is too far from its rest pose, so that the run
     is refused.
     """
-    rest, low, high = (
-        np.array(each) for each in (config.arm.rest_pose, *zip(*(j.position_limit for j in config.joints), strict=True))
-    )
-    away = np.abs(np.array(position) - rest)
-    if not NEAR_RAD < away.max() <= tolerance_now(config):
+    limits = [joint.position_limit for joint in config.joints]
+    low, high = np.array(limits).T
+    measured = np.array([within_limits(*each) for each in zip(position, limits, strict=True)])
+    rest = np.array(config.arm.rest_pose)
+    lies = np.clip(measured, low, high)
+    if np.abs(measured - rest).max() > tolerance_now(config) or np.abs(lies - rest).max() <= NEAR_RAD:
         return config
-    lies = np.clip(position, low, high).tolist()
-    return config.model_copy(update={"arm": config.arm.model_copy(update={"rest_pose": lies})})
+    return config.model_copy(update={"arm": config.arm.model_copy(update={"rest_pose": lies.tolist()})})
 
 
 def said_of_the_rest(config: Config, lies: Config) -> str:
     """Say where the arm lies instead of in its rest pose."""
     each = zip(config.joints, lies.arm.rest_pose, config.arm.rest_pose, strict=True)
-    away = [f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})" for joint, now, rest in each if now != rest]
+    away = [
+        f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})"
+        for joint, now, rest in each
+        if abs(now - rest) > NEAR_RAD
+    ]
     return f"The arm does not lie in arm.rest_pose: {', '.join(away)}. The motion starts and ends where it lies."

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from hil.estimator.data.fourier import white_noise
-from hil.estimator.data.repeated_noise import agreed_noise, repeated_noise
+from hil.estimator.data.repeated_noise import agreed_noise, coloured_noise, repeated_noise
 
 STEP = np.array([1.5e-3, 1.5e-3])
 SAMPLES = 4000
@@ -90,3 +91,44 @@ def test_two_measurements_are_averaged_where_they_agree() -> None:
     assert 1.0 < found[0] < 1.05
     np.testing.assert_allclose(found[1:], 1.0)
     np.testing.assert_allclose(agreed_noise(white, None, SAMPLES), white)
+
+
+def slow_passes(std: float, correlation: float, change: float = 0.0) -> list[np.ndarray]:
+    """Two passes of a band-limited motion that changes in between, with first-order filtered noise [steps]."""
+    rng = np.random.default_rng(8)
+    order = np.arange(1, SAMPLES // 2)
+    size = 100.0 * np.exp(2j * np.pi * rng.random((2, order.size))) / np.maximum(1.0, order / 50.0) ** 4
+    lines = [size, size * (1.0 + change * np.exp(2j * np.pi * rng.random(size.shape)))]
+    noise = np.sqrt(1.0 - correlation**2) * rng.standard_normal((2, 2, 2 * SAMPLES))
+    coloured = std * lfilter([1.0], [1.0, -correlation], noise)[..., SAMPLES:]
+    return [
+        np.round(SAMPLES / 2 * np.fft.irfft(np.pad(each, ((0, 0), (1, 0))), SAMPLES)[:, : SAMPLES // 2] + added[:, ::2])
+        for each, added in zip(lines, coloured, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("correlation", [0.6, 0.8])
+@pytest.mark.parametrize("std", [0.3, 1.0])
+def test_noise_that_a_servo_filters_is_measured(std: float, correlation: float) -> None:
+    """Every second sample of it: the correlation of successive ones is 0.36 and 0.64."""
+    passes = slow_passes(std, correlation)
+    white, coloured = repeated_noise(passes, np.ones(2)), coloured_noise(passes)
+    assert white is not None and coloured is not None
+    true = np.sqrt(1.0 / 12.0 + std**2)
+    assert np.all(white < 0.93 * true)
+    np.testing.assert_allclose(np.hypot(white, coloured), true, rtol=0.08)
+    passes[0][:, ::15] = np.nan
+    white, coloured = repeated_noise(passes, np.ones(2)), coloured_noise(passes)
+    assert white is not None and coloured is not None
+    np.testing.assert_allclose(np.hypot(white, coloured), true, rtol=0.1)
+
+
+@pytest.mark.parametrize("change", [0.0, 0.003, 0.02])
+def test_motion_that_changes_is_no_noise(change: float) -> None:
+    passes = slow_passes(0.3, 0.0, change)
+    assert np.max(np.abs(passes[1] - passes[0])) > 100.0 * change
+    for lost in (1, 7):
+        passes[0][:, ::lost] += 0.0 if lost == 1 else np.nan
+        coloured = coloured_noise(passes)
+        assert coloured is not None and np.all(coloured < 0.12)
+    assert coloured_noise(passes[:1]) is None

@@ -15,6 +15,8 @@ from hil.arm_model import ArmModel
 from hil.errors import ResultError
 from hil.estimator.models.regressor import inverse_dynamics
 from hil.estimator.models.terms import base_names
+from hil.export.parameters import export_toml
+from hil.export.source import Source
 from hil.model_file import read_result
 from hil.runs.run_folder import RunFolder
 
@@ -136,6 +138,21 @@ def test_files_that_hold_no_model_are_refused_with_their_name(identified: Path, 
         load_model(identified)
     with pytest.raises(ResultError, match=r"nowhere cannot be read: No such file"):
         load_model(tmp_path / "nowhere")
+
+
+def test_a_damaged_toml_file_is_read_like_any_other_toml(identified: Path, tmp_path: Path) -> None:
+    path = tmp_path / "arm.TOML"
+    export_toml(Source.open(identified), path)
+    assert load_model(path).values == load_model(identified).values
+    path.write_text("schema = 1\nschema = 1\n", encoding="utf-8")
+    with pytest.raises(
+        ResultError,
+        match=r"schema is given twice, in lines 1 and 2\. Delete one of them\.\nRecreate it with hil export",
+    ):
+        load_model(path)
+    path.write_bytes("# Länge\nschema = 1\n".encode("latin-1"))
+    with pytest.raises(ResultError, match="not UTF-8 text, from line 1 on"):
+        load_model(path)
 
 
 def test_it_needs_numpy_only_and_hil_itself_not_even_that(identified: Path) -> None:

@@ -52,6 +52,11 @@ def test_every_reader_says_what_is_wrong(
         ("[[x]]\na = 1\n[[x]]\na = 1\nb = 1\nb = 2\n", "b is given twice in the [[x]] of line 3, in lines 5 and 6."),
         ("[x]\na.b = 1\na = 2\n", "a in line 3 is already given in [x], in another form."),
         ("a = {b = 1, b = 2}", "Duplicate inline table key 'b'"),
+        ("[a]\nx = [\n  [1, 2],\n]\nx = 1\n", "x is given twice in [a], in lines 2 and 5."),
+        ("[a]\nx = 1\nx = [\n  1,\n]\n", "x is given twice in [a], in lines 2 and 3."),
+        ('[a]\ny = """\nx = 1\n[b]\n"""\nx = 1\nx = 2\n', "x is given twice in [a], in lines 6 and 7."),
+        ("[[a]]\n[a.b]\nx = 1\n[[a]]\n[a.b]\nx = 1\nx = 2\n", "x is given twice in [a.b], in lines 6 and 7."),
+        ("[a]\nb = 1\n[[a]]\n", "[[a]] in line 3 is already given, in another form."),
     ],
 )
 def test_what_is_given_twice_is_named_with_both_lines(text: str, said: str, tmp_path: Path) -> None:

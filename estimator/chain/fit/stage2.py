@@ -252,7 +252,7 @@ def _resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple
     and the number of simulations.
     """
     resolved = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
-    # An early fit may be far off: where it makes a joint much too light, the step must not remain too long permanently.
+    # An early fit may be far off: where it makes a joint much too light, the friction step must not stay wide.
     floor = np.clip(resolved, options.width_floor, options.initial_width)
     bounded = replace(coarse.coordinates, width_floor=floor)
     soft = bounded.raised(soft)
