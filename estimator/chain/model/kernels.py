@@ -358,7 +358,7 @@ def invert(matrix: Any, inverse: Any, factor: Any) -> bool:  # noqa: PLR0912
 
 # Functions called only from compiled code need no wrappers for C.
 compiled: Any = numba.njit(  # type: ignore[call-overload]
-    nogil=True, error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True
+    nogil=True, error_model="numpy", fastmath={"contract"}, _nrt=False, no_cfunc_wrapper=True
 )
 _cross, _dot, _push, _carry, _flow, _into = map(compiled, (_cross, _dot, _push, _carry, _flow, _into))
 place, move, accelerate, differentiate, regress, pull, invert = map(

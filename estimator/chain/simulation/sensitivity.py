@@ -15,6 +15,7 @@ from hil.estimator.chain.simulation.stepping import JOINT_TERMS, run
 ABSENT = {"coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}
 """Values that disable a term that the model lacks; zero for all other terms."""
 AT_ONCE = 8
+LINE = 8  # numbers in a cache line
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,9 @@ class Simulation:
     ) -> None:
         n = base.chain.joints
         self._causes = len(names) + 2 * n if names else 0
-        width = AT_ONCE * -(-self._causes // AT_ONCE)
+        # Unwanted derivatives are written to a spare column after all others.
+        width = AT_ONCE * -(-(self._causes + 1) // AT_ONCE)
+        spare = width - 1
         at = {name: index for index, name in enumerate(names)}
         rotation, translation, axis, gravity = base.chain.arrays
         tilt = [parameters.get(name, 0.0) for name in TILT]
@@ -66,28 +69,29 @@ class Simulation:
             np.array([[parameters.get(f"{t}_{j + 1}", ABSENT.get(t, 0.0)) for j in range(n)] for t in JOINT_TERMS]),
             np.array(start, dtype=np.float64, order="C"),
         )
-        # Unwanted derivatives are written to a spare column after all others.
-        where = np.array([at.get(name, width) for name in base.names] + [width])
+        where = np.array([at.get(name, spare) for name in base.names] + [spare])
         self._columns = (
             where[places(n, base.columns)],
-            np.array([[at.get(f"{term}_{joint + 1}", width) for joint in range(n)] for term in JOINT_TERMS]),
+            np.array([[at.get(f"{term}_{joint + 1}", spare) for joint in range(n)] for term in JOINT_TERMS]),
             np.array(
                 [
-                    [at.get("delay", width)] * n,
-                    [at.get(f"lag_ratio_{j + 1}", at.get("lag", width)) for j in range(n)],
+                    [at.get("delay", spare)] * n,
+                    [at.get(f"lag_ratio_{j + 1}", at.get("lag", spare)) for j in range(n)],
                 ]
             ),
             np.array([at[name] for name in TILT if name in at], dtype=np.int64),
             tilt_slopes(gravity, *tilt) if TILT[0] in at else np.zeros((2, 3)),
         )
         self._gain = np.ascontiguousarray(gain, dtype=np.float64)
-        z = np.zeros((3 * n, width))
+        first, even = -(-3 * n // 4) * 4, n + n % 2
+        rows = first + -(-n // 4) * 4
+        z = _aligned(rows, width)
         if names:
             z[np.arange(2 * n), len(names) + np.arange(2 * n)] = 1.0
         solve = (np.zeros((4, n)), *np.zeros((3, n, n)), *np.zeros((3, n)))
         self._room = (
-            *(room(n), solve, tuple(np.zeros((6, n))), np.zeros(n), z),
-            *(*np.zeros((2, n, width)), np.zeros((n, width + 1)), np.zeros((n, 3 * n)), np.zeros((n, n))),
+            *(room(n), solve, tuple(np.zeros((6, n))), np.zeros(n)),
+            *(z, first, _aligned(even, width), np.zeros((n, 3 * n)), np.zeros((even, rows))),
         )
 
     @property
@@ -111,6 +115,13 @@ class Simulation:
             *(self._gain, run_.step, run_.finer, self._columns, self._room, position, derivative),
         )
         return (position if stayed and np.all(np.isfinite(position)) else None), derivative
+
+
+def _aligned(rows: int, columns: int) -> Array:
+    """Return zeros that start at a multiple of the length of a cache line, so that no vector straddles two lines."""
+    spare = np.zeros(rows * columns + LINE)
+    first = -(spare.ctypes.data // spare.itemsize) % LINE
+    return spare[first : first + rows * columns].reshape(rows, columns)
 
 
 def pieces(samples: int) -> list[slice]:

@@ -100,53 +100,64 @@ def _direct(
 
 # These take whole arrays and indices: a view of a row costs as much as its arithmetic.
 def _add_eight(out: Any, i: int, A: Any, X: Any, j: int, width: int) -> None:
-    """Add the products of A's columns j to j + 7 in row i with those rows of X to row i of out."""
+    """Add the products of A's columns j to j + 7 in rows i and i + 1 with those rows of X to those rows of out.
+
+    Two rows at a time: X is read half as often.
+    """
     a, b, c, d = A[i, j], A[i, j + 1], A[i, j + 2], A[i, j + 3]
     e, f, g, h = A[i, j + 4], A[i, j + 5], A[i, j + 6], A[i, j + 7]
+    m = i + 1
+    p, q, r, s = A[m, j], A[m, j + 1], A[m, j + 2], A[m, j + 3]
+    t, u, v, w = A[m, j + 4], A[m, j + 5], A[m, j + 6], A[m, j + 7]
     for k in range(width):
-        out[i, k] += (
-            (a * X[j, k] + b * X[j + 1, k])
-            + (c * X[j + 2, k] + d * X[j + 3, k])
-            + (e * X[j + 4, k] + f * X[j + 5, k])
-            + (g * X[j + 6, k] + h * X[j + 7, k])
-        )
+        x0, x1, x2, x3 = X[j, k], X[j + 1, k], X[j + 2, k], X[j + 3, k]
+        x4, x5, x6, x7 = X[j + 4, k], X[j + 5, k], X[j + 6, k], X[j + 7, k]
+        out[i, k] += (a * x0 + b * x1) + (c * x2 + d * x3) + (e * x4 + f * x5) + (g * x6 + h * x7)
+        out[m, k] += (p * x0 + q * x1) + (r * x2 + s * x3) + (t * x4 + u * x5) + (v * x6 + w * x7)
 
 
 def _add_four(out: Any, i: int, A: Any, X: Any, j: int, width: int) -> None:
+    m = i + 1
     a, b, c, d = A[i, j], A[i, j + 1], A[i, j + 2], A[i, j + 3]
+    p, q, r, s = A[m, j], A[m, j + 1], A[m, j + 2], A[m, j + 3]
     for k in range(width):
-        out[i, k] += (a * X[j, k] + b * X[j + 1, k]) + (c * X[j + 2, k] + d * X[j + 3, k])
+        x0, x1, x2, x3 = X[j, k], X[j + 1, k], X[j + 2, k], X[j + 3, k]
+        out[i, k] += (a * x0 + b * x1) + (c * x2 + d * x3)
+        out[m, k] += (p * x0 + q * x1) + (r * x2 + s * x3)
 
 
-def _add_one(out: Any, i: int, A: Any, X: Any, j: int, width: int) -> None:
-    a = A[i, j]
-    for k in range(width):
-        out[i, k] += a * X[j, k]
+def _multiply(A: Any, X: Any, inner: int, out: Any) -> None:
+    """Set out = A X, with the first `inner` columns of A.
 
-
-def _add_product(A: Any, X: Any, rows: int, inner: int, width: int, out: Any) -> None:
-    """Add A X to out, where A is (rows, inner), X (inner, width)."""
-    for i in range(rows):
+    The number of rows of `out` is even, `inner` a multiple of 4.
+    """
+    rows, width = out.shape
+    for i in range(0, rows, 2):
+        for k in range(width):
+            out[i, k] = out[i + 1, k] = 0.0
         j = 0
         while j + 8 <= inner:
             _add_eight(out, i, A, X, j, width)
             j += 8
-        if j + 4 <= inner:
+        if j < inner:
             _add_four(out, i, A, X, j, width)
-            j += 4
-        while j < inner:
-            _add_one(out, i, A, X, j, width)
-            j += 1
 
 
-def _solved(inverse: Any, minus: Any, R: Any, n: int, width: int, out: Any) -> None:
-    """Set out = -inverse R; `minus` is working space."""
+def _solve_for(inverse: Any, mixed: Any, columns: int, first: int, A: Any) -> None:
+    """Set A to -inverse [mixed, 1], in the order of the rows of `z` in `_run_loop`.
+
+    mixed: coefficients of the derivatives of angles and velocities and, from row `first` of `z` on, accelerations;
+    `columns` in all. That of the direct derivatives is 1.
+    """
+    n = inverse.shape[0]
     for i in range(n):
-        for j in range(n):
-            minus[i, j] = -inverse[i, j]
-        for c in range(width):
-            out[i, c] = 0.0
-    _add_product(minus, R, n, n, width, out)
+        for c in range(columns):
+            total = 0.0
+            for j in range(n):
+                total -= inverse[i, j] * mixed[j, c]
+            A[i, c if c < 2 * n else first - 2 * n + c] = total
+        for c in range(n):
+            A[i, 2 * n + c] = -inverse[i, c]
 
 
 def _stage(
@@ -269,13 +280,15 @@ def _run_loop(  # noqa: PLR0912
 
     The results are written to `position` (samples, joints) and, unless there are no causes, `derivative` (samples,
     joints, causes). A step in which a joint may come near standstill is divided into up to `finer` smaller ones.
+
+    The rows of `z` are the derivatives of angles and velocities, the direct derivatives of a stage's equation, and,
+    from row `first` on, the derivatives of the first stage's accelerations; `dl` holds those of the second stage's.
     """
-    work, solve, motion, by, z, dl, R, direct, mixed, minus = room
+    work, solve, motion, by, z, first, dl, mixed, A = room
     q1, v1, k, m, nothing, ahead = motion
     q, v = state[0], state[1]
-    n, causes = q.size, derivative.shape[2]
-    width = (causes + 7) // 8 * 8
-    zq, zv, dk = z[:n], z[n : 2 * n], z[2 * n :]
+    n, causes, width = q.size, derivative.shape[2], z.shape[1]
+    zq, zv, direct, dk = z[:n], z[n : 2 * n], z[2 * n : 3 * n], z[first : first + dl.shape[0]]
     for sample in range(torque.shape[0]):
         for j in range(n):
             position[sample, j] = q[j]
@@ -311,10 +324,8 @@ def _run_loop(  # noqa: PLR0912
                     for i in range(n):
                         for j in range(n):
                             mixed[i, j], mixed[i, n + j] = work[6][i, j], work[7][i, j]
-                        for c in range(width):
-                            R[i, c] = direct[i, c]
-                    _add_product(mixed, z, n, 2 * n, width, R)
-                    _solved(solve[2], minus, R, n, width, dk)
+                    _solve_for(solve[2], mixed, 2 * n, first, A)
+                    _multiply(A, z, first, dk)
                 for j in range(n):
                     q1[j], v1[j], ahead[j] = q[j] + h * v[j], v[j] + h * k[j], 2.0 * k[j]
                 if not _stage(chain, links, p, q1, v1, t, ahead, gh, m, work, solve):
@@ -327,10 +338,8 @@ def _run_loop(  # noqa: PLR0912
                             mixed[i, j] = work[6][i, j]
                             mixed[i, n + j] = work[7][i, j] + h * work[6][i, j]
                             mixed[i, 2 * n + j] = h * work[7][i, j] + 2.0 * work[4][i, j]
-                        for c in range(width):
-                            R[i, c] = direct[i, c]
-                    _add_product(mixed, z, n, 3 * n, width, R)
-                    _solved(solve[2], minus, R, n, width, dl)
+                    _solve_for(solve[2], mixed, 3 * n, first, A)
+                    _multiply(A, z, A.shape[1], dl)
                     for j in range(n):
                         for c in range(width):
                             zq[j, c] += h * zv[j, c] + 0.5 * h * h * dk[j, c]
@@ -342,11 +351,12 @@ def _run_loop(  # noqa: PLR0912
     return True
 
 
-# Only the loop is called from Python.
+# Only the loop is called from Python. None of this allocates: without numba's reference counts, which cost an atomic
+# operation for every view of an array, it is a quarter faster.
 _inner: Any = numba.njit(  # type: ignore[call-overload]
-    nogil=True, error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True, no_cpython_wrapper=True
+    nogil=True, error_model="numpy", fastmath={"contract"}, _nrt=False, no_cfunc_wrapper=True, no_cpython_wrapper=True
 )
-_left, _direct, _add_eight, _add_four, _add_one, _add_product, _solved, _stage, _follow, _pieces, _broken = map(
-    _inner, (_left, _direct, _add_eight, _add_four, _add_one, _add_product, _solved, _stage, _follow, _pieces, _broken)
+_left, _direct, _add_eight, _add_four, _multiply, _solve_for, _stage, _follow, _pieces, _broken = map(
+    _inner, (_left, _direct, _add_eight, _add_four, _multiply, _solve_for, _stage, _follow, _pieces, _broken)
 )
-run: Callable[..., bool] = compiled(_run_loop, fastmath={"contract"})
+run: Callable[..., bool] = compiled(_run_loop, fastmath={"contract"}, _nrt=False)
