@@ -190,8 +190,8 @@ class Guard:
                     index,
                     Cause.EARLY_MOTION,
                     f"moves before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
-                    "is allowed. Let the arm come to rest; check whether a hand or a cable pushes or holds it, or its horn "
-                    "slips.",
+                    "is allowed. Let the arm come to rest; check whether a hand or a cable pushes or holds it, or "
+                    "its horn slips.",
                 )
 
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
