@@ -306,13 +306,8 @@ class ServoBus:
 
         Raises PortLost; BusShared if another master has written to a servo.
         """
-        exchange = self.prepared
-        if (found := exchange.overruled(due)) is not None:
+        if (found := self.prepared.overruled(due)) is not None:
             raise overruled(self._drives[found.place], found)
-        if exchange.is_in_doubt and exchange.read_back_at <= self.port.clock.now():
-            # The status distinguishes lost goals from another master's. Reading it takes the time of the next
-            # read-back, so it is only requested right after one.
-            exchange.read_status_next()
 
     @property
     def heard_instead(self) -> str:

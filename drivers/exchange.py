@@ -15,7 +15,7 @@ loop needs.
 import math
 import struct
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -40,6 +40,11 @@ AFTER_LOSS = 5
 """Number of reads of different lengths that take turns after lost replies. A reply that arrives fewer than this many
 cycles late is recognised by its length.
 """
+
+_INSTRUCTIONS = frozenset(Instruction) - {Instruction.STATUS}
+_FRONT_SIZE = 8  # header, ID, LEN, INST
+_LONGEST_CUT_OFF = 64
+"""Largest LEN of an instruction that is recognised although its end is missing; a damaged LEN is usually larger."""
 
 _NEVER = 1 << 62
 _DOUBTS = 3
@@ -124,7 +129,8 @@ class Exchange:
         self._slow_spans = len(spans) - 1
         least = max(patience, min(PATIENCE_SHARE * interval, MOST_PATIENCE_S))
         self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
-        self._soonest = [0.5 * port.wire_time(self._bytes(read)) for read in self._reads]
+        self._wire_s = {read: port.wire_time(self._bytes(read)) for read in self._reads}
+        self._soonest = [0.5 * self._wire_s[read] for read in self._reads]
         self._doubts = _DOUBTS
         self._status_every = _NEVER if status is None else status_every
         self._until_status = self._status_every
@@ -134,10 +140,11 @@ class Exchange:
         self._late_possible = False
         self._after_loss = 0
         self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
-        self._lasted = math.inf
+        self._off_wire = math.inf
+        """Duration of the latest cycle without its wire time [s]."""
+        self._was_unusual = False
+        """Whether the latest cycle read another span than the usual one, and so left less time than most."""
         self._read_back: ReadBack | None = None
-        self._shorter: dict[GroupRead, float] = {}
-        """By how much the wire time of each read-back is shorter than that of a usual cycle [s]."""
         self.read_back_at = math.inf
         """When `overruled` should be called again, before the next cycle [s on the port's clock]."""
 
@@ -169,8 +176,7 @@ class Exchange:
         modes that were set.
         """
         back = self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
-        usual = self._bytes(self._reads[0])
-        self._shorter = {read: self._port.wire_time(usual - self._bytes(read)) for read in back.reads}
+        self._wire_s |= {read: self._port.wire_time(self._bytes(read)) for read in back.reads}
         self._expected = self._expected.union(*(read.expected for read in back.reads))
         self.read_back_at = -math.inf
 
@@ -193,15 +199,31 @@ class Exchange:
 
         Raises PortLost.
         """
-        back, port = self._read_back, self._port
+        back = self._read_back
         if back is None or not self._sent:
             return None
-        now, read = self._now(), back.read
+        goals, modes = back.reads
+        if back.read is modes:
+            # Only goals are overwritten by the next cycle. If there is time for them as well, they are read last.
+            before_goals = due - self._takes(goals, back) - HOST_S
+            if self._now() + self._takes(modes, back) <= before_goals:
+                found = self._held(back, before_goals)
+                if found is not None or back.read is modes:
+                    return found
+        return self._held(back, due)
+
+    def _takes(self, read: GroupRead, back: ReadBack) -> float:
+        """Longest time that a read-back is expected to take [s]."""
+        return max(self._off_wire + self._wire_s[read], back.longest)
+
+    def _held(self, back: ReadBack, due: float) -> Overruled | None:
+        """Read back once if that is possible before `due` [s]."""
+        port, now, read = self._port, self._now(), back.read
         asked = read.reply_size + (len(read.request) if self._echoes else 0)
-        takes = max(self._lasted - self._shorter[read], back.longest)
+        takes = self._takes(read, back)
         if now + takes > due or self._late_possible:
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
-            self.read_back_at = now + TRY_AGAIN_S
+            self.read_back_at = now if self._was_unusual or self._late_possible else now + TRY_AGAIN_S
             return None
         port.clock.wait_until(due - takes - HOST_S)
         before = self._now()
@@ -219,8 +241,10 @@ class Exchange:
             self._late_possible = True
         else:
             back.took(min(now - before, 2.0 * takes))
+        self.read_back_at = now
         found = back.look(servos, self._sent, now)
-        self.read_back_at = back.due
+        if back.has_just_sighted(now):
+            self.read_status_next()  # it distinguishes lost goals from another master's
         return found
 
     def cycle(self, goal_ticks: Sequence[int], *, between: bool = False) -> Reply:
@@ -264,7 +288,8 @@ class Exchange:
         elif self._doubts and self._now() - before < self._soonest[span]:
             servos = self._latest(read, servos, before + timeout)
         after = self._now()
-        self._lasted = after - before
+        self._off_wire = after - before - self._wire_s[read]
+        self._was_unusual = span > 0
         return _reply((before, after, span if span < self._kinds else 0, servos))
 
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
@@ -316,6 +341,8 @@ class Exchange:
             # One byte at a time, since the length of a stuffed packet is not known in advance.
             received += self._port.read(1, remaining)
         self._look_for_strangers(_packets_within(received))
+        if not self._echoes:
+            self.strangers += sum(self._is_anothers(*front) for front in _fronts_of_instructions(received))
         complete = sum(answer is not None for answer in answers) / len(answers)
         if complete < 1.0 and len(received) > complete * read.reply_size + _PART_OF_A_REPLY:
             self.damaged_at, self.senders = self._now(), read.senders(received)
@@ -332,6 +359,11 @@ class Exchange:
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
+
+    def _is_anothers(self, servo_id: int, length: int) -> bool:
+        """Whether an instruction whose end is missing is another master's, not a damaged reply of such a LEN."""
+        lengths = {size + 4 for _, size in self._expected}
+        return servo_id in (*self.ids, BROADCAST_ID) and length <= _LONGEST_CUT_OFF and length not in lengths
 
     def _overhear(self, received: bytes) -> None:
         """Examine bytes that were pending before the request: from another master, or a late or repeated reply."""
@@ -407,6 +439,20 @@ def _packets_within(received: bytes) -> list[Packet]:
         found += packets
         at = received.find(HEADER, end if packets else at + 1)
     return found
+
+
+def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:
+    """ID and LEN of each instruction that is cut off by the next packet.
+
+    A master that transmits does not receive: of another one's packet it hears what preceded its own.
+    """
+    at = received.find(HEADER)
+    while (following := received.find(HEADER, at + len(HEADER))) >= 0:
+        if following - at >= _FRONT_SIZE and received[at + _FRONT_SIZE - 1] in _INSTRUCTIONS:
+            length = int.from_bytes(received[at + 5 : at + 7], "little")
+            if following - at < 7 + length:
+                yield received[at + 4], length
+        at = following
 
 
 def _front(goal: Register, count: int) -> bytes:

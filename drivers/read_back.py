@@ -11,18 +11,14 @@ from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRea
 
 __all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack"]
 
-_READ_BACK_S = 0.015
-"""Mean time between two read-backs [s]."""
+_MODES_S = 0.025
+"""Mean time between two read-backs of the modes [s]; all others are of the goals.
 
-_GOALS_PER_MODE = 2
-"""Largest number of goal read-backs between two mode read-backs.
-
-This number and the times are random, because regular checks might never detect a program that overwrites every other
-goal.
+It is random: a program that overwrites goals regularly must not always do so when the modes are read.
 """
 
 _GOALS_PER_MODE_IN_DOUBT = 4
-"""The same while a foreign value is suspected, and every cycle is followed by a read-back."""
+"""Least number of goal read-backs between two mode read-backs while a foreign value is suspected."""
 
 _RECENT = 4
 """Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
@@ -33,16 +29,24 @@ REMEMBERED = 128
 _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Numbers of read-backs of a foreign value that prove another writer, and the time in which they must occur [s].
 
-Three are required for a goal that this program may have written in an earlier cycle, and for 0, which a servo itself
-may have set: by then, the status has detected lost writes, a tripped watchdog or a reboot.
+Three of the same value are required for a goal that this program may have written in an earlier cycle, and for 0, which
+a servo itself may have set. By then, the status has detected lost writes, a tripped watchdog or a reboot; and writes
+that are lost now and then leave a different goal each time.
 """
+
+_UNSURE_S = 0.01
+"""Least time between the first and the last of these three [s], in which the status is read."""
 
 TRY_AGAIN_S = 0.005
 """Delay after which a read-back for which a cycle left no time is tried again [s]."""
 
 _FADES = 0.98
 _IN_DOUBT_S = 0.3
-"""Time after a foreign value was read, during which every cycle is followed by a read-back [s]."""
+"""Time after a foreign value was read, during which others are expected [s]."""
+
+
+_Sightings = deque[tuple[float, int]]
+"""Time [s] and value of each."""
 
 
 class Overruled(NamedTuple):
@@ -55,7 +59,11 @@ class Overruled(NamedTuple):
 
 
 class ReadBack:
-    """Reads back alternately the goals and the operating modes that the servos hold right before a cycle."""
+    """Reads back the goals that the servos hold right before a cycle, and now and then their operating modes instead.
+
+    Every cycle overwrites the goals of another master, so one that writes less often than this program is seen only if
+    the goals are read before every cycle.
+    """
 
     def __init__(
         self,
@@ -68,19 +76,23 @@ class ReadBack:
     ) -> None:
         kind = FastSyncRead if fast else SyncRead
         self.reads: tuple[GroupRead, GroupRead] = kind(ids, goal), kind(ids, mode)
-        self.due = -math.inf
         self.longest = 0.0
         """Duration of the longest recent read-back [s]; decays from one read-back to the next."""
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
         self._modes = tuple(modes)
         self._is_of_modes = True
-        self._until_mode = 0
+        self._modes_due = -math.inf
+        self._goals_since = 0
         self._draw = Random(1)
-        self._goals_sighted: list[deque[float]] = [deque() for _ in ids]
-        self._modes_sighted: list[deque[float]] = [deque() for _ in ids]
+        self._goals_sighted: list[_Sightings] = [deque() for _ in ids]
+        self._modes_sighted: list[_Sightings] = [deque() for _ in ids]
         self.doubts_until = -math.inf
         self.sighted: Overruled | None = None
         """The latest value read back that this program did not write; it is recent until `doubts_until`."""
+
+    def has_just_sighted(self, now: float) -> bool:
+        """Whether the read-back at `now` [s] found a foreign value."""
+        return self.doubts_until >= now + _IN_DOUBT_S
 
     @property
     def read(self) -> GroupRead:
@@ -95,28 +107,33 @@ class ReadBack:
         of_modes = self._is_of_modes
         is_nearly_sure = False
         for place, value in self._foreign(servos, sent):
-            times = (self._modes_sighted if of_modes else self._goals_sighted)[place]
-            while times and now - times[0] > _SIGHTED_S:
-                times.popleft()
-            times.append(now)
+            seen = (self._modes_sighted if of_modes else self._goals_sighted)[place]
+            while seen and now - seen[0][0] > _SIGHTED_S:
+                seen.popleft()
+            seen.append((now, value))
             if of_modes:
                 self.sighted = Overruled(place, "Operating Mode", value, self._modes[place])
             else:
                 self.sighted = Overruled(place, self._goals[place], value, sent[-1][place])
             is_ours = not of_modes and (value == 0 or any(value in each for each in sent))
-            most = _UNSURE_SIGHTINGS if is_ours else _SIGHTINGS
-            if len(times) >= most:
+            times = [when for when, other in seen if other == value or not is_ours]
+            most, least_s = (_UNSURE_SIGHTINGS, _UNSURE_S) if is_ours else (_SIGHTINGS, 0.0)
+            if len(times) >= most and now - times[0] >= least_s:
                 return self.sighted
             self.doubts_until = now + _IN_DOUBT_S
-            is_nearly_sure |= len(times) == most - 1
-        is_in_doubt = now < self.doubts_until
-        # A change of mode resets the goal, so a foreign goal may be its first sign.
+            is_nearly_sure |= len(times) >= most - 1
         if not is_nearly_sure:
-            most = _GOALS_PER_MODE_IN_DOUBT if is_in_doubt else 1 + int(_GOALS_PER_MODE * self._draw.random())
-            self._until_mode = most if of_modes else self._until_mode - 1
-            self._is_of_modes = self._until_mode == 0
-        self.due = now if is_in_doubt else now + _READ_BACK_S * (0.5 + self._draw.random())
+            self._choose_next(now)
         return None
+
+    def _choose_next(self, now: float) -> None:
+        """Choose what to read next; a change of mode resets the goal, so a foreign goal may be its first sign."""
+        if self._is_of_modes:
+            self._modes_due, self._goals_since = now + _MODES_S * (0.5 + self._draw.random()), 0
+        else:
+            self._goals_since += 1
+        enough = _GOALS_PER_MODE_IN_DOUBT if now < self.doubts_until else 1
+        self._is_of_modes = now >= self._modes_due and self._goals_since >= enough
 
     def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
         """Place and value of each servo that holds a value that this program did not write."""
@@ -126,6 +143,8 @@ class ReadBack:
                 for place, (answer, mode) in enumerate(zip(servos, self._modes, strict=True))
                 if answer is not None and answer[-1] != mode and len(answer) > 1
             ]
+        if all(answer is not None and answer[-1] == goal for answer, goal in zip(servos, sent[-1], strict=True)):
+            return []  # as almost always
         # A servo that received its neighbour's goal is not commanded by another master.
         own = set().union(*islice(reversed(sent), _RECENT))
         return [

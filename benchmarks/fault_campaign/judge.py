@@ -35,6 +35,9 @@ GAP_MS = 50
 LIE_RAD, LIE_RAD_S, LIE_SHARE = 0.1, 0.5, 0.1
 """Tolerances for the position and velocity reported to the program; the velocity also has a relative tolerance."""
 
+UNSURE_MS = 20
+"""How much earlier than an attack its effect may appear in the record [ms], which is written once the bus is used."""
+
 OBEYED = 0.1
 """Tolerance for a servo's goal, relative to the largest goal of the run."""
 
@@ -93,6 +96,8 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     bound = BOUND_MS
     if set(drawn.kinds) & UNHEARD:
         bound = max(bound, 1e3 * config.safety.watchdog + TRIP_MS)
+    again = [attack.start for attack in drawn.attacks if attack.kind == Kind.MODE_TAKEN]
+    since = since_again(time[driven], since, again)
     late_ms, unseen = _flowed_ms(time[driven], since), False
     plain = min([when for what, when in reasons if not what.endswith(TO_BE_SEEN)], default=np.inf)
     if late_ms > bound and _flowed_ms(time[driven], plain) <= bound:
@@ -110,6 +115,19 @@ def received(config: Config, story: Story) -> Heard:
     """What the program received in a run, and what it commanded."""
     told = _Told(config, story.traffic, 0.0)
     return Heard.of(config, told.heard, told.sent)
+
+
+def since_again(driven: NDArray[np.float64], since: float, again: list[float]) -> float:
+    """When the current had to end [s] if another program switched torque on again, at the times `again`.
+
+    driven: times at which current flowed [s]. Where it had ended after `since`, a new reason begins.
+    """
+    for when in sorted(again):
+        before = driven[driven < when - 1e-3 * GAP_MS]
+        was_off = not ((driven >= when - 1e-3 * GAP_MS) & (driven < when - 1e-3 * UNSURE_MS)).any()
+        if since < when and was_off and _flowed_ms(before, since) <= BOUND_MS:
+            since = when - 1e-3 * UNSURE_MS
+    return since
 
 
 def _flowed_ms(driven: NDArray[np.float64], since: float) -> float:

@@ -69,7 +69,7 @@ EQUIVALENT = {
     ("is_home * (", "self._was_below * 1.0  ->  self._was_below / 1.0"): "chain_watch: the same number",
     ("self._seen_at = 0.0", "0.0  ->  1.0"): "chain_watch: not used before the first sample",
     ("_NEVER = ", "62  ->  124"): "exchange: more cycles than any run has",
-    ("self.due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: every look sets it before it is read",
+    ("self._modes_due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: the first look sets it",
     (
         "self._clock = [",
         "0.0  ->  1.0",

@@ -190,7 +190,8 @@ class Guard:
                     index,
                     Cause.EARLY_MOTION,
                     f"moves before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
-                    "is allowed. Let the arm come to rest; check for a draught, a dragging cable or a hand.",
+                    "is allowed. Let the arm come to rest; check whether a hand or a cable pushes or holds it, or "
+                    "its horn slips.",
                 )
 
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
@@ -233,7 +234,8 @@ class Guard:
             index,
             Cause.JUMP,
             f"reports an angle that changed by {joint['moved']:+.3f} rad within {1e3 * joint['seconds']:.0f} ms; its "
-            f"velocity limit allows at most {joint['most']:.3f} rad. Check the encoder, its magnet and the supply.",
+            f"velocity limit allows at most {joint['most']:.3f} rad. Check the encoder, its magnet and the supply, "
+            "and whether its horn slips.",
         )
 
     def _outside(self, index: int, state: State) -> NoReturn:

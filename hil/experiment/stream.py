@@ -40,6 +40,9 @@ from hil.setup.servo_session import has_moved
 
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
+_STILL_STEPS = 1
+"""Change of the position of a joint at rest, in encoder steps: it may lie between two of them."""
+
 _BY_OTHER_GOALS = {
     *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
@@ -174,8 +177,21 @@ class Stream:
             moving = self._moving(self._play(self._silence(window), Phase.REST))
         if moving:
             raise ExperimentError(
-                f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again."
+                self._false_velocity(state, window)
+                or f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again."
             )
+
+    def _false_velocity(self, state: State, window: int) -> str:
+        """Which joint reports a velocity although its position has not changed in the last `window` samples."""
+        moved = np.ptp(self._recorder.samples["position"][-window:], axis=0)
+        for joint, velocity, way in zip(self._bus.joints, state.velocity, moved, strict=True):
+            if abs(velocity) > self._safety.rest_velocity and way <= _STILL_STEPS * abs(joint.position_unit):
+                return (
+                    f"{joint.title} reports a velocity of {velocity:.2f} rad/s before the start, but its position has "
+                    f"changed by {way:.4f} rad in the last {window * self._interval:.1f} s: one of the two readings is "
+                    "wrong. Check the encoder and its magnet; replace the servo if necessary."
+                )
+        return ""
 
     def _warm_up(self, segment: Segment) -> None:
         """Play periods that are recorded but not used."""

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from hil.drivers.control_table import load_control_table
 from hil.drivers.errors import PortLost
-from hil.drivers.exchange import Exchange
+from hil.drivers.exchange import HOST_S, Exchange
 from hil.drivers.packet import HEADER, Framer, Instruction, crc, encode, encode_status
 from hil.drivers.port import Port
+from hil.drivers.read_back import TRY_AGAIN_S
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import read_back_spans, spans
 from hil.drivers.sync_read import FastSyncRead, Span, SyncRead
@@ -365,6 +366,10 @@ def test_another_masters_instructions_between_two_cycles_are_counted() -> None:
         assert cycles.strangers == count
 
 
+ONE_READ_BACK_S = 0.004
+"""Time before a cycle that suffices for one read-back, but not for modes and goals."""
+
+
 def read_back_of(wire: Wire) -> Exchange:
     cycles = exchange(wire)
     modes = [Mode.CURRENT, Mode.CURRENT]
@@ -379,6 +384,55 @@ def test_another_masters_instructions_before_a_read_back_are_counted() -> None:
     wire.waiting = encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")
     cycles.overruled(wire.now() + 0.1)
     assert cycles.strangers == 1
+
+
+def test_modes_are_read_back_before_goals_if_there_is_time_for_both() -> None:
+    for available, asked in ((ONE_READ_BACK_S, [1]), (0.1, [1, 0])):
+        wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])
+        cycles = read_back_of(wire)
+        cycles.cycle([0, 0])
+        assert cycles._read_back is not None
+        reads = cycles._read_back.reads
+        sizes = [own.reply_size // 2 - 11 for own in reads]
+        wire.answers = [
+            b"".join(encode_status(servo, 0, bytes(sizes[is_of_modes])) for servo in (1, 2)) for is_of_modes in asked
+        ]
+        wire.written.clear()
+        assert cycles.overruled(wire.now() + available) is None and not cycles._late_possible
+        assert wire.written == [reads[is_of_modes].request for is_of_modes in asked]
+
+
+def test_a_lost_reply_or_a_long_cycle_delays_the_next_read_back_by_one_cycle_only() -> None:
+    fine = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+    wire = Wire([fine, b""])
+    cycles = read_back_of(wire)
+    for is_passing in (False, True):
+        cycles.cycle([0, 0])
+        before = wire.now()
+        assert cycles.overruled(before + (1e-4 if not is_passing else 0.1)) is None
+        assert cycles.read_back_at == (before if is_passing else before + TRY_AGAIN_S)
+
+
+@pytest.mark.parametrize(("front", "count"), [(8, 1), (12, 1), (7, 0), (4, 0)])
+def test_an_instruction_of_another_master_that_ours_cuts_off_is_counted(front: int, count: int) -> None:
+    fine = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+    wire = Wire([encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")[:front] + fine])
+    cycles = exchange(wire)
+    assert None not in cycles.cycle([0, 0]).servos
+    assert cycles.strangers == count
+
+
+def test_a_damaged_reply_is_not_taken_for_a_part_of_an_instruction() -> None:
+    whole = answer(1, 1, 2, 3)
+    for start in range(len(whole)):
+        for count in range(1, 5):
+            for value in Instruction:  # where a part is lost, data may stand where the instruction is expected
+                damaged = bytearray(whole[:9] + bytes((value,)) * 4 + whole[13:])
+                del damaged[start : start + count]
+                wire = Wire([bytes(damaged) + answer(2, 4, 5, 6)])
+                cycles = exchange(wire)
+                cycles.cycle([0, 0])
+                assert not cycles.strangers, (start, count, value)
 
 
 def test_goals_are_compared_with_what_was_sent_though_the_caller_changes_its_list() -> None:
@@ -396,7 +450,7 @@ def test_goals_are_compared_with_what_was_sent_though_the_caller_changes_its_lis
         size, held = (goal.size, (7, 8)) if cycles._read_back.read is goals_are_asked_for else (mode.size, (0, 0))
         answers = [bytes(size - 2) + struct.pack("<h", each) for each in held]
         wire.answers = [b"".join(encode_status(servo, 0, each) for servo, each in enumerate(answers, 1))]
-        assert cycles.overruled(wire.now() + 0.1) is None and not wire.answers
+        assert cycles.overruled(wire.now() + 0.9 * HOST_S) is None and not wire.answers
         assert not cycles._late_possible and not cycles.is_in_doubt
 
 
@@ -452,9 +506,9 @@ def test_a_read_back_behind_an_echo_is_read_whole() -> None:
     assert isinstance(mode, Span)
     wire.answers = [back.read.request + b"".join(encode_status(servo, 0, bytes(mode.size)) for servo in (1, 2))]
     began = wire.time
-    assert cycles.overruled(began + 0.1) is None
+    assert cycles.overruled(began + ONE_READ_BACK_S) is None
     assert not wire.waiting and not cycles._late_possible
-    assert wire.time < began + 0.1, "it did not wait for more"
+    assert wire.time < began + ONE_READ_BACK_S, "it did not wait for more"
 
 
 @pytest.mark.parametrize(("share", "latest"), [(0.4, True), (0.6, False)])

@@ -158,36 +158,27 @@ def test_a_servo_that_does_not_answer_is_left_to_the_next_cycle(fake_config: Mak
         assert bus.exchange([0.1, 0.1]).missing == (False, False)
 
 
-@pytest.mark.parametrize(("every", "phase"), [(2, 0), (2, 1), (3, 0), (3, 1), (3, 2)])
-def test_a_program_that_overwrites_some_goals_regularly_is_found_within_half_a_second(
-    fake_config: Make, every: int, phase: int
+@pytest.mark.parametrize(
+    ("interval", "every", "phase"),
+    [(0.01, 2, 0), (0.01, 2, 1), (0.01, 3, 0), (0.01, 3, 1), (0.01, 3, 2), (0.0025, 20, 0), (0.0025, 13, 8)],
+)
+def test_a_program_that_overwrites_some_goals_regularly_is_found_at_its_third_goal_at_the_latest(
+    fake_config: Make, interval: float, every: int, phase: int
 ) -> None:
+    """One may be missed at 400 Hz, because the modes are read then."""
     times = iter(range(10_000))
+    foreign: list[float] = []
 
-    def sometimes(servos: Any) -> None:
-        if next(times) % every == phase:
-            servos[2].write(102, b"\xf9\xff")
+    with driven(fake_config(interval=interval)) as bus:
 
-    with driven(fake_config(interval=INTERVAL)) as bus:
-        start = bus.port.clock.now()
+        def sometimes(servos: Any) -> None:
+            if next(times) % every == phase:
+                servos[2].write(102, b"\xf9\xff")
+                foreign.append(bus.port.clock.now())
+
         with pytest.raises(BusShared, match="Goal Current reads -7"):
-            after_each(bus, sometimes, 100)
-        assert bus.port.clock.now() - start < 0.5
-
-
-@pytest.mark.parametrize("phase", [0, 8])
-def test_a_program_that_overwrites_every_twentieth_goal_is_found_too(fake_config: Make, phase: int) -> None:
-    times = iter(range(10_000))
-
-    def seldom(servos: Any) -> None:
-        if next(times) % 20 == phase:
-            servos[2].write(102, b"\xf9\xff")
-
-    with driven(fake_config(interval=0.0025)) as bus:
-        start = bus.port.clock.now()
-        with pytest.raises(BusShared, match="Goal Current reads -7"):
-            after_each(bus, seldom, 800, 0.0025)
-        assert bus.port.clock.now() - start < 1.5
+            after_each(bus, sometimes, 5 * every, interval)
+        assert len(foreign) <= 3
 
 
 @pytest.mark.parametrize("interval", [0.004, 0.005, 1 / 150, 0.01])

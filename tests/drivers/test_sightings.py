@@ -1,5 +1,7 @@
 """How many foreign values, in which time, prove that another program writes to a servo."""
 
+import itertools
+
 import pytest
 
 from hil.drivers.control_table import load_control_table
@@ -42,6 +44,25 @@ def test_the_second_foreign_goal_is_proof_the_third_of_one_that_lost_writes_may_
     assert seen == proof and found == Overruled(1, "Goal Current", goal, OURS)
 
 
+@pytest.mark.parametrize(("apart", "proof"), [(0.001, 11), (0.004, 4), (0.005, 3)])
+def test_a_goal_that_lost_writes_may_leave_is_no_proof_before_the_status_was_read(apart: float, proof: int) -> None:
+    back = read_back()
+    look(back, 0.0)
+    assert not reads_modes(back)
+    found = [look(back, 1.0 + 1.001 * apart * number, goal=LONG_AGO) for number in range(proof)]
+    assert not any(found[:-1]) and found[-1]
+
+
+def test_different_goals_of_ours_are_what_lost_writes_leave() -> None:
+    back, now = read_back(), 0.0
+    for goal in (LONG_AGO, 56, 0) * 2:
+        while reads_modes(back):
+            look(back, now)
+        now += 0.1
+        assert look(back, now, goal=goal) is None
+    assert look(back, now + 0.1, goal=LONG_AGO)
+
+
 def test_the_second_foreign_mode_is_proof() -> None:
     back = read_back()
     seen, now, found = 0, 0.0, None
@@ -80,18 +101,14 @@ def test_one_sighting_short_of_proof_the_same_registers_are_read_again() -> None
         assert not reads_modes(back)
 
 
-def test_after_a_sighting_every_cycle_is_followed_by_a_read_back_for_a_while() -> None:
+def test_a_sighting_is_told_at_once_and_raises_doubts_for_a_while() -> None:
     back = read_back()
     look(back, 1.0)
-    assert 1.0 < back.due < 1.03
-    while reads_modes(back):
-        look(back, 1.0)
-    look(back, 1.0, goal=FOREIGN)
-    assert back.due == 1.0 and back.doubts_until == pytest.approx(1.3)
-    look(back, 1.29)
-    assert back.due == 1.29
-    look(back, 1.31)
-    assert back.due > 1.31
+    assert not reads_modes(back) and not back.has_just_sighted(1.0)
+    look(back, 1.01, goal=FOREIGN)
+    assert back.has_just_sighted(1.01) and back.doubts_until == pytest.approx(1.31)
+    look(back, 1.02)
+    assert not back.has_just_sighted(1.02) and back.doubts_until == pytest.approx(1.31)
 
 
 def test_a_refusal_or_a_missing_answer_shows_nothing() -> None:
@@ -118,13 +135,29 @@ def test_the_longest_read_back_fades() -> None:
     assert back.longest == 0.02
 
 
-def test_one_or_two_read_backs_of_goals_lie_between_two_of_modes() -> None:
-    back, counts, goals = read_back(), set(), 0
-    for number in range(200):
+@pytest.mark.parametrize("apart", [0.001, 0.0025, 0.01])
+def test_modes_are_read_every_25_ms_at_random_and_goals_otherwise(apart: float) -> None:
+    back, times = read_back(), []
+    for number in range(round(25 / apart)):
         if reads_modes(back):
-            counts.add(goals)
-            goals = 0
-        else:
-            goals += 1
-        look(back, 0.01 * number)
-    assert counts == {0, 1, 2}, "none before the first"
+            times.append(apart * number)
+        look(back, apart * number)
+    between = [after - before for before, after in itertools.pairwise(times)]
+    assert min(between) >= 0.0125 and max(between) < 0.0375 + 2.001 * apart
+    assert sum(between) / len(between) == pytest.approx(0.025 + 1.5 * apart, rel=0.05)
+
+
+def test_at_least_one_read_back_of_goals_follows_each_of_modes_and_four_in_doubt() -> None:
+    back = read_back()
+    for is_in_doubt, least in ((False, 1), (True, 4)):
+        counts, goals = set(), 99
+        for number in range(100):
+            now = number + 0.1
+            back.doubts_until = now + 1.0 if is_in_doubt else 0.0
+            if reads_modes(back):
+                counts.add(goals)
+                goals = 0
+            else:
+                goals += 1
+            look(back, now)
+        assert counts == {least, 99}

@@ -10,7 +10,7 @@ from benchmarks.fault_campaign.arms import RATES, Setting, names, settings
 from benchmarks.fault_campaign.attack import Attack, Kind
 from benchmarks.fault_campaign.campaign import Outcome, prepare
 from benchmarks.fault_campaign.draw import Drawn
-from benchmarks.fault_campaign.judge import judge_words, received
+from benchmarks.fault_campaign.judge import judge_words, received, since_again
 from benchmarks.fault_campaign.twin import has_healthy_twin
 from benchmarks.faults import campaign, figures
 
@@ -115,3 +115,13 @@ def test_a_healthy_twin_is_found_for_a_healthy_arm_and_a_stuck_one_but_not_for_o
         heard, angle=np.where(moves, heard.angle, heard.angle[at]), velocity=np.where(moves, heard.velocity, 0.0)
     )
     assert has_healthy_twin(ready.config, frozen, 1.2) and not has_healthy_twin(ready.config, frozen, 1.3)
+
+
+@pytest.mark.parametrize(
+    ("ended", "again", "since"),
+    [(1.08, 1.2, 1.18), (1.08, 0.9, 1.0), (1.17, 1.2, 1.0), (1.12, 1.2, 1.0), (1.08, 1.1, 1.0)],
+    ids=["ended in time", "before the reason", "has not ended", "ended too late", "ended just before"],
+)
+def test_torque_that_another_program_switches_on_is_a_new_reason(ended: float, again: float, since: float) -> None:
+    driven = np.concatenate((np.arange(0.5, ended, 1e-3), np.arange(again, again + 0.05, 1e-3)))
+    assert since_again(driven, 1.0, [again]) == pytest.approx(since)

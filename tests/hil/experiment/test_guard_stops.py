@@ -249,6 +249,23 @@ def test_an_arm_that_is_still_moving_when_the_rest_is_over(
     assert_stopped(ports[0])
 
 
+def test_a_velocity_without_motion_before_the_start_is_a_false_reading(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    config = arm()
+
+    def freeze() -> None:
+        elbow = ports[0].bus.servos[2]
+        right = elbow.present.state
+        elbow.present.state = lambda position, _velocity, current: right(position, 0.5, current)
+
+    run = RunFolder.create(tmp_path / "run", config)
+    said = r"'elbow' \(ID 2.* reports a velocity of 0\.\d\d rad/s before the start, but its position .* by 0\.000\d rad"
+    with pytest.raises(ExperimentError, match=said):
+        run_experiment(config, run, config.path, once(freeze, Phase.REST, 180), plan)
+    assert_stopped(ports[0])
+
+
 def test_a_goal_that_is_no_number_is_never_sent(arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan) -> None:
     config = arm()
     broken = plan.segments[0].period_current.copy()
