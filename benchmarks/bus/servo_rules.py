@@ -1,4 +1,4 @@
-"""What a servo answers and stores according to ROBOTIS' manual alone: the oracle of `benchmarks/bus/random_calls.py`.
+"""What a servo answers and stores according to ROBOTIS' manual alone: the oracle of `random_calls` and `conversations`.
 
 Written from the e-Manual's control tables and protocol page, without the fake's code, so that a difference between the
 two is settled by the manual. Where the manual is silent or vague, the oracle allows several answers, or forgets what a
@@ -6,12 +6,13 @@ register holds until it is read again.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 RESULT_FAIL, INSTRUCTION, CRC, DATA_RANGE, DATA_LENGTH, DATA_LIMIT, ACCESS = range(1, 8)
 FINE = 0
 
 TORQUE_ENABLE, OPERATING_MODE, SERVO_ID, BAUD = 64, 11, 7, 8
+POSITION_MODE, LED = 3, 65
 EEPROM_END = 64
 
 
@@ -66,6 +67,7 @@ _COMMON = (
     Row(84, 2, 0, 16383),
     Row(88, 2, 0, 16383, 0),
     Row(90, 2, 0, 16383, 0),
+    Row(98, 1, 0, 127, 0),
     Row(100, 2, -885, 885, limit=36),
     Row(108, 4, 0, 32767, 0),
     Row(112, 4, 0, 32767, 0),
@@ -76,32 +78,87 @@ _COMMON = (
     Row(146, 1, moves=True),
 )
 
-XM430_W350 = (
-    *_COMMON,
-    Row(31, 1, 0, 100, 80),
-    Row(32, 2, 95, 160, 160),
-    Row(34, 2, 95, 160, 95),
-    Row(36, 2, 0, 885, 885),
-    Row(38, 2, 0, 1193, 1193),
-    Row(44, 4, 0, 1023, 200),
-    Row(102, 2, -1193, 1193, limit=38),
-    Row(104, 4, -1023, 1023, limit=44),
-)
 
-XL330_M288 = (
-    *_COMMON,
-    Row(31, 1, 0, 100, 70),
-    Row(32, 2, 31, 70, 70),
-    Row(34, 2, 31, 70, 35),
-    Row(36, 2, 0, 885, 885),
-    Row(38, 2, 0, 1750, 1750),
-    Row(44, 4, 0, 2047, 445),
-    Row(102, 2, -1750, 1750, limit=38),
-    Row(104, 4, -2047, 2047, limit=44),
-)
+def _table(
+    velocity: int,
+    current: int | None,
+    gains: tuple[int, int, int, int, int] = (1920, 100, 0, 0, 800),
+    *,
+    celsius: int = 80,
+    volts: tuple[int, int, int] = (95, 95, 160),
+    fastest: int = 1023,
+    threshold: int = 10,
+) -> tuple[Row, ...]:
+    """One model's table.
+
+    velocity, current: the factory's Velocity and Current Limit. gains: Velocity I and P, Position D, I and P. volts:
+    lowest possible Voltage Limit, the factory's lower one, and the upper one. threshold: Moving Threshold.
+    """
+    differ = {24: threshold} | dict(zip((76, 78, 80, 82, 84), gains, strict=True))
+    differ |= {SERVO_ID: 1, BAUD: 1}
+    low, factory_low, high = volts
+    rows = [
+        replace(
+            row, initial=differ.get(row.address, row.initial), high=6 if is_330 and row.address == BAUD else row.high
+        )
+        for is_330 in (fastest > 1023,)
+        for row in _COMMON
+    ]
+    rows += [Row(31, 1, 0, 100, celsius), Row(32, 2, low, high, high), Row(34, 2, low, high, factory_low)]
+    rows += [Row(36, 2, 0, 885, 885), Row(44, 4, 0, fastest, velocity), Row(104, 4, -fastest, fastest, limit=44)]
+    if current is not None:
+        rows += [Row(38, 2, 0, current, current), Row(102, 2, -current, current, limit=38)]
+    return tuple(rows)
+
+
+def _x330(
+    velocity: int, current: int, gains: tuple[int, int, int, int, int], volts: tuple[int, int, int]
+) -> tuple[Row, ...]:
+    return _table(velocity, current, gains, celsius=70, volts=volts, fastest=2047)
+
+
+_BY_900 = (1920, 100, 0, 0, 900)
+_V5, _V12, _V24 = (31, 35, 70), (55, 55, 140), (60, 60, 160)
+
+TABLES = {
+    "XM430-W350": _table(200, 1193),
+    "XM430-W210": _table(330, 1193),
+    "XH430-W350": _table(130, 648, _BY_900),
+    "XH430-W210": _table(210, 648, _BY_900),
+    "XD430-T350": _table(130, 648, _BY_900),
+    "XD430-T210": _table(210, 648, _BY_900),
+    "XW430-T333": _table(139, 2047, _BY_900),
+    "XM540-W270": _table(128, 2047),
+    "XM540-W150": _table(230, 2047),
+    "XH540-W270": _table(167, 2047),
+    "XH540-W150": _table(300, 2047),
+    "XD540-T270": _table(167, 2047),
+    "XD540-T150": _table(300, 2047),
+    "XW540-T260": _table(167, 2047),
+    "XW540-T140": _table(304, 2047),
+    "XL330-M288": _x330(445, 1750, (1600, 180, 0, 0, 400), _V5),
+    "XL330-M077": _x330(1620, 1750, (400, 40, 0, 400, 400), _V5),
+    "XC330-M181": _x330(545, 2352, (1400, 100, 500, 0, 1200), _V5),
+    "XC330-M288": _x330(350, 2352, (1600, 50, 500, 0, 1100), _V5),
+    "XC330-T181": _x330(510, 910, (1200, 40, 0, 0, 900), _V12),
+    "XC330-T288": _x330(320, 910, (1200, 40, 0, 0, 900), _V12),
+    "XL430-W250": _table(265, None, (1000, 100, 4000, 0, 640), celsius=72, volts=(60, 60, 140)),
+    "XC430-W150": _table(460, None, (1920, 100, 0, 0, 460), volts=_V24, threshold=20),
+    "XC430-W240": _table(306, None, (1920, 100, 0, 0, 700), volts=_V24),
+}
+"""Control table of every X model for 5 to 12 V with one motor, by the pages x/<model>."""
+
+for _name in [name for name in TABLES if name.startswith("XW")]:  # watertight: without an LED
+    TABLES[_name] = tuple(row for row in TABLES[_name] if row.address != LED)
+
+XM430_W350, XL330_M288 = TABLES["XM430-W350"], TABLES["XL330-M288"]
 
 MODES = {0, 1, 3, 4, 5, 16}
-FORGOTTEN_WITH_MODE = (76, 78, 80, 82, 84, 88, 90, 100, 102, 104, 108, 112, 116)
+WITHOUT_CURRENT = {1, 3, 4, 16}
+"""Operating modes of all models, and of those without a current sensor."""
+
+GAINS = (76, 78, 80, 82, 84, 88, 90)
+FORGOTTEN_WITH_MODE = (*GAINS, 100, 102, 104, 108, 112, 116)
 """Registers that a change of Operating Mode may set to values of the new mode."""
 
 
@@ -113,6 +170,7 @@ class Rules:
 
     def __init__(self, table: Iterable[Row], values: Mapping[int, int]) -> None:
         self.rows = {row.address: row for row in table}
+        self.modes = MODES if 102 in self.rows else WITHOUT_CURRENT
         self.held = {address: value for address, value in values.items() if not self.rows[address].moves}
         self.waiting: tuple[int, bytes] | None = None
 
@@ -164,7 +222,7 @@ class Rules:
             reasons.add(DATA_LENGTH)
         else:
             value = int.from_bytes(data, "little", signed=row.low < 0)
-            if not row.low <= value <= row.high or (address == OPERATING_MODE and value not in MODES):
+            if not row.low <= value <= row.high or (address == OPERATING_MODE and value not in self.modes):
                 # A goal's range is given by its limit, so either error describes it.
                 reasons |= {DATA_RANGE} if row.limit is None and not row.moves else {DATA_RANGE, DATA_LIMIT}
         if row.is_eeprom and self.torque:
@@ -211,6 +269,8 @@ class Rules:
                 self.held.pop(row.address, None)
                 if row.initial is not None:
                     self.held[row.address] = row.initial
+        if self.held.get(OPERATING_MODE) != POSITION_MODE:
+            self._forget(GAINS)  # the table's are those of the factory's mode
 
     def factory_reset(self, kept: Iterable[int]) -> None:
         """Reset EEPROM to its factory values except for the registers `kept`; the servo reboots."""

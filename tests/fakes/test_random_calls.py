@@ -44,9 +44,11 @@ def changed(address: int, row: Row) -> tuple[Row, ...]:
 def test_a_servo_that_differs_is_found(address: int, row: Row, named: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(random_calls.TABLES, "XM430-W350", changed(address, row))
     asking = client(3)
-    call(asking, CALLS)
-    assert any(str(address) in each for each in asking.differences)
-    assert named.startswith("(") or any(named in each for each in asking.differences)
+    for _ in range(4):
+        call(asking, CALLS)
+        if about := [each for each in asking.differences if f" {address}" in each]:
+            break
+    assert about and (named.startswith("(") or any(named in each for each in about))
 
 
 @pytest.mark.parametrize(
