@@ -41,6 +41,7 @@ _REPEATS = _HEIGHTS * np.exp(-((2.0 * np.pi * _ORDERS * _STD[:, None]) ** 2))
 """Power of each order of the rounding error that repeats at each of `_STD`, without drift (stds, orders) [steps^2]."""
 _SLOW = 1.0 / 16.0  # fraction of the lines that drift may occupy
 _CHANGE = 0.03  # largest relative change of the motion from pass to pass
+_SURE = 3.0  # standard errors by which coloured noise must exceed white noise
 _OCTAVE = 4.0  # largest ratio of the powers of noise in successive octaves: that of a first-order filter
 _MOST_NOISE = 1.0  # exponent of the correction for noise in the drift; above it, an order counts as decorrelated
 
@@ -69,7 +70,7 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
     return noise
 
 
-def coloured_noise(passes: Sequence[Array], averaged: int = 1) -> Array | None:
+def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> Array | None:
     """Return the standard deviation of one mean sample's noise in excess of white noise (joints,) [rad].
 
     It is 0 unless significant. On the lines on which the motion may have changed from pass to pass, the noise is
@@ -79,14 +80,17 @@ def coloured_noise(passes: Sequence[Array], averaged: int = 1) -> Array | None:
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None
     found = [[_excess(*joint) for joint in zip(*each, strict=True)] for each in pairwise(passes)]
-    excess, error = np.mean(found, axis=0).T / (2.0 * averaged)
-    noise: Array = np.sqrt(np.where(excess > AGREE * error, excess, 0.0))
+    excess, fast = 0.5 * np.mean(found, axis=0).T
+    # Most of the rounding error may repeat, so that small changes of the motion stand out against what is left of it.
+    known = np.maximum(fast, ROUNDING * step**2)
+    error = known * np.sqrt(2.0 * (0.75 + 0.75**2 / 0.25) / passes[0].shape[1])
+    noise: Array = np.sqrt(np.where(excess > _SURE * error, excess / averaged, 0.0))
     return noise
 
 
 def _excess(former: Array, later: Array) -> tuple[float, float]:
-    """Return the power of the difference of two passes (samples,) beyond that of its fast part, and its standard error
-    if the noise is white.
+    """Return the power of the difference of two passes (samples,) beyond white noise as in its fast part, and the
+    latter's.
     """
     difference = later - former
     valid = np.isfinite(difference)
@@ -97,12 +101,12 @@ def _excess(former: Array, later: Array) -> tuple[float, float]:
     strong = np.flatnonzero(2.0 * _CHANGE**2 * _spectrum(window * (motion - motion.mean()))[0] > fast)
     slow = max(int(_SLOW * power.shape[1]), int(strong[-1]) + 1 if strong.size else 1, 1)
     if 4 * slow > _fastest(power) or not valid.any():
-        return 0.0, 0.0
+        return 0.0, fast
     excess = float(_beyond_fast(power, slow)[0])
     if not valid.all():  # interpolation leaves less of fast noise than of slow noise
         like = _spectrum(interpolated_noise(valid))
         excess -= fast * float(np.mean(_beyond_fast(like, slow)) / np.mean(like[:, _fastest(like) :]))
-    return excess, fast * float(np.sqrt((0.75 + 0.75**2 / 0.25) / power.shape[1]))
+    return excess, fast
 
 
 def _spectrum(signal: Array) -> Array:

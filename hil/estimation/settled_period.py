@@ -75,7 +75,7 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
         position=_mean_of_periods(on_time),
         position_std=scatter(on_time),
         repeated_noise=repeated_noise(passes, period.position_step, experiment.periods),
-        coloured_noise=coloured_noise(passes, experiment.periods),
+        coloured_noise=coloured_noise(passes, period.position_step, experiment.periods),
     )
 
 
