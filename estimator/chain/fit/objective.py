@@ -304,8 +304,8 @@ class ChainProblem:
             latest.x, latest.parts, latest.size = x.copy(), {}, 0
             latest.objects, latest.settings = self._objects, self._settings
         if index in latest.parts:
-            for part, position, derivative in latest.parts[index]:
-                yield part, _missed(position, measured[part]), derivative
+            for part, known, derivative in latest.parts[index]:
+                yield part, _missed(known, measured[part]), derivative
             return
         run = self.run_of(period, parameters)
         names = self.coordinates.names
