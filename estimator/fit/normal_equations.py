@@ -20,12 +20,26 @@ def normal_equations(jacobian: Array, residual: Array, weight: Array | None = No
 
     jacobian: J (rows, columns). residual: r (rows,). weight: diagonal of W (rows,), by default 1.
     """
-    columns = jacobian.shape[1]
-    product = np.zeros((columns, columns + 1))
-    both = np.ascontiguousarray(jacobian)
-    _multiply(both, residual, np.ones(len(residual)) if weight is None else weight, product)
-    normal = np.tril(product[:, :-1])
-    return normal + np.tril(normal, -1).T, product[:, -1]
+    products = Products(jacobian.shape[1])
+    products.add(jacobian, residual, np.ones(len(residual)) if weight is None else weight)
+    return products.sums
+
+
+class Products:
+    """Normal equations of rows that are added in several parts."""
+
+    def __init__(self, columns: int) -> None:
+        self._product = np.zeros((columns, columns + 1))
+
+    def add(self, jacobian: Array, residual: Array, weight: Array) -> None:
+        """Add rows; arguments as in `normal_equations`."""
+        _multiply(np.ascontiguousarray(jacobian), residual, weight, self._product)
+
+    @property
+    def sums(self) -> tuple[Array, Array]:
+        """J'WJ (columns, columns) and J'Wr (columns,)."""
+        normal = np.tril(self._product[:, :-1])
+        return normal + np.tril(normal, -1).T, self._product[:, -1]
 
 
 def _loop(J: Any, r: Any, weight: Any, product: Any) -> None:

@@ -7,7 +7,7 @@ follow any motion but carry little information; soft gains carry nearly as much 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation, pie
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.covariance import Scatter
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic, minimise
-from hil.estimator.fit.normal_equations import normal_equations
+from hil.estimator.fit.normal_equations import Products
 from hil.estimator.options import MinimiserOptions
 from hil.estimator.simulation.drive import torque_and_slopes
 
@@ -30,11 +30,17 @@ MOST_KEPT = 1 << 26  # bytes of derivatives
 
 @dataclass
 class _Latest:
-    """The latest simulation with derivatives, kept because the covariance needs the one at the minimum again."""
+    """The latest simulation with derivatives.
+
+    Problems that differ in weights or prior only share it, and the covariance needs the one at the minimum again.
+    """
 
     x: Array | None = None
+    objects: tuple[object, ...] = ()
+    settings: tuple[float, ...] = ()
+    """What else the simulation depends on."""
     parts: dict[int, list[tuple[slice, Array, Array]]] = field(default_factory=dict)
-    """Samples, residuals and derivatives of each period that was simulated to its end."""
+    """Samples, angles and derivatives of each period that was simulated to its end."""
     size: int = 0
 
 
@@ -70,7 +76,7 @@ class ChainProblem:
     prior still decides what the data do not determine."""
     added: tuple[Array | None, ...] = ()
     """Known base parameters of what was added to the arm in each period (base parameters,) [SI]; None for nothing."""
-    _latest: _Latest = field(init=False, repr=False, compare=False, default_factory=_Latest)
+    latest: _Latest = field(repr=False, compare=False, default_factory=_Latest)
 
     @property
     def count(self) -> int:
@@ -97,10 +103,14 @@ class ChainProblem:
         return ChainRun(
             self._thinned(np.moveaxis(torque, 0, 2)),
             self._thinned(np.transpose(slopes, (2, 3, 0, 1))),
-            np.ascontiguousarray(period.position.T[:: self.every][: period.samples // self.every]),
+            self._measured(period),
             self.every / (period.rate * self.steps),
             self.finer,
         )
+
+    def _measured(self, period: SettledPeriod) -> Array:
+        """Return the angles that are compared (samples, joints) [rad]."""
+        return np.ascontiguousarray(period.position.T[:: self.every][: period.samples // self.every])
 
     def _thinned(self, of_steps: Array) -> Array:
         """Average values per step (samples, steps, ...) over groups of `every` samples."""
@@ -117,28 +127,60 @@ class ChainProblem:
 
     def evaluate(self, x: Array) -> Quadratic:
         """Return the sum of squares at `x` with its normal equations."""
+        return self._with_prior(x, self._of_data(x))
+
+    def tempered(self, x: Array) -> tuple["ChainProblem", Quadratic]:
+        """Return the problem with the prior's weight raised by as much as the residual at `x` exceeds the assumed
+        noise, and its sum of squares there.
+
+        Repeated readings count as one, as they do in the sum of squares.
+        """
+        data = self._of_data(x)
+        problem = replace(self, prior_weight=max(1.0, data.cost / self.counted))
+        return problem, problem._with_prior(x, data)
+
+    @property
+    def counted(self) -> float:
+        """Number of samples compared; repeated readings count as in the sum of squares."""
+        counted = (
+            np.square(weight * period.noise)[:: self.every]
+            for weight, period in zip(self.weights, self.periods, strict=True)
+        )
+        return max(1.0, sum(float(np.sum(each)) for each in counted))
+
+    def _with_prior(self, x: Array, data: Quadratic) -> Quadratic:
+        """Return the sum of squares with the prior's part; infinite as a whole if that of the data is."""
+        normal, gradient = data.normal.copy(), data.gradient.copy()
+        if not np.isfinite(data.cost):
+            return Quadratic(np.inf, normal, gradient)
+        cost = data.cost + self._add_prior(x, normal, gradient)
+        if not (np.isfinite(cost) and np.all(np.isfinite(normal))):
+            return Quadratic(np.inf, np.zeros_like(normal), np.zeros_like(gradient))
+        return Quadratic(cost, normal, gradient)
+
+    def _of_data(self, x: Array) -> Quadratic:
+        """Return the data's part of the sum of squares at `x`."""
         parameters = self.parameters(x)
         normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
         if not all(map(np.isfinite, parameters.values())):
             return Quadratic(np.inf, normal, gradient)
-        cost = self._add_prior(x, normal, gradient)
+        cost = 0.0
         for index, (period, weight) in enumerate(zip(self.periods, self.weights, strict=True)):
             where, slopes = self._where(x, index)
-            J_J, J_r = np.zeros((slopes.size, slopes.size)), np.zeros(slopes.size)
+            products = Products(slopes.size)
+            squares = np.square(weight[:: self.every])
             for part, r, J in self._pieces(x, index, period, parameters):
                 if r is None:
                     return Quadratic(np.inf, normal, gradient)
-                square = np.square(weight[:: self.every][part]).reshape(-1)
-                found = normal_equations(J.reshape(-1, slopes.size), r.reshape(-1), square)
+                square = squares[part].reshape(-1)
+                products.add(J.reshape(-1, slopes.size), r.reshape(-1), square)
                 with np.errstate(over="ignore", invalid="ignore"):  # a motion that diverges has an infinite sum
-                    J_J, J_r = J_J + found[0], J_r + found[1]
                     cost += float(square @ r.reshape(-1) ** 2)
+            J_J, J_r = products.sums
             with np.errstate(over="ignore", invalid="ignore"):
                 normal[np.ix_(where, where)] += J_J * np.outer(slopes, slopes)
                 gradient[where] += J_r * slopes
-        if not (np.isfinite(cost) and np.all(np.isfinite(normal))):
-            return Quadratic(np.inf, np.zeros_like(normal), np.zeros_like(gradient))
-        return Quadratic(cost, normal, gradient)
+        return Quadratic(cost if np.isfinite(cost) else np.inf, normal, gradient)
 
     def minimise(
         self,
@@ -169,31 +211,51 @@ class ChainProblem:
     def cost(self, x: Array) -> float:
         """Return the sum of squares at `x` alone; infinite if the motion diverges."""
         total = self.prior_cost(x)
-        for (run, position), weight in zip(self._motions(x), self.weights, strict=True):
+        for position, period, weight in zip(self._motions(x), self.periods, self.weights, strict=True):
             if position is None:
                 return np.inf
-            total += float(np.nansum(np.square(weight[:: self.every][: len(position)] * (position - run.measured))))
+            missed = position - self._measured(period)
+            total += float(np.nansum(np.square(weight[:: self.every][: len(position)] * missed)))
         return total
 
     def positions(self, x: Array) -> tuple[Array, ...] | None:
         """Return the predicted positions of each period (joints, samples) [rad]; None if a motion diverges."""
         found = []
-        for _, position in self._motions(x):
+        for position in self._motions(x):
             if position is None:
                 return None
             found.append(position.T)
         return tuple(found)
 
-    def _motions(self, x: Array) -> Iterator[tuple[ChainRun, Array | None]]:
-        """Yield each period's run and its simulated positions (samples, joints) [rad], or None if the simulation
-        diverges.
-        """
+    def _motions(self, x: Array) -> Iterator[Array | None]:
+        """Yield each period's simulated positions (samples, joints) [rad], or None if the simulation diverges."""
         parameters = self.parameters(x)
         for index, period in enumerate(self.periods):
+            if self._knows(x) and index in self.latest.parts:
+                yield np.concatenate([position for _, position, _ in self.latest.parts[index]])
+                continue
             run = self.run_of(period, parameters)
             moved = self._of_period(index, parameters)
             simulation = Simulation(self.model.base, moved, self.start(x, index), self.gain(period))
-            yield run, simulation.go_on(run, slice(0, len(run.measured)))[0]
+            yield simulation.go_on(run, slice(0, len(run.measured)))[0]
+
+    def _knows(self, x: Array) -> bool:
+        """Whether the latest simulation with derivatives was this one."""
+        latest = self.latest
+        return (
+            latest.x is not None
+            and all(one is other for one, other in zip(latest.objects, self._objects, strict=True))
+            and latest.settings == self._settings
+            and np.array_equal(latest.x, x)
+        )
+
+    @property
+    def _objects(self) -> tuple[object, ...]:
+        return self.periods, self.model, self.coordinates.names, self.state_scale, self.added
+
+    @property
+    def _settings(self) -> tuple[float, ...]:
+        return self.steps, self.softness, self.finer, self.every
 
     def scatter(self, x: Array, lags: int) -> Array:
         """Return the sum of products of the scores, in coordinates; see `hil.estimator.fit.covariance`."""
@@ -236,17 +298,20 @@ class ChainProblem:
         The residuals, predicted minus measured (samples, joints) [rad], are 0 where a sample is missing, and None if
         the motion diverges. The derivatives are with respect to parameters and initial state.
         """
-        latest = self._latest
-        if latest.x is None or not np.array_equal(latest.x, x):
+        latest = self.latest
+        measured = self._measured(period)
+        if not self._knows(x):
             latest.x, latest.parts, latest.size = x.copy(), {}, 0
+            latest.objects, latest.settings = self._objects, self._settings
         if index in latest.parts:
-            yield from latest.parts[index]
+            for part, known, derivative in latest.parts[index]:
+                yield part, _missed(known, measured[part]), derivative
             return
         run = self.run_of(period, parameters)
         names = self.coordinates.names
         moved, added = self._of_period(index, parameters), self._added(index)
         simulation = Simulation(self.model.base, moved, self.start(x, index), self.gain(period), names)
-        kept = []
+        kept: list[tuple[slice, Array, Array]] = []
         for part in pieces(len(run.measured)):
             position, derivative = simulation.go_on(run, part)
             if position is None:  # the derivatives are not finite either
@@ -255,11 +320,10 @@ class ChainProblem:
             complete(self.model.base, parameters, names, derivative)
             if added is not None:
                 derivative[:, :, names.index(ADDED_MASS)] = derivative[:, :, : added.size] @ added
-            r = np.where(np.isnan(run.measured[part]), 0.0, position - run.measured[part])
-            yield part, r, derivative
+            yield part, _missed(position, measured[part]), derivative
             latest.size += derivative.nbytes
             if latest.size < MOST_KEPT:
-                kept.append((part, r, derivative))
+                kept.append((part, position, derivative))
         if latest.size < MOST_KEPT:
             latest.parts[index] = kept
 
@@ -302,3 +366,8 @@ class ChainProblem:
             gradient[scales] += factor * precision @ x[scales]  # the coordinates are logarithms
             cost += float(x[scales] @ precision @ x[scales])
         return factor * cost
+
+
+def _missed(position: Array, measured: Array) -> Array:
+    """Return the residuals, 0 where a sample is missing."""
+    return np.where(np.isnan(measured), 0.0, position - measured)

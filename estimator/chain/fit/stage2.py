@@ -243,7 +243,7 @@ def _softened_later(coarse: ChainProblem, x: Array, options: ChainOptions) -> tu
     every_sample = replace(options, first_step=0.0, ftol_coarse=options.ftol_near, softness=options.softness[1:])
     soft, softness, more = _softened(problem, found.x, every_sample)
     problem = replace(problem, softness=softness)
-    found = _tempered(problem, soft).minimise(soft, options.ftol_near)
+    found, _ = _minimised(problem, soft, options.ftol_near)
     return problem, found, spent + more + found.iterations
 
 
@@ -257,13 +257,13 @@ def _resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple
     bounded = replace(coarse.coordinates, width_floor=floor)
     soft = bounded.raised(soft)
     sticking = replace(coarse, coordinates=bounded, finer=options.finer, reach=1.0)
-    found = _tempered(sticking, soft).minimise(soft, options.ftol_near)
+    found, _ = _minimised(sticking, soft, options.ftol_near)
     return sticking, found, found.iterations
 
 
 def _level(problem: ChainProblem, x: Array) -> float:
     """Return the RMS weighted residual at `x`; 1 for noise alone."""
-    return float(np.sqrt(replace(problem, prior_weight=0.0).cost(x) / _counted(problem)))
+    return float(np.sqrt(replace(problem, prior_weight=0.0).cost(x) / problem.counted))
 
 
 def _narrowed(problem: ChainProblem, near: ChainFit, options: ChainOptions) -> Array:
@@ -286,9 +286,8 @@ def _softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Ar
     for frequency in options.softness:
         last = frequency == options.softness[-1]
         every = 1 if last or coarse.steps > 1 else skip
-        trial = _tempered(replace(coarse, softness=frequency, every=every), x)
         try:
-            found = trial.minimise(x, options.ftol_coarse)
+            found, trial = _minimised(replace(coarse, softness=frequency, every=every), x, options.ftol_coarse)
         except ConvergenceError:
             if cost is None:
                 raise
@@ -303,22 +302,11 @@ def _softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Ar
     return x, softness, spent
 
 
-def _tempered(problem: ChainProblem, x: Array) -> ChainProblem:
-    """Return the problem with the prior's weight raised by as much as the residual at `x` exceeds the assumed noise.
-
-    Repeated readings count as one, as they do in the sum of squares.
-    """
-    excess = replace(problem, prior_weight=0.0).cost(x) / _counted(problem)
-    return replace(problem, prior_weight=max(1.0, excess))
-
-
-def _counted(problem: ChainProblem) -> float:
-    """Return the number of samples compared; repeated readings count as in the sum of squares."""
-    counted = (
-        np.square(weight * period.noise)[:: problem.every]
-        for weight, period in zip(problem.weights, problem.periods, strict=True)
-    )
-    return max(1.0, sum(float(np.sum(each)) for each in counted))
+def _minimised(problem: ChainProblem, x: Array, ftol: float) -> tuple[Minimum, ChainProblem]:
+    """Return the minimum from `x` with the prior's weight raised by the residual there, and that problem."""
+    trial, at = problem.tempered(x)
+    found = trial.minimise(x, ftol, at=at)
+    return replace(found, iterations=found.iterations + 1), trial
 
 
 def _problem(

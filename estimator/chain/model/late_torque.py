@@ -78,25 +78,26 @@ def complete(base: BaseParameters, parameters: Mapping[str, float], names: tuple
     base parameters come first.
     """
     at = {name: index for index, name in enumerate(names)}
-    ratios = [parameters.get(f"lag_ratio_{joint + 1}", 1.0) for joint in range(base.chain.joints)]
     generating = _generating(base.chain.joints, parameters)
     # At the limit the loss no longer grows with its causes.
     free = _possible(base, parameters, generating) == 1.0
     for joint, share, viscous, late in generating if free else ():
         by_rotor = derivative[:, :, : base.count] @ rotor(base, joint)
-        own = f"lag_ratio_{joint + 1}"
+        own_lag = f"lag_ratio_{joint + 1}"
         for name, change in {
             f"viscous_{joint + 1}": share * late,
             f"back_emf_{joint + 1}": viscous * late,
-            own if own in at else "lag": share * viscous,
+            own_lag if own_lag in at else "lag": share * viscous,
             "delay": share * viscous if parameters.get("delay", 0.0) > 0.0 else 0.0,
         }.items():
             if name in at:
                 derivative[:, :, at[name]] -= change * by_rotor
-    for joint, ratio in enumerate(ratios):
-        if (index := at.get(f"lag_ratio_{joint + 1}")) is not None:
-            derivative[:, :, at["lag"]] += ratio * derivative[:, :, index]
-            derivative[:, :, index] *= parameters["lag"]
+    own = [index for joint in range(base.chain.joints) if (index := at.get(f"lag_ratio_{joint + 1}")) is not None]
+    if own:  # consecutive: see `ChainModel.names`
+        rows = derivative.reshape(-1, derivative.shape[2])
+        of_own = rows[:, own[0] : own[-1] + 1]
+        rows[:, at["lag"]] += of_own @ np.array([parameters[names[index]] for index in own])
+        of_own *= parameters["lag"]
 
 
 def _generating(joints: int, parameters: Mapping[str, float]) -> list[tuple[int, float, float, float]]:

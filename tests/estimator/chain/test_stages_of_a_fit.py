@@ -13,6 +13,7 @@ from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.fit.stage1 import fit_lines
 from hil.estimator.chain.fit.stage2 import DEFAULTS, REPEATED, ChainFit
 from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.simulation.sensitivity import Simulation
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.fit.levenberg_marquardt import Minimum, Quadratic
 
@@ -43,13 +44,50 @@ def test_the_prior_counts_as_much_more_as_the_residual_exceeds_the_noise(
     period = sticking(often)
     problem, x = problem_of(setup, period)
 
-    def cost(of: ChainProblem, _: np.ndarray) -> float:  # every sample is off by as many standard deviations
-        return sum(float(np.sum((weight[:: of.every] * off * period.noise) ** 2)) for weight in of.weights)
+    def of_data(of: ChainProblem, x: np.ndarray) -> Quadratic:  # every sample is off by as many standard deviations
+        cost = sum(float(np.sum((weight[:: of.every] * off * period.noise) ** 2)) for weight in of.weights)
+        return Quadratic(cost, np.eye(x.size), np.zeros(x.size))
 
-    monkeypatch.setattr(ChainProblem, "cost", cost)
+    monkeypatch.setattr(ChainProblem, "_of_data", of_data)
     for every in (1, 2):
-        found = stage2._tempered(replace(problem, every=every), x).prior_weight
-        assert found == pytest.approx(max(1.0, off**2))
+        tempered, at = replace(problem, every=every).tempered(x)
+        assert tempered.prior_weight == pytest.approx(max(1.0, off**2))
+        assert at.cost == pytest.approx(of_data(tempered, x).cost + tempered.prior_cost(x))
+        assert np.any(at.normal != np.eye(x.size))  # the prior's part is in it
+
+
+def test_problems_that_differ_in_weights_share_one_simulation(
+    setup: bench.Setup, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the same sums of squares as without sharing; one that differs in anything else is simulated anew."""
+    problem, x = problem_of(setup, sticking(1))
+    x = stage2._towards_prior(problem, x, DEFAULTS)
+    simulated: list[Simulation] = []
+    go_on = Simulation.go_on
+    monkeypatch.setattr(Simulation, "go_on", lambda self, *args: simulated.append(self) or go_on(self, *args))
+
+    def fresh(other: ChainProblem) -> ChainProblem:
+        return replace(other, latest=type(other.latest)())
+
+    first = problem.evaluate(x)
+    once = len(simulated)
+    lighter = replace(problem, weights=tuple(0.5 * weight for weight in problem.weights), reach=0.1, prior_weight=2.0)
+    shared, positions, cost = lighter.evaluate(x), problem.positions(x), problem.cost(x)
+    assert len(simulated) == once
+    assert shared.cost == fresh(lighter).evaluate(x).cost
+    assert cost == pytest.approx(first.cost)
+    np.testing.assert_array_equal(positions, fresh(problem).positions(x))
+    others: tuple[dict[str, Any], ...] = (
+        {"softness": 1.0},
+        {"steps": 3},
+        {"finer": 4},
+        {"steps": 1, "every": 2},
+        {"state_scale": 1.1 * problem.state_scale},
+    )
+    for other in others:
+        changed = replace(problem, **other)
+        problem.evaluate(x)
+        assert changed.cost(x) == pytest.approx(fresh(changed).cost(x), rel=1e-12), other
 
 
 def test_repeated_readings_count_as_a_few(setup: bench.Setup) -> None:
@@ -70,7 +108,10 @@ class Softer:
     def prior_cost(self, x: np.ndarray) -> float:
         return self.costs[self.softness][1]
 
-    def minimise(self, x: np.ndarray, ftol: float) -> Minimum:
+    def tempered(self, x: np.ndarray) -> tuple["Softer", None]:
+        return self, None
+
+    def minimise(self, x: np.ndarray, ftol: float, at: None) -> Minimum:
         return Minimum(x + 1.0, Quadratic(sum(self.costs[self.softness]), np.eye(2), np.zeros(2)), 1)
 
 
@@ -83,10 +124,7 @@ class Softer:
         ({3.0: (1e3, 0.0), 1.5: (1e3, 1e6), 1.0: (1e3, 1e6)}, 1.0),  # only the prior counts more
     ],
 )
-def test_the_softest_observer_that_follows_is_kept(
-    monkeypatch: pytest.MonkeyPatch, costs: dict[float, tuple[float, float]], kept: float
-) -> None:
-    monkeypatch.setattr(stage2, "_tempered", lambda problem, _: problem)
+def test_the_softest_observer_that_follows_is_kept(costs: dict[float, tuple[float, float]], kept: float) -> None:
     problem: Any = Softer(costs, (sticking(1),))
     x, softness, _ = stage2._softened(problem, np.zeros(2), DEFAULTS)
     assert softness == kept
