@@ -243,7 +243,7 @@ class Exchange:
             back.took(min(now - before, 2.0 * takes))
         self.read_back_at = now
         found = back.look(servos, self._sent, now)
-        if back.has_just_sighted(now):
+        if back.is_unexpected:
             self.read_status_next()  # it distinguishes lost goals from another master's
         return found
 

@@ -86,13 +86,11 @@ class ReadBack:
         self._draw = Random(1)
         self._goals_sighted: list[_Sightings] = [deque() for _ in ids]
         self._modes_sighted: list[_Sightings] = [deque() for _ in ids]
+        self.is_unexpected = False
+        """Whether the latest read-back found anything else than the latest goals or the modes that were set."""
         self.doubts_until = -math.inf
         self.sighted: Overruled | None = None
         """The latest value read back that this program did not write; it is recent until `doubts_until`."""
-
-    def has_just_sighted(self, now: float) -> bool:
-        """Whether the read-back at `now` [s] found a foreign value."""
-        return self.doubts_until >= now + _IN_DOUBT_S
 
     @property
     def read(self) -> GroupRead:
@@ -137,14 +135,18 @@ class ReadBack:
 
     def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
         """Place and value of each servo that holds a value that this program did not write."""
+        expected = self._modes if self._is_of_modes else sent[-1]
+        self.is_unexpected = any(
+            answer is not None and answer[-1] != value for answer, value in zip(servos, expected, strict=True)
+        )
+        if not self.is_unexpected:
+            return []
         if self._is_of_modes:
             return [
                 (place, answer[-1])
                 for place, (answer, mode) in enumerate(zip(servos, self._modes, strict=True))
                 if answer is not None and answer[-1] != mode and len(answer) > 1
             ]
-        if all(answer is not None and answer[-1] == goal for answer, goal in zip(servos, sent[-1], strict=True)):
-            return []  # as almost always
         # A servo that received its neighbour's goal is not commanded by another master.
         own = set().union(*islice(reversed(sent), _RECENT))
         return [

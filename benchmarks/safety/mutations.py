@@ -45,6 +45,7 @@ TESTS = {
     "hil/plan/silence.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/plan/brake.py": [f"{_EXPERIMENT}/test_brake.py"],
     "hil/experiment/stream.py": [
+        f"{_EXPERIMENT}/test_stream_schedule.py",
         *(f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py", f"{_EXPERIMENT}/test_lowering.py"),
     ],
     "hil/drivers/exchange.py": [

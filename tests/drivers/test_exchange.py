@@ -413,6 +413,20 @@ def test_a_lost_reply_or_a_long_cycle_delays_the_next_read_back_by_one_cycle_onl
         assert cycles.read_back_at == (before if is_passing else before + TRY_AGAIN_S)
 
 
+@pytest.mark.parametrize(("held", "is_due"), [(0, False), (5, True)])
+def test_a_goal_that_was_not_taken_asks_for_the_status(held: int, is_due: bool) -> None:
+    wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])
+    cycles = read_back_of(wire)
+    cycles._status_every = cycles._until_status = 20
+    cycles.cycle([0, 0])
+    assert cycles._read_back is not None
+    for is_of_modes in (True, False):
+        data = bytes(cycles._read_back.read.reply_size // 2 - 13) + struct.pack("<h", 0 if is_of_modes else held)
+        wire.answers = [b"".join(encode_status(servo, 0, data) for servo in (1, 2))]
+        assert cycles.overruled(wire.now() + ONE_READ_BACK_S) is None
+    assert cycles._until_status == (1 if is_due else 19)
+
+
 @pytest.mark.parametrize(("front", "count"), [(8, 1), (12, 1), (7, 0), (4, 0)])
 def test_an_instruction_of_another_master_that_ours_cuts_off_is_counted(front: int, count: int) -> None:
     fine = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)

@@ -101,14 +101,24 @@ def test_one_sighting_short_of_proof_the_same_registers_are_read_again() -> None
         assert not reads_modes(back)
 
 
-def test_a_sighting_is_told_at_once_and_raises_doubts_for_a_while() -> None:
+def test_a_sighting_raises_doubts_for_a_while() -> None:
     back = read_back()
     look(back, 1.0)
-    assert not reads_modes(back) and not back.has_just_sighted(1.0)
+    assert not reads_modes(back)
     look(back, 1.01, goal=FOREIGN)
-    assert back.has_just_sighted(1.01) and back.doubts_until == pytest.approx(1.31)
     look(back, 1.02)
-    assert not back.has_just_sighted(1.02) and back.doubts_until == pytest.approx(1.31)
+    assert back.doubts_until == pytest.approx(1.31)
+
+
+@pytest.mark.parametrize(("goal", "is_unexpected"), [(OURS, False), (20, True), (FOREIGN, True)])
+def test_an_earlier_goal_than_the_latest_is_unexpected_though_not_foreign(goal: int, is_unexpected: bool) -> None:
+    back = read_back()
+    look(back, 1.0)
+    for now in (1.001, 1.002):
+        look(back, now, goal=goal)
+        assert back.is_unexpected is is_unexpected
+    look(back, 1.003)
+    assert not back.is_unexpected
 
 
 def test_a_refusal_or_a_missing_answer_shows_nothing() -> None:

@@ -1,0 +1,399 @@
+"""What the stream does when, to the microsecond, on a scripted bus, with checks that only note what they are given."""
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.config.schema import Config, load_config
+from hil.drivers.state import Slow, State
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
+from hil.experiment import stream as module
+from hil.experiment.stop_request import StopRequest
+from hil.experiment.stream import Progress, Stream
+from hil.fakes.bus.clock import VirtualClock
+from hil.plan.plan import Plan, Segment
+from hil.runs.recording import Phase, Recorder
+from tests.support.paths import CONFIGS
+
+JOINTS = 2
+NOTHING = (0.0,) * JOINTS
+TAKES_S = 1e-3
+Call = tuple[Any, ...]
+HELD = -0.3
+"""Position of the joints [rad]."""
+
+
+class Bus:
+    """Answers every exchange after `takes` [s], the last of which is used again; notes every call."""
+
+    def __init__(self, config: Config, turns: int, takes: list[float]) -> None:
+        self.joints = config.bus.joints
+        self.port = self.prepared = self
+        self.clock = VirtualClock()
+        self.exchanges_per_sample = turns
+        self.patience = 0.02
+        self.read_back_at = math.inf
+        self.heard_instead = self.commanded_by_another = ""
+        self.is_watched = True
+        self.takes = takes
+        self.calls: list[Call] = []
+        self.velocity = NOTHING
+        self.slow: Slow | None = None
+        self.status: Any = None
+
+    def exchange(self, goals: list[float], *, between: bool = False) -> State:
+        now = self.clock.now()
+        self.calls.append(("between" if between else "sample", round(now, 6), *goals))
+        self.clock.wait_until(now + (self.takes.pop(0) if len(self.takes) > 1 else self.takes[0]))
+        position, fine = (HELD,) * JOINTS, (False,) * JOINTS
+        after, sent = self.clock.now(), tuple(goals)
+        return State(now, after, sent, sent, self.velocity, position, (0,) * JOINTS, fine, self.slow, self.status)
+
+    def check_not_overruled(self, due: float) -> None:
+        self.calls.append(("read back", round(due, 6)))
+
+    def read_status_next(self) -> None:
+        self.calls.append(("status",))
+
+    def times(self, kind: str) -> list[float]:
+        return [call[1] for call in self.calls if call[0] == kind]
+
+
+class Checks:
+    """In place of the guard and the model: notes what they are given."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        self.calls: list[Call] = []
+        self.wants_status = False
+
+    def clamp(self, wanted: list[float]) -> list[float]:
+        return list(wanted)
+
+    def woke_up(self, now: float, late: float) -> None:
+        self.calls.append(("woke up", round(now, 6), round(late, 6)))
+
+    def late(self, seconds: float) -> None:
+        self.calls.append(("late", round(seconds, 6)))
+
+    def look(self, _state: State, gap: float = 0.0, *, between: bool = False) -> None:
+        self.calls.append(("look", round(gap, 6), between))
+
+    def look_at_rest(self, _state: State) -> None:
+        self.calls.append(("at rest",))
+
+    def of(self, kind: str) -> list[Call]:
+        return [call[1:] for call in self.calls if call[0] == kind]
+
+
+Make = Callable[..., tuple[Stream, Bus, Checks]]
+
+
+@pytest.fixture
+def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+    """Return a function that makes a stream, its bus, and its guard."""
+    monkeypatch.setattr(module, "Guard", Checks)
+    monkeypatch.setattr(module, "ModelWatch", Checks)
+    config = load_config(CONFIGS / "fake_two_link_ideal.toml")
+    opened: list[Recorder] = []
+
+    def made(
+        rate: float = 20.0,
+        turns: int = 1,
+        takes: list[float] | None = None,
+        watch: Callable[[Progress], None] = lambda _: None,
+        **changes: Any,
+    ) -> tuple[Stream, Bus, Checks]:
+        bus = Bus(config, turns, takes or [TAKES_S])
+        segment = Segment("identify", None, np.full((8, JOINTS), 0.1), 4)  # type: ignore[arg-type]
+        plan = {
+            **{"rate": rate, "segments": (segment,), "rest_samples": 4, "end_samples": 8, "brake_samples": 9},
+            **{"max_settling_periods": 4, "periods": 3, "settle_within": 0.01, "drift_within": 0.05},
+            **changes,
+        }
+        recorder = Recorder(tmp_path / "samples.npy", JOINTS, 500)
+        opened.append(recorder)
+        stream = Stream(bus, Plan(**plan), config, recorder, StopRequest(), watch, lambda _: None)  # type: ignore[arg-type]
+        guard: Any = stream._guard
+        return stream, bus, guard
+
+    yield made
+    for recorder in opened:
+        recorder.close()
+
+
+def play(stream: Stream, rows: list[float], phase: Phase = Phase.PERIODIC) -> State:
+    return stream._play(np.tile(np.array(rows)[:, None], (1, JOINTS)), phase)
+
+
+def test_goals_are_exchanged_again_between_two_samples(make: Make) -> None:
+    stream, bus, guard = make(turns=5)
+    play(stream, [0.1, 0.2, 0.3], Phase.REST)
+    at = [round(0.05 + 0.01 * number, 6) for number in range(11)]
+    goals = [0.1] * 5 + [0.2] * 5 + [0.3]
+    kinds = ["between" if number % 5 else "sample" for number in range(11)]
+    assert bus.calls == [(kind, when, goal, goal) for kind, when, goal in zip(kinds, at, goals, strict=True)]
+    assert guard.of("look") == [(0.0 if number == 0 else 0.01, number % 5 > 0) for number in range(11)]
+    assert guard.of("woke up") == [(when, 0.0) for when in at[::5]]
+    assert len(guard.of("at rest")) == 11
+    model: Any = stream._model
+    assert len(model.of("look")) == 11
+    samples = stream._recorder.samples
+    assert samples["deadline"] == pytest.approx(at[::5])
+    assert set(samples["phase"]) == {Phase.REST} and set(samples["period"]) == {-1}
+
+
+def test_an_exchange_that_might_delay_the_next_sample_is_left_out(make: Make) -> None:
+    stream, bus, _ = make(turns=5, takes=[0.012])
+    play(stream, [0.1, 0.2])
+    assert bus.times("sample") == [0.05, 0.1] and bus.times("between") == [0.062, 0.074, 0.086]
+    stream, bus, _ = make(turns=5, takes=[0.025, TAKES_S])
+    play(stream, [0.1, 0.2])
+    assert bus.times("between") == [0.075, 0.08, 0.09], "the first one is a whole turn late"
+
+
+def test_one_slow_exchange_is_forgotten_in_time(make: Make) -> None:
+    stream, bus, _ = make(turns=5, takes=[TAKES_S, 0.0125, TAKES_S])
+    play(stream, [0.1] * 6)
+    assert np.diff(bus.times("sample")) == pytest.approx(0.05)
+    # After 12 more exchanges, 0.0125 s times 0.98 for each is less than a turn; until then the last one is left out.
+    later = [round(0.05 * sample + 0.01 * turn, 6) for sample in (2, 3, 4) for turn in (1, 2, 3)]
+    assert bus.times("between") == [0.06, 0.0725, 0.08, *later, 0.26, 0.27, 0.28, 0.29]
+
+
+@pytest.mark.parametrize("turns", [1, 5])
+def test_read_backs_are_made_right_before_the_exchanges_that_follow(make: Make, turns: int) -> None:
+    stream, bus, _ = make(turns=turns)
+    bus.read_back_at = -math.inf
+    play(stream, [0.1, 0.2])
+    apart = 0.05 / turns
+    dues = [round(0.05 + apart * number, 6) for number in range(1, turns + 1)]
+    assert bus.times("read back") == dues
+    assert [call[0] for call in bus.calls] == ["sample", *["read back", "between"] * (turns - 1), "read back", "sample"]
+    bus.read_back_at = dues[-1] + 0.05 - 1e-6
+    play(stream, [0.3])
+    assert bus.times("read back") == [*dues, round(dues[-1] + 0.05, 6)], "only where it is due by then"
+
+
+def test_missed_ticks_are_told_and_the_goal_stays(make: Make) -> None:
+    stream, bus, guard = make()
+    play(stream, [0.1])
+    bus.clock.wait_until(0.05 + 3.5 * 0.05)
+    play(stream, [0.2, 0.3, 0.4, 0.5])
+    assert bus.calls == [("sample", 0.05, 0.1, 0.1), ("sample", 0.225, 0.4, 0.4), ("sample", 0.25, 0.5, 0.5)]
+    assert guard.of("late") == [(0.175,), (0.175,)]
+    # Time in which this program slept is counted from the deadline, then from the latest time it was awake.
+    assert guard.of("woke up")[:5] == [(0.05, 0.0), (0.225, 0.125), (0.225, 0.0), (0.225, 0.0), (0.25, 0.0)]
+    samples = stream._recorder.samples
+    assert samples["missing"][:, 0].tolist() == [0, 1, 1, 0, 0]
+    assert samples["goal_current"][:, 0].tolist() == [0.1, 0.1, 0.1, 0.4, 0.5]
+
+
+def test_before_the_first_exchange_a_missed_tick_counts_from_its_deadline(make: Make) -> None:
+    stream, bus, guard = make()
+    wait = stream._ticks.wait
+    stream._ticks.wait = lambda: (bus.clock.wait_until(0.2), wait())[1]  # type: ignore[method-assign, func-returns-value]
+    stream._ticks._start = 0.05
+    play(stream, [0.1])
+    assert guard.of("late") == [(0.15,)] and not bus.calls
+
+
+def test_progress_is_shown_twenty_times_a_second_and_with_slow_values(make: Make) -> None:
+    seen: list[Progress] = []
+    stream, bus, _ = make(100.0, watch=seen.append)
+    play(stream, [0.1] * 12)
+    assert [progress.taken for progress in seen] == [5, 10]
+    assert {(progress.expected, progress.phase, progress.role) for progress in seen} == {
+        (4 + 4 * 8 + 8, Phase.PERIODIC, "identify")
+    }
+    bus.slow = Slow((12.0,) * JOINTS, (30.0,) * JOINTS, NOTHING)
+    play(stream, [0.1])
+    assert [progress.taken for progress in seen] == [5, 10, 13]
+
+
+@pytest.mark.parametrize(("status", "wants", "asked"), [(None, True, 0), ((None,) * JOINTS, False, 0), ((), True, 1)])
+def test_a_status_in_doubt_is_read_again_next(make: Make, status: Any, wants: bool, asked: int) -> None:
+    stream, bus, guard = make()
+    bus.status, guard.wants_status = status, wants
+    play(stream, [0.1])
+    assert bus.calls.count(("status",)) == asked
+
+
+def test_rest_is_checked_only_before_the_start(make: Make) -> None:
+    stream, bus, guard = make()
+    play(stream, [0.1])
+    assert not guard.of("at rest")
+    stream._rest()
+    assert len(guard.of("at rest")) == 4 and not any(call[2] for call in bus.calls[1:])
+
+
+@pytest.mark.parametrize("left_by_a_run", [False, True])
+def test_an_arm_that_an_earlier_run_left_may_take_longer_to_come_to_rest(make: Make, left_by_a_run: bool) -> None:
+    stream, bus, _ = make(end_samples=12)
+    stream._left_by_a_run = left_by_a_run
+    bus.velocity = (0.0, 0.5)
+    with pytest.raises(ExperimentError, match=r"elbow.* reports a velocity of 0\.50 rad/s before the start"):
+        stream._rest()
+    assert len(bus.calls) == (4 + 12 if left_by_a_run else 4)
+
+
+def settle(stream: Stream, differences: list[float], moved: float = 1.0) -> list[int]:
+    """Let the periods differ from the one before by `differences`; return which periods were played."""
+    played: list[int] = []
+    repetition = stream._repetition = SimpleNamespace(difference=math.nan, moved=(1.0, moved))  # type: ignore[assignment]
+
+    def play_period(_: Segment, period: int) -> None:
+        played.append(period)
+        if period:
+            repetition.difference = differences[min(period, len(differences)) - 1]  # type: ignore[attr-defined]
+
+    stream._play_period = play_period  # type: ignore[method-assign]
+    try:
+        stream._play_periods(stream._plan.segments[0])
+    except NotSettled as error:
+        error.add_note(str(played))
+        raise
+    return played
+
+
+@pytest.mark.parametrize(
+    ("differences", "last"), [([0.01], 3), ([0.2, 0.009], 4), ([0.2, 0.1, 0.05, 0.01], 6), ([0.2, 0.2, 0.2, 0.05], 4)]
+)
+def test_the_other_periods_follow_the_first_settled_one(make: Make, differences: list[float], last: int) -> None:
+    stream, _, _ = make()
+    assert settle(stream, differences) == list(range(last + 1))
+
+
+def test_what_never_settles_is_refused_with_the_time_that_warming_up_takes(make: Make) -> None:
+    stream, _, _ = make(max_settling_periods=5, warm_up_periods=2)
+    with pytest.raises(NotSettled, match=r"After 5 periods of 0\.4 s .* Check for backlash") as stop:
+        settle(stream, [0.5, 0.1, 0.4, 0.1, 0.2])
+    assert stop.value.__notes__ == [str(list(range(6)))]
+    stream, _, _ = make(rate=0.5, max_settling_periods=5, warm_up_periods=2)
+    with pytest.raises(NotSettled, match=r"50\.0%, 20\.0%, 18\.0%, .*set experiment\.warm_up = 530\.") as stop:
+        settle(stream, [0.5, 0.2, 0.18, 0.162, 0.1458])  # 26 more periods: (2 + 5 + 26) * 16 s = 528 s
+
+
+@pytest.mark.parametrize(("steps", "is_enough"), [(4.1, True), (3.9, False)])
+def test_a_joint_that_hardly_moves_in_a_period_is_stuck(make: Make, steps: float, is_enough: bool) -> None:
+    stream, bus, _ = make()
+    moved = steps * abs(bus.joints[1].position_unit)
+    if is_enough:
+        assert settle(stream, [0.01], moved) == [0, 1, 2, 3]
+        return
+    with pytest.raises(DidNotMove, match=r"elbow.* moved by 0\.00"):
+        settle(stream, [0.01], moved)
+
+
+class Brakes:
+    """In place of the brake: a current for as many exchanges as wanted."""
+
+    wanted = 99
+
+    def __init__(self, _config: Config, apart: float) -> None:
+        self.apart = apart
+
+    def goals(self, _state: State) -> list[float] | None:
+        self.wanted -= 1
+        return [0.7] * JOINTS if self.wanted >= 0 else None
+
+
+@pytest.mark.parametrize(("turns", "wanted", "count"), [(1, 99, 1), (5, 99, 6), (5, 3, 3), (5, 0, 0)])
+def test_a_stop_brakes_at_once_and_for_60_ms_at_most(
+    make: Make, monkeypatch: pytest.MonkeyPatch, turns: int, wanted: int, count: int
+) -> None:
+    monkeypatch.setattr(module, "Brake", Brakes)
+    monkeypatch.setattr(Brakes, "wanted", wanted)
+    stream, bus, guard = make(turns=turns)
+    play(stream, [0.1])
+    looks = len(guard.of("look"))
+
+    def fail() -> None:
+        raise SafetyStop("stopped", Cause.POSITION)
+
+    stream._play_all = fail  # type: ignore[method-assign]
+    with pytest.raises(SafetyStop):
+        stream.run()
+    begun, apart = 0.05 + TAKES_S, 0.05 / turns
+    first = [begun] if count else []
+    # The ticks of the brake begin an interval after its first exchange.
+    assert bus.times("between") == pytest.approx(
+        [*first, *(begun + TAKES_S + apart * number for number in range(1, count))]
+    )
+    samples = stream._recorder.samples[1:]
+    assert len(samples) == count and set(samples["phase"]) <= {Phase.BRAKING} and set(samples["period"]) <= {-1}
+    assert len(guard.of("look")) == looks
+
+
+def test_a_second_signal_or_a_stall_ends_the_brake(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "Brake", Brakes)
+    stream, bus, _ = make(turns=5, takes=[TAKES_S, TAKES_S, 0.03])
+    play(stream, [0.1])
+    stream._brake()
+    assert len(bus.times("between")) == 2, "the next tick was missed"
+    stream, bus, _ = make(turns=5)
+    play(stream, [0.1])
+    stream._stop = SimpleNamespace(insisted=True)  # type: ignore[assignment]
+    stream._brake()
+    assert not bus.times("between")
+
+
+def test_without_any_state_there_is_nothing_to_brake(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "Brake", Brakes)
+    stream, bus, _ = make()
+    stream._brake()
+    assert not bus.calls
+
+
+@pytest.mark.parametrize(
+    ("error", "is_told"),
+    [(SafetyStop("x", Cause.VELOCITY), True), (SafetyStop("x", Cause.ALERT), False), (ExperimentError("x"), False)],
+)
+def test_a_foreign_goal_seen_just_before_is_told_with_a_stop_that_it_may_have_caused(
+    make: Make, monkeypatch: pytest.MonkeyPatch, error: ExperimentError, is_told: bool
+) -> None:
+    monkeypatch.setattr(module, "Brake", Brakes)
+    stream, bus, _ = make()
+    bus.commanded_by_another = "a foreign goal"
+
+    def fail() -> None:
+        raise error
+
+    stream._play_all = fail  # type: ignore[method-assign]
+    with pytest.raises(ExperimentError):
+        stream.run()
+    assert getattr(error, "__notes__", []) == ["a foreign goal"] * is_told
+
+
+def test_a_run_plays_each_multisine_and_comes_to_rest(make: Make) -> None:
+    segments = tuple(Segment(role, None, np.full((8, JOINTS), goal), 4) for role, goal in (("a", 0.1), ("b", 0.2)))  # type: ignore[arg-type]
+    stream, bus, _ = make(segments=segments, warm_up_periods=2, end_samples=16, max_settling_periods=1)
+    stream._check_motion = lambda _: None  # type: ignore[method-assign, assignment]
+    stream.run()
+    samples = stream._recorder.samples
+    changes = np.flatnonzero(np.diff(samples["phase"].astype(int), prepend=-1))
+    phases = [Phase(phase) for phase in samples["phase"][changes]]
+    each = [Phase.PERIODIC, Phase.RAMP_OUT]
+    assert phases == [Phase.REST, Phase.RAMP_IN, Phase.WARM_UP, *each, Phase.RAMP_IN, *each, Phase.COMING_TO_REST]
+    lengths = np.diff([*changes, len(samples)]).tolist()
+    assert lengths == [4, 4, 16, 32, 4, 4, 32, 4, 4]
+    periodic = samples["phase"] == Phase.PERIODIC
+    assert samples["period"][periodic].tolist() == np.repeat([0, 1, 2, 3] * 2, 8).tolist()
+    assert set(samples["period"][~periodic]) == {-1}
+    segment = samples["segment"].tolist()
+    assert segment == [0] * (4 + 4 + 16 + 32 + 4) + [1] * (len(samples) - 60)
+    assert not any(call[2] for call in bus.calls[-4:])
+
+
+def test_an_arm_that_keeps_moving_without_current_is_waited_for(make: Make) -> None:
+    stream, bus, _ = make(end_samples=12)
+    bus.velocity = (0.0, 0.5)
+    stream._come_to_rest()
+    assert len(bus.calls) == 12
+    bus.velocity = NOTHING
+    stream._come_to_rest()
+    assert len(bus.calls) == 16
