@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
@@ -83,6 +82,8 @@ def filtered_rows(
             f"{position.shape[1]} samples at {1 / dt:.4g}/s cannot be filtered at {highest:g} Hz: "
             "record longer or faster"
         )
+    from scipy.signal import butter, sosfiltfilt
+
     filter_ = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
     smooth = sosfiltfilt(butter(ORDER, position_cutoff or cutoff, fs=1.0 / dt, output="sos"), position, axis=1)
     velocity = np.gradient(smooth, dt, axis=1)

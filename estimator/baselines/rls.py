@@ -9,7 +9,6 @@ does not change.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import butter, sosfilt, sosfilt_zi
 
 from hil.estimator.arrays import Array
 from hil.estimator.baselines.idim import InverseDynamics, uniform
@@ -44,6 +43,8 @@ def fit_recursively(
 
 
 def _causal_rows(recording: Recording, cutoff: float, width: float, delay: float) -> tuple[Array, Array]:
+    from scipy.signal import butter, sosfilt, sosfilt_zi
+
     position, torque, dt = uniform(recording, delay)
     filter_ = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
     rest = sosfilt_zi(filter_)[:, None, :]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -108,5 +108,5 @@ def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) ->
     samples = np.isfinite(simple.residual).sum(axis=1)
     ratio = samples * np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300))
     added = len(rich.names) - len(simple.names)
-    level = float(chi2.isf(options.significance, added))
+    level = float(chdtri(added, options.significance))
     return float(ratio.sum()) / max(rich.correlation_time, 1.0) - level

@@ -5,7 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
@@ -160,7 +160,7 @@ def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int
     A model error that widens the standard errors by the factor `systematic` can mimic errors of zeros, so it raises
     the threshold.
     """
-    if held is None or held.gain <= max(systematic, 1.0) ** 2 * float(chi2.isf(SIGNIFICANCE, held.shift.size)):
+    if held is None or held.gain <= max(systematic, 1.0) ** 2 * float(chdtri(held.shift.size, SIGNIFICANCE)):
         return ()
     return tuple((joint, float(each)) for joint, each in enumerate(held.shift, start=2) if abs(each) > LARGE_ZERO)
 

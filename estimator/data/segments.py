@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import lfilter
 
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import Recording
@@ -111,6 +110,8 @@ def grid_torque(recording: Recording, grid: Grid, delay: float, lag: float) -> A
     torque = recording.mean_torque(grid.edges, delay)
     if lag <= 0.0:
         return torque
+    from scipy.signal import lfilter
+
     # lag y' = u - y with constant u during a step: the end value and the mean of y are exact.
     a = np.exp(-grid.step / lag)
     start = torque[:, :1]

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import median_filter
 
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.fourier import white_noise
@@ -119,6 +118,8 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
     that moves on. If the fraction of such readings exceeds MOST_SPIKES, they are not outliers: the joint moves fast
     compared with the sample rate.
     """
+    from scipy.ndimage import median_filter
+
     position = period.filled()
     away = np.abs(position - median_filter(position, size=(1, 5), mode="wrap"))
     usual = np.maximum(1.5 * np.median(away, axis=1), np.maximum(period.position_step, period.noise))

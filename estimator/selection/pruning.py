@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from hil.estimator.arrays import Array
 from hil.estimator.identify import Estimate
@@ -36,7 +36,7 @@ def pruned_model(
             at = [names.index(name) for name in _tested(model, plainer)]
             away = value[at] - np.array([term_of(names[i]).absent for i in at])
             own = np.linalg.pinv(covariance[np.ix_(at, at)], rcond=1e-12, hermitian=True)
-            doubtful.append((float(away @ own @ away) / float(chi2.isf(level, len(at))), part, plainer, at, own, away))
+            doubtful.append((float(away @ own @ away) / float(chdtri(len(at), level)), part, plainer, at, own, away))
         doubtful = [each for each in doubtful if each[0] < 1.0 and each[1] != fixed]
         if not doubtful:
             return model

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfiltfilt
 
 from hil.config.schema import Config, StabiliserConfig
 from hil.dry_run.chain_prior import prior_arms
@@ -197,6 +196,8 @@ def _rows(arms: ChainArms, config: Config, samples: NDArray[np.void]) -> tuple[A
     played = samples[rows[0] : rows[-1] + 1]
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     cut_off = min(_CUT_OFF_TIMES * highest, 0.2 * rate)
+    from scipy.signal import butter, sosfiltfilt
+
     smooth = butter(4, cut_off, fs=rate, output="sos")
     position = sosfiltfilt(smooth, _filled(played["position"]), axis=0)
     torque = sosfiltfilt(smooth, played["goal_current"] * constants, axis=0)

@@ -9,7 +9,6 @@ stage 2.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from hil.estimator.arrays import Array
 from hil.estimator.baselines.idim import ORDER, PER_CYCLE, TRIM, uniform
@@ -49,6 +48,8 @@ def filtered_torque(recording: Recording, model: ChainModel, cutoff: float, dela
             f"{position.shape[1]} samples at {1 / dt:.4g}/s cannot be filtered at {cutoff:g} Hz: record longer "
             "or faster"
         )
+    from scipy.signal import butter, sosfiltfilt
+
     sos = butter(ORDER, cutoff, fs=1.0 / dt, output="sos")
     smooth = sosfiltfilt(sos, position, axis=1)
     velocity = np.gradient(smooth, dt, axis=1)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from hil.arm_model import ArmModel
 from hil.estimator.models.terms import TERMS
@@ -89,7 +89,7 @@ def _of_joint(
     z = pushed / np.sqrt(sharp)
     best = int(np.argmax(np.abs(z)))
     alone = math.erfc(abs(z[best]) / math.sqrt(2))
-    together = float(chi2.sf(difference @ pushed, len(names)))
+    together = float(chdtrc(len(names), max(difference @ pushed, 0.0)))
     change = float(pushed[best] / sharp[best] * scale[best])
     stds = dict(zip(names, (scale / np.sqrt(sharp)).tolist(), strict=True))
     # One hypothesis per term was tested, and one about all of them (Bonferroni).
