@@ -39,7 +39,7 @@ from hil.estimator.fit.covariance import (
 )
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.noise_weights import noise_weights
-from hil.estimator.models.bounds import MOVED, beyond_range, step_beyond
+from hil.estimator.models.bounds import MOVED, beyond_range, finite_std, step_beyond
 from hil.estimator.options import CoordinateOptions, CovarianceOptions, MinimiserOptions
 from hil.estimator.simulation.arm import steps_per_sample
 
@@ -437,7 +437,7 @@ def _at_bound(problem: ChainProblem, minimum: Minimum, value: Array, std: Array)
     slopes = np.diag(problem.coordinates.slopes(minimum.x[: value.size]))
     step, white = step_beyond(minimum.at.normal, minimum.at.gradient, slopes)
     used = np.array([index < base.count or kind_of(name) in ("viscous", "coulomb") for index, name in enumerate(names)])
-    if np.any(np.abs(step[used]) > MOVED * std[used]):
+    if np.any(np.abs(step[used]) > MOVED * finite_std(std, white)[used]):
         lower = np.where(problem.coordinates.positive, 0.0, -np.inf)
         beyond = beyond_range(value, step, white, lower, np.full(value.size, np.inf))
         found += [name for name, over in zip(names, beyond, strict=True) if over]

@@ -124,10 +124,11 @@ def test_a_positive_parameter_that_has_run_to_zero_does_not_count() -> None:
     assert decrease == pytest.approx(1e8 * 0.001**2, rel=1e-2)
 
 
-def test_friction_that_would_have_to_be_negative_is_at_its_bound(setup: bench.Setup) -> None:
+@pytest.mark.parametrize("taken", [1.02, 1.2])
+def test_friction_that_would_have_to_be_negative_is_at_its_bound(setup: bench.Setup, taken: float) -> None:
     period = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101))
     velocity = np.gradient(period.position[0], 1.0 / period.rate)
     torque = period.torque.copy()
-    torque[0] -= 1.02 * setup.arm.drives[0].viscous * velocity
+    torque[0] -= taken * setup.arm.drives[0].viscous * velocity
     found = identify_chain(replace(period, torque=torque), ChainModel(setup.base), setup.prior)
     assert found.at_bound == ("viscous_1",) and found.reached
