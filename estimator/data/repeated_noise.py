@@ -117,7 +117,8 @@ def _spectrum(signal: Array) -> Array:
 
 def _fastest(power: Array) -> int:
     """Return the first line of the fastest quarter of a spectrum (rows, lines)."""
-    return 3 * int(power.shape[1]) // 4
+    lines: int = power.shape[1]
+    return 3 * lines // 4
 
 
 def _beyond_fast(power: Array, slow: int) -> Array:

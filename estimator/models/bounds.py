@@ -50,6 +50,17 @@ def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Arr
     return below | above
 
 
+def finite_std(std: Array, white: Array) -> Array:
+    """Return standard errors `std` (parameters,), replaced where they are infinite, as at a bound.
+
+    white: standard errors for independent errors, which are widened there as those of the other parameters are.
+    """
+    known = np.isfinite(std) & (white > 0.0)
+    wider = float(np.median(std[known] / white[known])) if known.any() else 1.0
+    finite: Array = np.where(np.isfinite(std), std, wider * white)
+    return finite
+
+
 def dependent(names: tuple[str, ...], step: Array, std: Array) -> bool:
     """Return whether a base parameter, other than offsets, would move by more than its standard error."""
     base = np.array([term_of(name).part == "base" and kind_of(name) != "offset" for name in names])

@@ -8,7 +8,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
-from hil.estimator.models.conflicts import Trust
+from hil.estimator.models.conflicts import Conflict, Trust, conflict_sentences, contradicted, lowered
 from hil.estimator.models.terms import joint_of, kind_of
 from hil.estimator.selection.candidates import Candidate
 from hil.estimator.selection.verdict import (
@@ -47,6 +47,8 @@ class SegmentEvidence:
     """Whether a warning rules out using the estimate."""
     doubtful: bool = False
     """Whether a warning casts doubt on the estimate."""
+    conflicts: tuple[Conflict, ...] = ()
+    """Values far from those known beforehand."""
 
 
 def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate) -> dict[str, float]:
@@ -69,11 +71,14 @@ def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, 
     relative = relative_std(recordings, estimate)
     left, held_out = float(estimate.residual_over_noise.max()), evidence.held_out
     weakest = max(relative, key=lambda name: relative[name])
+    explained = left <= EXPLAINED
     trust = _trust(left, held_out, relative[weakest], evidence)
+    trust = lowered(trust, contradicted(evidence.conflicts, explained))
     sentences = (
         *(("Do not use these numbers: the warnings give the reasons.",) if evidence.faulty else ()),
         _left(estimate, evidence, trust),
         _predicted(held_out, estimate.segment_length),
+        *conflict_sentences(evidence.conflicts, explained),
         *evidence.doubts,
         _weakest(weakest, relative[weakest]),
     )

@@ -69,9 +69,13 @@ def _weight(config: Config, estimate: Estimate, largest_torque: float) -> list[s
 
 def conflicts_of(config: Config, estimate: Estimate) -> tuple[Conflict, ...]:
     """Values of `estimate` that are far from what the configuration and typical servos imply."""
+    return conflicts(estimate.names, estimate.value, estimate.std, torque_scale_std(config))
+
+
+def torque_scale_std(config: Config) -> dict[str, float]:
+    """Relative standard deviation of the ratio of the torque constants, by parameter; empty if the file gives none."""
     unsure = torque_constant_stds(config)
-    given = {"torque_scale_2": float(np.linalg.norm(unsure))} if unsure.size == 2 and unsure.any() else {}
-    return conflicts(estimate.names, estimate.value, estimate.std, given)
+    return {"torque_scale_2": float(np.linalg.norm(unsure))} if unsure.size == 2 and unsure.any() else {}
 
 
 def _constants(estimate: Estimate) -> list[str]:

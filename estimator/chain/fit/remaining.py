@@ -15,10 +15,12 @@ def remaining(minimum: Minimum, coordinates: ChainCoordinates) -> tuple[Array, f
     """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations predict.
 
     Where the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
-    A friction width at its lower bound stays there.
+    A friction width at its lower bound stays there, and no positive parameter becomes negative.
     """
     at, least = minimum.at, np.full(minimum.x.size, -np.inf)
-    least[: len(coordinates.names)] = coordinates.room_below(minimum.x)
+    # To first order, a decrease of a logarithm by 1 takes the parameter to 0.
+    lowest = np.where(coordinates.positive, -1.0, -np.inf)
+    least[: len(coordinates.names)] = np.maximum(coordinates.room_below(minimum.x), lowest)
     scale = np.sqrt(np.diag(at.normal))
     scale = np.maximum(scale, 1e-12 * scale.max())
     matrix = at.normal / np.outer(scale, scale)

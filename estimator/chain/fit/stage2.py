@@ -39,7 +39,7 @@ from hil.estimator.fit.covariance import (
 )
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.noise_weights import noise_weights
-from hil.estimator.models.bounds import MOVED, beyond_range, step_beyond
+from hil.estimator.models.bounds import MOVED, beyond_range, finite_std, step_beyond
 from hil.estimator.options import CoordinateOptions, CovarianceOptions, MinimiserOptions
 from hil.estimator.simulation.arm import steps_per_sample
 
@@ -415,7 +415,8 @@ def _fit(
 
 
 def _at_bound(problem: ChainProblem, minimum: Minimum, value: Array, std: Array) -> tuple[str, ...]:
-    """Return the parameters at a bound although the data favour values beyond it, if base parameters depend on them.
+    """Return the parameters at a bound although the data favour values beyond it, if base parameters, viscous or dry
+    friction depend on them or are among them.
 
     std: standard errors of the parameters `value` (parameters,).
     """
@@ -423,7 +424,8 @@ def _at_bound(problem: ChainProblem, minimum: Minimum, value: Array, std: Array)
     found = list(limited(base, dict(zip(names, value.tolist(), strict=True)), std))
     slopes = np.diag(problem.coordinates.slopes(minimum.x[: value.size]))
     step, white = step_beyond(minimum.at.normal, minimum.at.gradient, slopes)
-    if np.any(np.abs(step[: base.count]) > MOVED * std[: base.count]):
+    used = np.array([index < base.count or kind_of(name) in ("viscous", "coulomb") for index, name in enumerate(names)])
+    if np.any(np.abs(step[used]) > MOVED * finite_std(std, white)[used]):
         lower = np.where(problem.coordinates.positive, 0.0, -np.inf)
         beyond = beyond_range(value, step, white, lower, np.full(value.size, np.inf))
         found += [name for name, over in zip(names, beyond, strict=True) if over]

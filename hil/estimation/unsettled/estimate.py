@@ -2,8 +2,8 @@
 
 import logging
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from hil.config.chain import only_planar
 from hil.config.experiment import ModelConfig
 from hil.errors import ConfigError
 from hil.estimation.model_from_config import wanted_model
+from hil.estimation.plausibility import torque_scale_std
 from hil.estimation.result_checks import describe_segment_choice, describe_verdict
 from hil.estimation.settled_warnings import clipping_warnings
 from hil.estimation.unsettled.plausibility import implausible, undetermined
@@ -20,6 +21,7 @@ from hil.estimator.baselines.idim import fit_inverse_dynamics
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
+from hil.estimator.models.conflicts import Conflict, conflicts
 from hil.estimator.selection.segment_verdict import SegmentEvidence, judge_segments
 from hil.estimator.selection.segments import considered, missing_terms, predicted_positions
 from hil.estimator.selection.unsettled import SegmentChoice, choose_by_shooting, held_out_error
@@ -47,6 +49,18 @@ class Estimated:
     estimate: ShootingEstimate
 
 
+@dataclass(frozen=True)
+class Given:
+    """What is known of the drives and encoders beforehand.
+
+    torque_scale_std: see `hil.estimator.models.conflicts.conflicts`. zeros: whether the encoder zeros are those of a
+    configuration.
+    """
+
+    torque_scale_std: Mapping[str, float] = field(default_factory=dict)
+    zeros: bool = False
+
+
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
     """Estimate from all samples of a run that never became periodic or was stopped before it did."""
     config, facts = run.load_config(), run.load_facts()
@@ -61,8 +75,9 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
         between="held",
         command_to_sample=facts.command_to_sample,
     )
-    zeros = config.model.zeros
-    result = estimate_any([recording], config.model, 1.0, zeros, facts.config, config.arm.gravity).result
+    given = Given(torque_scale_std(config), zeros=True)
+    zeros, gravity = config.model.zeros, config.arm.gravity
+    result = estimate_any([recording], config.model, 1.0, zeros, facts.config, gravity, given=given).result
     result = replace(result, warnings=(*result.warnings, *clipping_warnings(config, samples)))
     run.write_result(result)
     return result
@@ -76,8 +91,10 @@ def estimate_any(
     shown_path: str,
     gravity: float,
     stepped: Sequence[bool] = (),
+    given: Given = Given(),
 ) -> Estimated:
     """The estimate, its checks and its verdict. stepped: whether each joint's encoder step is known; by default it is.
+    given: what contradicts the estimate if it is far off.
 
     Raises ConfigError, EstimationError.
     """
@@ -93,7 +110,14 @@ def estimate_any(
     verdict = judge_segments(
         recordings,
         estimate,
-        SegmentEvidence(held_out, missing_terms(recordings, estimate), odd, bool(found.faults), bool(found.doubts)),
+        SegmentEvidence(
+            held_out,
+            missing_terms(recordings, estimate),
+            odd,
+            bool(found.faults),
+            bool(found.doubts),
+            conflicts_in(estimate, given),
+        ),
     )
     result = _result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3), stepped)
     result = replace(
@@ -110,6 +134,16 @@ def estimate_any(
     for warning in result.warnings:
         log.warning("%s: %s", shown_path, warning)
     return Estimated(result, predicted_positions(recordings, estimate), estimate)
+
+
+def conflicts_in(estimate: ShootingEstimate, given: Given) -> tuple[Conflict, ...]:
+    """Values that are far from what is known beforehand."""
+    names, value, std = [*estimate.names], [*estimate.value], [*estimate.std]
+    if given.zeros:
+        for zero, error in zip(estimate.zeros, estimate.zeros_std, strict=True):
+            names += [f"zero_{joint}" for joint in range(1, zero.size + 1)]
+            value, std = [*value, *zero], [*std, *error]
+    return conflicts(names, np.array(value), np.array(std), given.torque_scale_std)
 
 
 def _start(recordings: Sequence[Recording]) -> NDArray[np.float64]:

@@ -111,3 +111,24 @@ def estimate_of(setup: bench.Setup, monkeypatch: pytest.MonkeyPatch, std: float,
     )
     monkeypatch.setattr(identify, "_best_fit", lambda *_: fit)
     return identify_chain(period, model, setup.prior)
+
+
+def test_a_positive_parameter_that_has_run_to_zero_does_not_count() -> None:
+    """Its best value is negative, where the fit may not go: the sum of squares would fall, however small it is."""
+    names = ChainCoordinates(("viscous_1", "coulomb_1"), np.ones(2), np.zeros(0))
+    slopes, best = np.array([1e-9, 0.05]), np.array([-0.01, 0.051])
+    normal = np.diag(1e8 * slopes**2)
+    missing = (best - slopes) / slopes
+    step, decrease = remaining(Minimum(np.log(slopes), Quadratic(1.0, normal, -normal @ missing), 1), names)
+    np.testing.assert_allclose(step, [-1.0, 0.02], atol=1e-6)
+    assert decrease == pytest.approx(1e8 * 0.001**2, rel=1e-2)
+
+
+@pytest.mark.parametrize("taken", [1.02, 1.2])
+def test_friction_that_would_have_to_be_negative_is_at_its_bound(setup: bench.Setup, taken: float) -> None:
+    period = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101))
+    velocity = np.gradient(period.position[0], 1.0 / period.rate)
+    torque = period.torque.copy()
+    torque[0] -= taken * setup.arm.drives[0].viscous * velocity
+    found = identify_chain(replace(period, torque=torque), ChainModel(setup.base), setup.prior)
+    assert found.at_bound == ("viscous_1",) and found.reached

@@ -1,0 +1,45 @@
+"""The verdict on estimates from arbitrary motion: values that contradict what was known."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.estimation.unsettled.estimate import Given, conflicts_in
+from hil.estimator.selection.segment_verdict import SegmentEvidence, judge_segments
+
+NAMES = ("inertia_1", "gravity_1", "viscous_1", "coulomb_1", "offset_1")
+
+
+def estimated(ratio: float = 1.0, zero: float = 0.0, left: float = 1.0) -> Any:
+    """An estimate whose residual is `left` times the noise."""
+    return SimpleNamespace(
+        model=SimpleNamespace(base_names=NAMES),
+        names=(*NAMES, "torque_scale_2"),
+        value=np.array([0.02, 0.5, 0.04, 0.05, 0.0, ratio]),
+        std=np.array([1e-4, 1e-3, 1e-4, 1e-4, 1e-3, 2e-3]),
+        zeros=np.array([[0.0, zero]]),
+        zeros_std=np.full((1, 2), 1e-3),
+        residual_over_noise=np.array([left]),
+        segment_length=1.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("estimate", "given", "trust", "said"),
+    [
+        (estimated(1.2), Given(), "yes", ""),
+        (estimated(1.2), Given({"torque_scale_2": 0.02}), "with care", "torque_scale_2 is 1.2"),
+        (estimated(2.0, left=3.0), Given(), "no", "torque_scale_2 is 2"),
+        (estimated(zero=0.2), Given(), "yes", ""),
+        (estimated(zero=0.2), Given(zeros=True), "with care", "zero_2 is 0.2"),
+    ],
+)
+def test_values_far_from_the_files_lower_the_verdict(estimate: Any, given: Given, trust: str, said: str) -> None:
+    recordings: Any = [SimpleNamespace(torque=np.ones((2, 10)))]
+    held_out = np.array([0.001, 0.001])
+    verdict = judge_segments(recordings, estimate, SegmentEvidence(held_out, conflicts=conflicts_in(estimate, given)))
+    assert verdict.trust == trust
+    assert said in " ".join(verdict.sentences)
+    assert bool(said) == ("standard deviations from" in " ".join(verdict.sentences))
