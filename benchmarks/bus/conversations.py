@@ -184,9 +184,6 @@ class Conversation:
     def named(self, servo_id: int) -> Servo | None:
         return next((servo for servo in self.servos if servo.id == servo_id), None)
 
-    def shadows(self, servo_id: int) -> list[Servo]:
-        return [servo for servo in self.servos if servo.shadow == servo_id and servo.id != servo_id]
-
     def any_servo(self) -> Servo:
         return self.random.choice(self.servos)
 
@@ -376,8 +373,8 @@ class Conversation:
         self._write(servo, TORQUE_ENABLE, b"\0")
         self._write(servo, 34, before.to_bytes(2, "little"))
         self.settle(servo, [70])
+        servo.alert = False  # not in the status of the Reboot either: ROBOTIS' own clients would take it for a failure
         self.ask("reboot", packet(servo.id, codec.REBOOT), self.answers(servo, {FINE}))
-        servo.alert = False
         self._booted(servo)
         self.settle(servo, [70])
 

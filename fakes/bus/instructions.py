@@ -8,7 +8,8 @@ and the reply to a fast read ends in the middle (source: ROBOTIS in DynamixelSDK
 - Servos reply to a broadcast Ping one directly after the other, in ascending order of ID.
 - If two servos have the same ID and reply at once, the host receives nothing; both execute the instruction.
 - The status of a write to ID or Baud Rate, and of a Factory Reset, is still sent with the old ID at the old baud rate;
-that of a Reboot or Factory Reset still has the alert that it ends.
+that of a Reboot no longer has the alert that it ends: ROBOTIS' easy SDK and hardware interface take any error for a
+failed reboot, although they reboot servos because of alerts.
 - A servo executes what is addressed to its Secondary ID but does not reply to it; its EEPROM is not written.
 - In a fast read, a servo that refuses sends its error and zeros.
 """
@@ -150,10 +151,10 @@ class Instructions:
         for servo in self._by_id.get(servo_id, ()):
             if servo.hears(now, self._line.baud):
                 wanted = servo.status_return_level >= least_level
-                delay_s, sender, alert = servo.return_delay_s, servo.id, servo.alert
+                delay_s, sender = servo.return_delay_s, servo.id
                 error, data = act(servo)
                 if wanted:
-                    answers.append((sender, error | alert | servo.alert, data, delay_s))
+                    answers.append((sender, error | servo.alert, data, delay_s))
         if len(answers) == 1:
             sender, error, data, delay_s = answers[0]
             self._line.send([(sender, delay_s, encode_status(sender, error, data))], now)

@@ -91,8 +91,9 @@ class Terminal:
             def watch(asking: Asking) -> None:
                 if asking.servo is not None:
                     servo_id, model = asking.servo
-                    self.say(f"{asking.baud} baud, ID {servo_id}: {model}")
-                status.update(f"Scanning at {asking.baud} baud, about {asking.left_s:.0f} s left")
+                    self.say(f"{'' if asking.baud is None else f'{asking.baud} baud, '}ID {servo_id}: {model}")
+                at = "" if asking.baud is None else f" at {asking.baud} baud"
+                status.update(f"Scanning{at}, about {asking.left_s:.0f} s left")
 
             yield watch
 

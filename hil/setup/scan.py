@@ -40,7 +40,10 @@ class Found(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """The replies at one baud rate; trouble: description of a problem on the whole bus; empty if there is none."""
+    """The replies at one baud rate: over TCP the one that the servos are set to, or the first one if none answered.
+
+    trouble: description of a problem on the whole bus; empty if there is none.
+    """
 
     baud: int
     servos: tuple[Found, ...]
@@ -50,10 +53,10 @@ class Heard(NamedTuple):
 class Asking(NamedTuple):
     """A scan in progress: current baud rate, remaining time [s], and the servo that has just answered, if any.
 
-    servo: ID and model name, or "model number N".
+    baud: None over TCP, where the other end sets it. servo: ID and model name, or "model number N".
     """
 
-    baud: int
+    baud: int | None
     left_s: float
     servo: tuple[int, str] | None = None
 
@@ -70,10 +73,13 @@ def scan(port: Port, bauds: Sequence[int] = BAUD_RATES, watch: Watch = lambda _:
     """Scan at each baud rate in turn. Raises PortLost.
 
     Baud rates that the adapter does not support are reported as trouble. Over TCP, where the remote end sets the baud
-    rate, only the first one is tried. watch: called while waiting, and with each servo that answers.
+    rate, servos are asked once, and each says which baud rate it is set to. watch: called while waiting, and with each
+    servo that answers.
     """
     if not port.has_baud:
-        bauds = bauds[:1]
+        heard = listen(port, watch=watch)
+        yield heard._replace(baud=_set_to(port, heard.servos))
+        return
     for place, baud in enumerate(bauds):
         behind_s = sum(_listening_s(port, later) for later in bauds[place + 1 :])
         try:
@@ -82,6 +88,13 @@ def scan(port: Port, bauds: Sequence[int] = BAUD_RATES, watch: Watch = lambda _:
             yield Heard(baud, (), str(error))
             continue
         yield listen(port, watch=_with_more(behind_s, watch))
+
+
+def _set_to(port: Port, servos: Sequence[Found]) -> int:
+    """The baud rate that these servos are set to; adopted for `port`, whose wire times depend on it."""
+    if servos:
+        port.set_baud(servos[0].baud)
+    return port.baud
 
 
 def _with_more(behind_s: float, watch: Watch) -> Watch:
@@ -101,18 +114,19 @@ def listen(port: Port, patience: float = _PATIENCE_S, watch: Watch = lambda _: N
     """
     framer = Framer()
     answers = {}
+    baud = port.baud if port.has_baud else None
     port.discard_input()
     port.write(encode(BROADCAST_ID, Instruction.PING))
     deadline = port.clock.now() + patience + port.latency + port.wire_time(_STATUS_BYTES)
     while (remaining := deadline - port.clock.now()) > 0:
-        watch(Asking(port.baud, remaining))
+        watch(Asking(baud, remaining))
         for packet in framer.feed(port.read(_STATUS_BYTES, min(remaining, 0.05))):
             if packet.is_status and len(packet.data) == 3:
                 answers[packet.id] = packet.data
                 deadline += port.wire_time(_STATUS_BYTES)
                 number = packet.data[0] | packet.data[1] << 8
                 model = model_names().get(number, f"model number {number}")
-                watch(Asking(port.baud, deadline - port.clock.now(), (packet.id, model)))
+                watch(Asking(baud, deadline - port.clock.now(), (packet.id, model)))
     servos = tuple(_describe(port, servo_id, data) for servo_id, data in sorted(answers.items()))
     damaged = framer.bad_crc or framer.noise_bytes + framer.pending > _STATUS_BYTES
     return Heard(port.baud, servos, "corrupted replies: two servos with the same ID, or a bad cable" if damaged else "")
@@ -124,11 +138,14 @@ def _describe(port: Port, servo_id: int, data: bytes) -> Found:
     if model is None:
         return Found(port.baud, servo_id, number, None, firmware, None, None, "no control table for this model")
     servo = Servo(port, servo_id, load_control_table(model))
+    baud = port.baud
     try:
+        if not port.has_baud:
+            baud = BAUD_RATES[servo.read("Baud Rate")]
         voltage = VOLTAGE_UNIT * servo.read("Present Input Voltage")
         temperature = float(servo.read("Present Temperature"))
         error = servo.hardware_error()
-    except (DriverError, KeyError) as problem:
-        return Found(port.baud, servo_id, number, model, firmware, None, None, f"cannot be read: {problem}")
+    except (DriverError, KeyError, IndexError) as problem:
+        return Found(baud, servo_id, number, model, firmware, None, None, f"cannot be read: {problem}")
     trouble = f"hardware error: {describe_error(error)}; reboot it" if error else ""
-    return Found(port.baud, servo_id, number, model, firmware, round(voltage, 1), temperature, trouble)
+    return Found(baud, servo_id, number, model, firmware, round(voltage, 1), temperature, trouble)

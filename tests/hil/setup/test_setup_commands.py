@@ -360,7 +360,15 @@ def test_a_scan_tells_of_servos_as_they_answer_and_how_long_it_will_take(port: C
     assert told[first].left_s > 1.4
 
 
-def test_scan_over_tcp_asks_once(port: Callable[..., Port]) -> None:
+def test_scan_over_tcp_asks_once_and_the_servos_say_their_baud(
+    port: Callable[..., Port], monkeypatch: pytest.MonkeyPatch
+) -> None:
     opened = port()
     opened.url = "socket://bench:4000"
-    assert [heard.baud for heard in scan(opened, (1_000_000, 57_600))] == [1_000_000]
+    opened.baud = 9_600  # of no consequence: the other end has 1 MBd
+    monkeypatch.setattr(Port, "set_baud", lambda self, baud: setattr(self, "baud", baud))
+    told: list[Asking] = []
+    (heard,) = scan(opened, (9_600, 57_600), told.append)
+    assert {asking.baud for asking in told} == {None}
+    assert heard.baud == opened.baud == 1_000_000
+    assert [(servo.baud, servo.id) for servo in heard.servos] == [(1_000_000, 1), (1_000_000, 2)]
