@@ -12,8 +12,9 @@ from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.conflicts import chain_conflicts
 from hil.estimator.chain.fit.coordinates import ANGLES, kind_of
 from hil.estimator.chain.fit.held_zeros import HeldZeros
+from hil.estimator.chain.fit.options import DEFAULTS, ChainOptions
 from hil.estimator.chain.fit.stage1 import ChainLinear, fit_lines
-from hil.estimator.chain.fit.stage2 import DEFAULTS, ChainFit, ChainOptions, fit_periods
+from hil.estimator.chain.fit.stage2 import ChainFit, fit_periods
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes

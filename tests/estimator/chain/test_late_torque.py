@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from benchmarks import chain as bench
-from hil.estimator.chain.fit import stage2
 from hil.estimator.chain.fit.objective import ChainProblem
+from hil.estimator.chain.fit.options import DEFAULTS
 from hil.estimator.chain.fit.resolved_widths import resolved_widths
 from hil.estimator.chain.fit.stage1 import fit_lines
+from hil.estimator.chain.fit.starts import first_problem
 from hil.estimator.chain.fit.uncertainty import neglected_covariance
 from hil.estimator.chain.identify import identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -53,7 +54,7 @@ def test_lags_that_differ_are_found(setup: bench.Setup, period: SettledPeriod) -
 @pytest.mark.parametrize("drive", ["lag", "delay_lag"])
 def test_derivatives_are_those_of_the_sum_of_squares(setup: bench.Setup, period: SettledPeriod, drive: str) -> None:
     model = ChainModel(setup.base, drive=drive, lags=True, by_voltage=(1, 3))  # type: ignore[arg-type]
-    problem, x = stage2._problem([period], model, fit_lines([period], model, setup.prior), setup.prior, stage2.DEFAULTS)
+    problem, x = first_problem([period], model, fit_lines([period], model, setup.prior), setup.prior, DEFAULTS)
     x = x.copy()
     for name, value in {"lag_ratio_2": 0.3, "delay": 0.4, "coulomb_width_1": np.log(0.1)}.items():
         if name in model.names:
@@ -73,7 +74,7 @@ def test_a_diverging_simulation_costs_infinitely_much_without_a_warning(
     setup: bench.Setup, period: SettledPeriod, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = ChainModel(setup.base, drive="lag", by_voltage=(1,))
-    problem, x = stage2._problem([period], model, fit_lines([period], model, setup.prior), setup.prior, stage2.DEFAULTS)
+    problem, x = first_problem([period], model, fit_lines([period], model, setup.prior), setup.prior, DEFAULTS)
 
     def diverge(_: Simulation, run: object, part: slice) -> tuple[None, np.ndarray]:
         del run

@@ -9,8 +9,8 @@ from benchmarks import chain as bench
 from hil.estimator.chain import identify
 from hil.estimator.chain.fit import stage2
 from hil.estimator.chain.fit.coordinates import ChainCoordinates
+from hil.estimator.chain.fit.options import ChainOptions
 from hil.estimator.chain.fit.remaining import remaining
-from hil.estimator.chain.fit.stage2 import ChainOptions
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.data.settled_period import SettledPeriod

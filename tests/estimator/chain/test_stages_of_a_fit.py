@@ -8,10 +8,12 @@ import pytest
 
 from benchmarks import chain as bench
 from hil.estimator.chain import identify
-from hil.estimator.chain.fit import stage2
+from hil.estimator.chain.fit import starts
 from hil.estimator.chain.fit.objective import ChainProblem
+from hil.estimator.chain.fit.options import DEFAULTS
 from hil.estimator.chain.fit.stage1 import fit_lines
-from hil.estimator.chain.fit.stage2 import DEFAULTS, REPEATED, ChainFit
+from hil.estimator.chain.fit.stage2 import ChainFit
+from hil.estimator.chain.fit.starts import REPEATED
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.simulation.sensitivity import Simulation
 from hil.estimator.data.settled_period import SettledPeriod
@@ -32,7 +34,7 @@ def sticking(often: int) -> SettledPeriod:
 
 def problem_of(setup: bench.Setup, period: SettledPeriod) -> tuple[ChainProblem, np.ndarray]:
     model = ChainModel(setup.base)
-    return stage2._problem([period], model, fit_lines([period], model, setup.prior), setup.prior, DEFAULTS)
+    return starts.first_problem([period], model, fit_lines([period], model, setup.prior), setup.prior, DEFAULTS)
 
 
 @pytest.mark.parametrize("often", [1, 16, 50])
@@ -61,7 +63,7 @@ def test_problems_that_differ_in_weights_share_one_simulation(
 ) -> None:
     """With the same sums of squares as without sharing; one that differs in anything else is simulated anew."""
     problem, x = problem_of(setup, sticking(1))
-    x = stage2._towards_prior(problem, x, DEFAULTS)
+    x = starts.towards_prior(problem, x, DEFAULTS)
     simulated: list[Simulation] = []
     go_on = Simulation.go_on
     monkeypatch.setattr(Simulation, "go_on", lambda self, *args: simulated.append(self) or go_on(self, *args))
@@ -91,7 +93,7 @@ def test_problems_that_differ_in_weights_share_one_simulation(
 
 
 def test_repeated_readings_count_as_a_few(setup: bench.Setup) -> None:
-    counted = [float(np.sum(stage2._repeated(sticking(often)) ** 2)) for often in (1, REPEATED, 16, 50)]
+    counted = [float(np.sum(starts.repeated(sticking(often)) ** 2)) for often in (1, REPEATED, 16, 50)]
     np.testing.assert_allclose(counted, [1600, 1600, 1600 * REPEATED / 16, 1600 * REPEATED / 50])
 
 
@@ -126,7 +128,7 @@ class Softer:
 )
 def test_the_softest_observer_that_follows_is_kept(costs: dict[float, tuple[float, float]], kept: float) -> None:
     problem: Any = Softer(costs, (sticking(1),))
-    x, softness, _ = stage2._softened(problem, np.zeros(2), DEFAULTS)
+    x, softness, _ = starts.softened(problem, np.zeros(2), DEFAULTS)
     assert softness == kept
     np.testing.assert_array_equal(x, 1.0 + DEFAULTS.softness.index(kept))
 
@@ -199,7 +201,7 @@ def test_a_restart_keeps_all_but_wide_coulomb_steps(setup: bench.Setup) -> None:
     names = problem.coordinates.names
     for width, expected in ((0.02, 0.005), (0.002, 0.002)):
         near = fit_of(setup, sticking(1), width, 0.5)
-        x = stage2._narrowed(problem, near, replace(DEFAULTS, initial_width=0.005))
+        x = starts.narrowed(problem, near.value, near.starts, replace(DEFAULTS, initial_width=0.005))
         wanted = [expected if name.startswith("coulomb_width") else 0.5 for name in names]
         np.testing.assert_allclose(problem.coordinates.values(x[: problem.count]), wanted)
 
@@ -218,11 +220,11 @@ def test_a_motion_that_is_not_explained_is_fitted_from_the_prior_too(
     problem, x = problem_of(setup, sticking(1))
     level = {0.0: first, 1.0: second}
     found = [Minimum(np.full(2, at), Quadratic(1.0, np.eye(2), np.zeros(2)), 1) for at in level]
-    monkeypatch.setattr(stage2, "_towards_prior", lambda _, x, options: x)
-    monkeypatch.setattr(stage2, "_softened", lambda *_: (x, 1.0, 1))
-    monkeypatch.setattr(stage2, "_resolved", lambda problem, *_: (problem, found[0], 1))
-    monkeypatch.setattr(stage2, "_softened_later", lambda *_: (replace(problem, softness=1.0), found[1], 10))
-    monkeypatch.setattr(stage2, "_level", lambda _, x: level[float(x[0])])
-    _, minimum, spent = stage2._started(problem, x, DEFAULTS)
+    monkeypatch.setattr(starts, "towards_prior", lambda _, x, options: x)
+    monkeypatch.setattr(starts, "softened", lambda *_: (x, 1.0, 1))
+    monkeypatch.setattr(starts, "resolved", lambda problem, *_: (problem, found[0], 1))
+    monkeypatch.setattr(starts, "_softened_later", lambda *_: (replace(problem, softness=1.0), found[1], 10))
+    monkeypatch.setattr(starts, "_level", lambda _, x: level[float(x[0])])
+    _, minimum, spent = starts.started(problem, x, DEFAULTS)
     assert minimum is found[chosen == "second"]
     assert spent == (2 if first <= DEFAULTS.poor else 12)

@@ -1,0 +1,63 @@
+"""Options of the likelihood of chains."""
+
+from dataclasses import dataclass
+
+from hil.estimator.options import CoordinateOptions
+
+
+@dataclass(frozen=True)
+class ChainOptions:
+    """Options of the likelihood of chains; names as in `hil.estimator.options`."""
+
+    softness: tuple[float, ...] = (3.0, 1.5, 1.0)
+    """Natural frequencies of the observer, in order of use [Hz].
+
+    A softer observer extracts more information; one that is too soft no longer follows the motion.
+    """
+    lost: float = 1.5
+    """Cost increase, beyond what the softness explains, above which the previous observer is kept (a ratio)."""
+    first_step: float = 5.2e-3
+    """Integration step while the observer is stiff [s]; samples within it are skipped."""
+    coarse_step: float = 2.6e-3
+    """Integration step [s]."""
+    fine_step: float = 1.3e-3
+    """Integration step of the last iterations [s]."""
+    finer: int = 16
+    """Number of smaller steps that replace one near standstill, where friction changes fast."""
+    finest: int = 64
+    """Number of smaller steps that replace one near standstill in the last iterations."""
+    widths_per_substep: float = CoordinateOptions.widths_per_substep
+    width_floor: float = 3e-4
+    """Minimum width of every Coulomb step [rad/s]: hardly distinguishable from friction that truly sticks."""
+    initial_width: float = 0.03
+    """Initial width of the smoothed Coulomb step [rad/s]."""
+    other_initial_widths: tuple[float, ...] = (0.005, 0.001)
+    """Initial widths of further fits, tried as long as no fit explains the motion [rad/s]."""
+    poor: float = 1.2
+    """RMS weighted residual above which a second start is made; 1 for noise alone."""
+    test_zeros: bool = False
+    """Whether to test the encoder zeros that the model holds fixed; takes one more simulation with sensitivities."""
+    min_initial_lag: float = 5e-4
+    """Minimum initial guess of the lag [s]."""
+    reach: float = 0.3
+    """Fraction of their maximum change per step that friction-shape parameters may use in the last iterations.
+
+    The sum of squares is far from quadratic in them.
+    """
+    ftol_coarse: float = 1e-2
+    ftol_near: float = 3e-3
+    ftol_nearer: float = 1e-3
+    ftol: float = 2e-5
+    towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
+    """Initial guesses as fractions of the way from the prior to stage 1; the first that can be simulated is used."""
+    unfinished: float = 1.0
+    """Expected decrease of the sum of squares in one more step, above which the minimum counts as not reached and the
+    fit continues with shorter integration steps. 1 is a distance of one standard error.
+    """
+    angle_scale: float = 0.1
+    """Scale of the initial angles [rad]."""
+    outlier_threshold: float = 4.0
+    """Residual in standard deviations above which a sample is downweighted."""
+
+
+DEFAULTS = ChainOptions()
