@@ -1,5 +1,6 @@
 """Fixtures: a fake arm with a short experiment, and the ports that a test opened, for inspecting the servos."""
 
+import gc
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,9 +18,25 @@ from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 
+@pytest.hookimpl(trylast=True)  # once deselected tests are gone
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the tests that take a minute each, so that no worker is left with one at the end."""
-    items.sort(key=lambda item: item.get_closest_marker("long") is None)
+    """Start with the tests that take a minute each, so that no worker is left with one at the end.
+
+    Of two workers, the second starts in the middle, with those of spatial arms: it compiles their loops while the first
+    compiles those of planar arms, and later each finds on disk what the other has compiled.
+    """
+    long = [item for item in items if item.get_closest_marker("long")]
+    spatial = [item for item in long if "chain" in item.nodeid]
+    planar = [item for item in long if item not in spatial]
+    others = [item for item in items if item not in long]
+    middle = max(0, len(items) // 2 - len(planar))
+    items[:] = [*planar, *others[:middle], *spatial, *others[middle:]]
+
+
+def pytest_collection_finish() -> None:
+    """Exclude what was imported and collected from garbage collection, which otherwise searches it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Annotated, NoReturn
 
 import typer
@@ -96,6 +97,12 @@ for _name, (_command, _example) in COMMANDS.items():
     app.command(_name, epilog=f"Example: hil {_name} {_example}")(with_verbosity(_command))
 
 
+@cache
+def _built() -> Callable[[], object]:
+    """The commands as Click has them; Typer would build them anew at every call of `main`, in 10 ms."""
+    return typer.main.get_command(app)
+
+
 def _one_blas_thread() -> None:
     """Give BLAS one thread unless the user chose a number; it reads these variables when numpy is first imported.
 
@@ -111,7 +118,7 @@ def main() -> NoReturn:
     _one_blas_thread()
     try:
         with _code_as_asked():
-            app()
+            _built()()
     except Exception as raised:
         error = stop_behind(raised) or raised
         code = exit_code(error)

@@ -3,11 +3,12 @@
 import os
 import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from tests.support.packages import unpack
 
 THEIR_TESTS = """
 import drivers, estimator, fakes
@@ -41,7 +42,7 @@ def environment(request: pytest.FixtureRequest, wheel: Path, tmp_path_factory: p
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
     packages = folder / "lib" / version / "site-packages"
-    zipfile.ZipFile(wheel).extractall(packages)
+    unpack(wheel, packages)
     (packages / "borrowed.pth").write_text(str(Path(np.__file__).parents[1]), encoding="utf-8")
     for name, module, function in (("pytest", "pytest", "console_main"), ("hil", "hil.cli.app", "main")):
         script = binaries / name

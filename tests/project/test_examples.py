@@ -15,6 +15,7 @@ from hil.runs.run_folder import RunFolder
 from tests.support.paths import ROOT
 
 EXAMPLES = ROOT / "examples"
+SCRIPTS = sorted(path.stem for path in EXAMPLES.glob("*.py") if "__main__" in path.read_text(encoding="utf-8"))
 LEAST_IMPROVEMENT = 3.0
 
 
@@ -32,7 +33,7 @@ def realistic(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run.path
 
 
-@pytest.mark.parametrize("name", ["feed_forward", "gravity_compensation"])
+@pytest.mark.parametrize("name", SCRIPTS)
 def test_the_model_makes_errors_several_times_smaller(name: str, realistic: Path, tmp_path: Path) -> None:
     command = [sys.executable, str(EXAMPLES / f"{name}.py"), str(realistic)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)

@@ -13,7 +13,7 @@ import pytest
 import hil
 from hil.config.bundled import bundled_configs, find_config
 from hil.config.schema import load_config
-from tests.support.packages import build
+from tests.support.packages import build, unpack
 from tests.support.paths import ROOT
 
 MOST_BYTES = 1_200_000
@@ -54,7 +54,7 @@ def test_the_wheel_of_the_sdist_is_the_same_wheel(wheel: Path, tmp_path: Path) -
 
 
 def test_a_bundled_arm_is_checked_by_name_without_a_checkout(wheel: Path, tmp_path: Path) -> None:
-    zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
+    unpack(wheel, tmp_path / "installed")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "installed")}
     code = (
         "import sys, hil.cli.app; print(hil.__file__); sys.argv = ['hil', 'check', 'fake_two_link']; hil.cli.app.main()"
