@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -43,6 +44,8 @@ class Bus:
         self.takes = takes
         self.calls: list[Call] = []
         self.velocity = NOTHING
+        self.wobble = 0.0
+        """Difference of two successive positions [rad]."""
         self.slow: Slow | None = None
         self.status: Any = None
 
@@ -50,7 +53,7 @@ class Bus:
         now = self.clock.now()
         self.calls.append(("between" if between else "sample", round(now, 6), *goals))
         self.clock.wait_until(now + (self.takes.pop(0) if len(self.takes) > 1 else self.takes[0]))
-        position, fine = (HELD,) * JOINTS, (False,) * JOINTS
+        position, fine = (HELD + self.wobble * (len(self.calls) % 2),) * JOINTS, (False,) * JOINTS
         after, sent = self.clock.now(), tuple(goals)
         return State(now, after, sent, sent, self.velocity, position, (0,) * JOINTS, fine, self.slow, self.status)
 
@@ -241,6 +244,14 @@ def test_an_arm_that_an_earlier_run_left_may_take_longer_to_come_to_rest(make: M
     assert len(bus.calls) == (4 + 12 if left_by_a_run else 4)
 
 
+@pytest.mark.parametrize(("steps", "message"), [(1, "one of the two readings is wrong"), (2, "The arm is moving")])
+def test_a_velocity_is_false_if_the_position_changes_by_one_step_at_most(make: Make, steps: int, message: str) -> None:
+    stream, bus, _ = make()
+    bus.velocity, bus.wobble = (0.0, 0.5), 0.99 * steps * abs(bus.joints[1].position_unit)
+    with pytest.raises(ExperimentError, match=message):
+        stream._rest()
+
+
 def settle(stream: Stream, differences: list[float], moved: float = 1.0) -> list[int]:
     """Let the periods differ from the one before by `differences`; return which periods were played."""
     played: list[int] = []
@@ -397,3 +408,39 @@ def test_an_arm_that_keeps_moving_without_current_is_waited_for(make: Make) -> N
     bus.velocity = NOTHING
     stream._come_to_rest()
     assert len(bus.calls) == 16
+
+
+@pytest.mark.parametrize(("is_stabilised", "is_upright"), [(False, False), (True, False), (True, True)])
+def test_only_an_upright_arm_is_balanced_in_the_end(
+    make: Make, monkeypatch: pytest.MonkeyPatch, is_stabilised: bool, is_upright: bool
+) -> None:
+    stream, _, _ = make()
+    stream._plan = replace(stream._plan, segments=())
+    balanced: list[Any] = []
+    monkeypatch.setattr(module, "must_balance", lambda _: is_upright)
+    stream._rest = stream._come_to_rest = lambda: None  # type: ignore[method-assign]
+    stream._balance = balanced.append  # type: ignore[method-assign]
+    stream._stabiliser = object() if is_stabilised else None  # type: ignore[assignment]
+    stream._play_all()
+    assert len(balanced) == (is_stabilised and is_upright)
+
+
+@pytest.mark.parametrize(("balanced_after", "is_moving", "windows"), [(0, False, 1), (2, False, 3), (2, True, 5)])
+def test_balancing_ends_once_the_arm_is_balanced_and_still_or_its_time_is_up(
+    make: Make, balanced_after: int, is_moving: bool, windows: int
+) -> None:
+    stream, bus, guard = make(end_samples=20)
+    looks: list[State] = []
+
+    def is_balanced(_: Config, state: State) -> bool:
+        looks.append(state)
+        return len(looks) > balanced_after
+
+    stabiliser: Any = SimpleNamespace(
+        balance=lambda: None, is_balanced=is_balanced, add=lambda goal, _: [each + 0.25 for each in goal]
+    )
+    stream._stabiliser = stabiliser
+    bus.velocity = (0.0, 0.5 * is_moving)
+    stream._balance(stabiliser)
+    assert len(bus.calls) == 4 * windows and all(call[2] == 0.25 for call in bus.calls)
+    assert not guard.of("at rest")
