@@ -444,3 +444,99 @@ def test_balancing_ends_once_the_arm_is_balanced_and_still_or_its_time_is_up(
     stream._balance(stabiliser)
     assert len(bus.calls) == 4 * windows and all(call[2] == 0.25 for call in bus.calls)
     assert not guard.of("at rest")
+
+
+class Lowers(Checks):
+    """In place of the lowering: a path of three samples, during which it notes what it is given."""
+
+    elsewhere = ""
+    lies_already = False
+
+    def lies(self, _state: State) -> bool:
+        return self.lies_already
+
+    def begin(self, _state: State, _goal: list[float]) -> int:
+        return 3
+
+    def goals(self, index: int, _state: State) -> list[float]:
+        return [0.5 + 0.1 * index] * JOINTS
+
+    def look(self, index: int, _state: State, gap: float, *, between: bool = False) -> None:  # type: ignore[override]
+        self.calls.append(("look", index, round(gap, 6), between))
+
+    def lies_elsewhere(self, _state: State) -> str:
+        return self.elsewhere
+
+
+def lowered(stream: Stream, lowering: Lowers) -> list[str]:
+    """Lower the arm; return what the error is told."""
+    error = ExperimentError("stopped")
+    stream._lower(lowering, error)  # type: ignore[arg-type]
+    return getattr(error, "__notes__", [])
+
+
+@pytest.mark.parametrize("turns", [1, 2])
+def test_an_arm_is_lowered_at_the_usual_rate(make: Make, turns: int) -> None:
+    stream, bus, _ = make(turns=turns)
+    play(stream, [0.1])
+    bus.read_back_at = -math.inf
+    lowering = Lowers()
+    assert lowered(stream, lowering) == ["The arm was lowered to its rest pose."]
+    first = 0.05 + TAKES_S + 0.05  # the ticks begin anew
+    at = [round(first + 0.05 * index, 6) for index in range(3)]
+    assert bus.times("sample")[1:] == at
+    assert bus.times("between") == ([] if turns == 1 else [round(each + 0.025, 6) for each in at[:2]])
+    assert [call[2] for call in bus.calls if call[0] == "sample"] == pytest.approx([0.1, 0.5, 0.6, 0.7])
+    between = [(0, 0.025, True), (1, 0.025, True)] if turns == 2 else [None, None]
+    apart = 0.05 / turns
+    wanted = [(0, 0.051, False), between[0], (1, apart, False), between[1], (2, apart, False)]
+    assert lowering.of("look") == [each for each in wanted if each is not None]
+    assert bus.times("read back")[-1] == at[-1]
+    samples = stream._recorder.samples[1:]
+    assert len(samples) == 3 and set(samples["phase"]) == {Phase.LOWERING} and set(samples["period"]) == {-1}
+    lowering.elsewhere = "elsewhere"
+    assert lowered(stream, lowering) == ["The arm was lowered, but not to its rest pose: elsewhere."]
+
+
+def test_ticks_missed_while_it_is_lowered_are_told_and_recorded(make: Make) -> None:
+    stream, bus, _ = make(takes=[TAKES_S, 0.13, TAKES_S])
+    play(stream, [0.1])
+    lowering = Lowers()
+    lowered(stream, lowering)
+    assert lowering.of("late") == [(0.13,)]
+    assert bus.times("sample") == [0.05, 0.101, 0.231]
+    assert stream._recorder.samples["missing"][:, 0].tolist() == [0, 0, 1, 0]
+    assert set(stream._recorder.samples["phase"][1:]) == {Phase.LOWERING}
+    assert set(stream._recorder.samples["period"][1:]) == {-1}
+
+
+@pytest.mark.parametrize(
+    ("is_watched", "since", "is_lowered"), [(True, 0.1, True), (True, 0.11, False), (False, 0.11, True)]
+)
+def test_an_arm_whose_watchdogs_have_acted_cannot_be_lowered(
+    make: Make, is_watched: bool, since: float, is_lowered: bool
+) -> None:
+    """They act 25 ms after their 80 ms at the latest."""
+    stream, bus, _ = make()
+    play(stream, [0.1])
+    bus.is_watched = is_watched
+    bus.clock.wait_until(0.05 + since)
+    (told,) = lowered(stream, Lowers())
+    assert ("was lowered" in told) is is_lowered and ("had already acted" in told) is not is_lowered
+    assert len(bus.calls) == (4 if is_lowered else 1)
+
+
+def test_an_arm_that_lies_or_was_not_seen_is_not_lowered(make: Make) -> None:
+    stream, bus, _ = make()
+    assert lowered(stream, Lowers()) == [] and not bus.calls, "no state"
+    play(stream, [0.1])
+    lowering = Lowers()
+    lowering.lies_already = True
+    assert lowered(stream, lowering) == []
+    assert stream._state is not None
+    for change in ({"missing": (False, True)}, {"error": (128, 0)}):
+        whole, stream._state = stream._state, stream._state._replace(**change)  # type: ignore[arg-type]
+        assert lowered(stream, Lowers()) == []
+        stream._state = whole
+    assert len(bus.calls) == 1
+    assert lowered(stream, Lowers()) == ["The arm was lowered to its rest pose."]
