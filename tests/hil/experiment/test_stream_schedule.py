@@ -402,12 +402,14 @@ def test_a_run_plays_each_multisine_and_comes_to_rest(make: Make) -> None:
 
 def test_an_arm_that_keeps_moving_without_current_is_waited_for(make: Make) -> None:
     stream, bus, _ = make(end_samples=12)
+    notes: list[str] = []
+    stream._note = notes.append  # type: ignore[method-assign, assignment]
     bus.velocity = (0.0, 0.5)
     stream._come_to_rest()
-    assert len(bus.calls) == 12
+    assert len(bus.calls) == 12 and notes[-1] == "still moving at 0.00, 0.50 rad/s after 3 s without current"
     bus.velocity = NOTHING
     stream._come_to_rest()
-    assert len(bus.calls) == 16
+    assert len(bus.calls) == 16 and notes[-1] == "at rest"
 
 
 @pytest.mark.parametrize(("is_stabilised", "is_upright"), [(False, False), (True, False), (True, True)])
@@ -540,3 +542,37 @@ def test_an_arm_that_lies_or_was_not_seen_is_not_lowered(make: Make) -> None:
         stream._state = whole
     assert len(bus.calls) == 1
     assert lowered(stream, Lowers()) == ["The arm was lowered to its rest pose."]
+
+
+@pytest.mark.parametrize(
+    ("can_be_lowered", "may_lower", "may_brake", "does"),
+    [(True, True, True, "lower"), (False, True, True, "brake"), (True, False, True, "brake"), (True, False, False, "")],
+)
+def test_a_stopped_arm_is_lowered_or_braked_or_neither(
+    make: Make, monkeypatch: pytest.MonkeyPatch, can_be_lowered: bool, may_lower: bool, may_brake: bool, does: str
+) -> None:
+    stream, _, _ = make()
+    monkeypatch.setattr(module, "may_lower", lambda *_: may_lower)
+    monkeypatch.setattr(module, "may_brake", lambda *_: may_brake)
+    stream._lowering = Lowers() if can_be_lowered else None  # type: ignore[assignment]
+    done: list[str] = []
+    stream._lower = lambda *_: done.append("lower")  # type: ignore[method-assign]
+    stream._brake = lambda: done.append("brake")  # type: ignore[method-assign]
+
+    def fail() -> None:
+        raise ExperimentError("stopped")
+
+    stream._play_all = fail  # type: ignore[method-assign]
+    with pytest.raises(ExperimentError):
+        stream.run()
+    assert done == ([does] if does else [])
+
+
+@pytest.mark.parametrize(("count", "asked"), [(0, 1), (1, 1), (2, 2)])
+def test_the_signals_so_far_do_not_end_the_lowering(make: Make, count: int, asked: int) -> None:
+    stream, _, _ = make()
+    play(stream, [0.1])
+    told: list[int] = []
+    stream._stop = SimpleNamespace(count=count, check_again=told.append)  # type: ignore[assignment]
+    lowered(stream, Lowers())
+    assert told == [asked] * 3
