@@ -237,11 +237,13 @@ class Exchange:
         received = received.removeprefix(read.request)
         servos = read.unpack(received) or read.search(received)[0]
         now = self._now()
+        self.read_back_at = now
         if None in servos:
             self._late_possible = True
+            if not self.is_in_doubt:
+                self.read_back_at = now + TRY_AGAIN_S  # a late reply costs the next cycle time
         else:
             back.took(min(now - before, 2.0 * takes))
-        self.read_back_at = now
         found = back.look(servos, self._sent, now)
         if back.is_unexpected:
             self.read_status_next()  # it distinguishes lost goals from another master's

@@ -413,6 +413,20 @@ def test_a_lost_reply_or_a_long_cycle_delays_the_next_read_back_by_one_cycle_onl
         assert cycles.read_back_at == (before if is_passing else before + TRY_AGAIN_S)
 
 
+@pytest.mark.parametrize(("doubts_until", "pause"), [(0.0, TRY_AGAIN_S), (1.0, 0.0)])
+def test_after_a_lost_reply_the_next_read_back_waits_unless_another_master_is_suspected(
+    doubts_until: float, pause: float
+) -> None:
+    fine = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
+    wire = Wire([fine])
+    cycles = read_back_of(wire)
+    cycles.cycle([0, 0])
+    assert cycles._read_back is not None
+    cycles._read_back.doubts_until = doubts_until
+    assert cycles.overruled(wire.now() + ONE_READ_BACK_S) is None
+    assert cycles.read_back_at == pytest.approx(wire.now() + pause, abs=1e-9)
+
+
 @pytest.mark.parametrize(("held", "is_due"), [(0, False), (5, True)])
 def test_a_goal_that_was_not_taken_asks_for_the_status(held: int, is_due: bool) -> None:
     wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])

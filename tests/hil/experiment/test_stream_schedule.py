@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -43,6 +44,8 @@ class Bus:
         self.takes = takes
         self.calls: list[Call] = []
         self.velocity = NOTHING
+        self.wobble = 0.0
+        """Difference of two successive positions [rad]."""
         self.slow: Slow | None = None
         self.status: Any = None
 
@@ -50,7 +53,7 @@ class Bus:
         now = self.clock.now()
         self.calls.append(("between" if between else "sample", round(now, 6), *goals))
         self.clock.wait_until(now + (self.takes.pop(0) if len(self.takes) > 1 else self.takes[0]))
-        position, fine = (HELD,) * JOINTS, (False,) * JOINTS
+        position, fine = (HELD + self.wobble * (len(self.calls) % 2),) * JOINTS, (False,) * JOINTS
         after, sent = self.clock.now(), tuple(goals)
         return State(now, after, sent, sent, self.velocity, position, (0,) * JOINTS, fine, self.slow, self.status)
 
@@ -241,6 +244,14 @@ def test_an_arm_that_an_earlier_run_left_may_take_longer_to_come_to_rest(make: M
     assert len(bus.calls) == (4 + 12 if left_by_a_run else 4)
 
 
+@pytest.mark.parametrize(("steps", "message"), [(1, "one of the two readings is wrong"), (2, "The arm is moving")])
+def test_a_velocity_is_false_if_the_position_changes_by_one_step_at_most(make: Make, steps: int, message: str) -> None:
+    stream, bus, _ = make()
+    bus.velocity, bus.wobble = (0.0, 0.5), 0.99 * steps * abs(bus.joints[1].position_unit)
+    with pytest.raises(ExperimentError, match=message):
+        stream._rest()
+
+
 def settle(stream: Stream, differences: list[float], moved: float = 1.0) -> list[int]:
     """Let the periods differ from the one before by `differences`; return which periods were played."""
     played: list[int] = []
@@ -391,9 +402,177 @@ def test_a_run_plays_each_multisine_and_comes_to_rest(make: Make) -> None:
 
 def test_an_arm_that_keeps_moving_without_current_is_waited_for(make: Make) -> None:
     stream, bus, _ = make(end_samples=12)
+    notes: list[str] = []
+    stream._note = notes.append  # type: ignore[method-assign, assignment]
     bus.velocity = (0.0, 0.5)
     stream._come_to_rest()
-    assert len(bus.calls) == 12
+    assert len(bus.calls) == 12 and notes[-1] == "still moving at 0.00, 0.50 rad/s after 3 s without current"
     bus.velocity = NOTHING
     stream._come_to_rest()
-    assert len(bus.calls) == 16
+    assert len(bus.calls) == 16 and notes[-1] == "at rest"
+
+
+@pytest.mark.parametrize(("is_stabilised", "is_upright"), [(False, False), (True, False), (True, True)])
+def test_only_an_upright_arm_is_balanced_in_the_end(
+    make: Make, monkeypatch: pytest.MonkeyPatch, is_stabilised: bool, is_upright: bool
+) -> None:
+    stream, _, _ = make()
+    stream._plan = replace(stream._plan, segments=())
+    balanced: list[Any] = []
+    monkeypatch.setattr(module, "must_balance", lambda _: is_upright)
+    stream._rest = stream._come_to_rest = lambda: None  # type: ignore[method-assign]
+    stream._balance = balanced.append  # type: ignore[method-assign]
+    stream._stabiliser = object() if is_stabilised else None  # type: ignore[assignment]
+    stream._play_all()
+    assert len(balanced) == (is_stabilised and is_upright)
+
+
+@pytest.mark.parametrize(("balanced_after", "is_moving", "windows"), [(0, False, 1), (2, False, 3), (2, True, 5)])
+def test_balancing_ends_once_the_arm_is_balanced_and_still_or_its_time_is_up(
+    make: Make, balanced_after: int, is_moving: bool, windows: int
+) -> None:
+    stream, bus, guard = make(end_samples=20)
+    looks: list[State] = []
+
+    def is_balanced(_: Config, state: State) -> bool:
+        looks.append(state)
+        return len(looks) > balanced_after
+
+    stabiliser: Any = SimpleNamespace(
+        balance=lambda: None, is_balanced=is_balanced, add=lambda goal, _: [each + 0.25 for each in goal]
+    )
+    stream._stabiliser = stabiliser
+    bus.velocity = (0.0, 0.5 * is_moving)
+    stream._balance(stabiliser)
+    assert len(bus.calls) == 4 * windows and all(call[2] == 0.25 for call in bus.calls)
+    assert not guard.of("at rest")
+
+
+class Lowers(Checks):
+    """In place of the lowering: a path of three samples, during which it notes what it is given."""
+
+    elsewhere = ""
+    lies_already = False
+
+    def lies(self, _state: State) -> bool:
+        return self.lies_already
+
+    def begin(self, _state: State, _goal: list[float]) -> int:
+        return 3
+
+    def goals(self, index: int, _state: State) -> list[float]:
+        return [0.5 + 0.1 * index] * JOINTS
+
+    def look(self, index: int, _state: State, gap: float, *, between: bool = False) -> None:  # type: ignore[override]
+        self.calls.append(("look", index, round(gap, 6), between))
+
+    def lies_elsewhere(self, _state: State) -> str:
+        return self.elsewhere
+
+
+def lowered(stream: Stream, lowering: Lowers) -> list[str]:
+    """Lower the arm; return what the error is told."""
+    error = ExperimentError("stopped")
+    stream._lower(lowering, error)  # type: ignore[arg-type]
+    return getattr(error, "__notes__", [])
+
+
+@pytest.mark.parametrize("turns", [1, 2])
+def test_an_arm_is_lowered_at_the_usual_rate(make: Make, turns: int) -> None:
+    stream, bus, _ = make(turns=turns)
+    play(stream, [0.1])
+    bus.read_back_at = -math.inf
+    lowering = Lowers()
+    assert lowered(stream, lowering) == ["The arm was lowered to its rest pose."]
+    first = 0.05 + TAKES_S + 0.05  # the ticks begin anew
+    at = [round(first + 0.05 * index, 6) for index in range(3)]
+    assert bus.times("sample")[1:] == at
+    assert bus.times("between") == ([] if turns == 1 else [round(each + 0.025, 6) for each in at[:2]])
+    assert [call[2] for call in bus.calls if call[0] == "sample"] == pytest.approx([0.1, 0.5, 0.6, 0.7])
+    between = [(0, 0.025, True), (1, 0.025, True)] if turns == 2 else [None, None]
+    apart = 0.05 / turns
+    wanted = [(0, 0.051, False), between[0], (1, apart, False), between[1], (2, apart, False)]
+    assert lowering.of("look") == [each for each in wanted if each is not None]
+    assert bus.times("read back")[-1] == at[-1]
+    samples = stream._recorder.samples[1:]
+    assert len(samples) == 3 and set(samples["phase"]) == {Phase.LOWERING} and set(samples["period"]) == {-1}
+    lowering.elsewhere = "elsewhere"
+    assert lowered(stream, lowering) == ["The arm was lowered, but not to its rest pose: elsewhere."]
+
+
+def test_ticks_missed_while_it_is_lowered_are_told_and_recorded(make: Make) -> None:
+    stream, bus, _ = make(takes=[TAKES_S, 0.13, TAKES_S])
+    play(stream, [0.1])
+    lowering = Lowers()
+    lowered(stream, lowering)
+    assert lowering.of("late") == [(0.13,)]
+    assert bus.times("sample") == [0.05, 0.101, 0.231]
+    assert stream._recorder.samples["missing"][:, 0].tolist() == [0, 0, 1, 0]
+    assert set(stream._recorder.samples["phase"][1:]) == {Phase.LOWERING}
+    assert set(stream._recorder.samples["period"][1:]) == {-1}
+
+
+@pytest.mark.parametrize(
+    ("is_watched", "since", "is_lowered"), [(True, 0.1, True), (True, 0.11, False), (False, 0.11, True)]
+)
+def test_an_arm_whose_watchdogs_have_acted_cannot_be_lowered(
+    make: Make, is_watched: bool, since: float, is_lowered: bool
+) -> None:
+    """They act 25 ms after their 80 ms at the latest."""
+    stream, bus, _ = make()
+    play(stream, [0.1])
+    bus.is_watched = is_watched
+    bus.clock.wait_until(0.05 + since)
+    (told,) = lowered(stream, Lowers())
+    assert ("was lowered" in told) is is_lowered and ("had already acted" in told) is not is_lowered
+    assert len(bus.calls) == (4 if is_lowered else 1)
+
+
+def test_an_arm_that_lies_or_was_not_seen_is_not_lowered(make: Make) -> None:
+    stream, bus, _ = make()
+    assert lowered(stream, Lowers()) == [] and not bus.calls, "no state"
+    play(stream, [0.1])
+    lowering = Lowers()
+    lowering.lies_already = True
+    assert lowered(stream, lowering) == []
+    assert stream._state is not None
+    for change in ({"missing": (False, True)}, {"error": (128, 0)}):
+        whole, stream._state = stream._state, stream._state._replace(**change)  # type: ignore[arg-type]
+        assert lowered(stream, Lowers()) == []
+        stream._state = whole
+    assert len(bus.calls) == 1
+    assert lowered(stream, Lowers()) == ["The arm was lowered to its rest pose."]
+
+
+@pytest.mark.parametrize(
+    ("can_be_lowered", "may_lower", "may_brake", "does"),
+    [(True, True, True, "lower"), (False, True, True, "brake"), (True, False, True, "brake"), (True, False, False, "")],
+)
+def test_a_stopped_arm_is_lowered_or_braked_or_neither(
+    make: Make, monkeypatch: pytest.MonkeyPatch, can_be_lowered: bool, may_lower: bool, may_brake: bool, does: str
+) -> None:
+    stream, _, _ = make()
+    monkeypatch.setattr(module, "may_lower", lambda *_: may_lower)
+    monkeypatch.setattr(module, "may_brake", lambda *_: may_brake)
+    stream._lowering = Lowers() if can_be_lowered else None  # type: ignore[assignment]
+    done: list[str] = []
+    stream._lower = lambda *_: done.append("lower")  # type: ignore[method-assign]
+    stream._brake = lambda: done.append("brake")  # type: ignore[method-assign]
+
+    def fail() -> None:
+        raise ExperimentError("stopped")
+
+    stream._play_all = fail  # type: ignore[method-assign]
+    with pytest.raises(ExperimentError):
+        stream.run()
+    assert done == ([does] if does else [])
+
+
+@pytest.mark.parametrize(("count", "asked"), [(0, 1), (1, 1), (2, 2)])
+def test_the_signals_so_far_do_not_end_the_lowering(make: Make, count: int, asked: int) -> None:
+    stream, _, _ = make()
+    play(stream, [0.1])
+    told: list[int] = []
+    stream._stop = SimpleNamespace(count=count, check_again=told.append)  # type: ignore[assignment]
+    lowered(stream, Lowers())
+    assert told == [asked] * 3
