@@ -88,7 +88,18 @@ class Port:
             raise self._lost(error) from error
 
     def read(self, count: int, timeout: float) -> bytes:
-        """Return up to `count` bytes; fewer if they have not arrived within `timeout` [s]."""
+        """Return up to `count` bytes; fewer if they have not arrived within `timeout` [s].
+
+        A URL handler may return what has arrived before its time is up; the rest is then read in the time that is left.
+        """
+        deadline = self.clock.now() + timeout
+        received = part = self._read_once(count, timeout)
+        while part and len(received) < count and (remaining := deadline - self.clock.now()) > 0.0:
+            part = self._read_once(count - len(received), remaining)
+            received += part
+        return received
+
+    def _read_once(self, count: int, timeout: float) -> bytes:
         try:
             # Setting the timeout makes pyserial query the terminal settings, so it is set only when it changes.
             if self._timeout != timeout:

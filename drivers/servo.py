@@ -59,8 +59,15 @@ class Servo:
         """Return the value of a register in ticks; raises NoReply, WrongReply, ServoRefused, PortLost."""
         return self.read_entry(self.table[register], attempts)
 
-    def read_entry(self, entry: Register, attempts: int = _ATTEMPTS) -> int:
-        """Read a register that is missing from the model's table; raises as `read`."""
+    def read_despite_error(self, register: str, attempts: int = _ATTEMPTS) -> int:
+        """Read a register as `read` does, but accept a reply that carries its value and reports an error too."""
+        return self.read_entry(self.table[register], attempts, despite_error=True)
+
+    def read_entry(self, entry: Register, attempts: int = _ATTEMPTS, *, despite_error: bool = False) -> int:
+        """Read a register that is missing from the model's table; raises as `read`.
+
+        despite_error: accept a reply that carries the value and reports an error too.
+        """
 
         def ask() -> tuple[list[int], int, int]:
             # The SDK's own readTxRx accepts the first bytes of any reply, including a late one to another request.
@@ -84,6 +91,8 @@ class Servo:
             data = packet[_DATA : _DATA + (packet[5] | packet[6] << 8) - _BESIDE_DATA]
             if len(data) != entry.size and not error & ~ALERT:
                 return [], COMM_RX_CORRUPT, error
+            if despite_error and len(data) == entry.size:
+                error = 0
             return data, result, error
 
         return entry.decode(bytes(self._try(f"reading {entry.name}", ask, attempts, is_read=True)))
@@ -99,7 +108,23 @@ class Servo:
             self.write_only(register, value, attempts)
         actual = self.read(register, attempts)
         if actual != value:
-            raise ServoRefused(f"{self.title}: {register} was written as {value} but reads back as {actual}.")
+            raise _not_held(self.title, register, value, actual)
+
+    def write_despite_error(self, register: str, value: int, attempts: int | None = None) -> None:
+        """Write a register as `write` does, but ignore errors that replies report if the value reads back as written.
+
+        What makes an arm safe, and what restores it, must not fail because of a servo that reports errors but obeys.
+        """
+        attempts = _ATTEMPTS if attempts is None else attempts
+        refused: ServoRefused | None = None
+        try:
+            with suppress(NoReply):
+                self.write_only(register, value, attempts)
+        except ServoRefused as error:
+            refused = error
+        actual = self.read_despite_error(register, attempts)
+        if actual != value:
+            raise refused or _not_held(self.title, register, value, actual)
 
     def write_only(self, register: str, value: int, attempts: int = _ATTEMPTS) -> None:
         """Write a register without reading it back, as needed for ID and Baud Rate; raises as `read`."""
@@ -147,7 +172,7 @@ class Servo:
             )
         refused = error & ~ALERT
         if refused:
-            raise ServoRefused(f"{self.title} refused {what}: {_status_error(refused)}.")
+            raise ServoRefused(f"{self.title} refused {what}: {describe_status_error(refused)}.")
         return value
 
 
@@ -162,7 +187,12 @@ def describe_error(error: HardwareError) -> str:
     return ", ".join(known + ([f"unknown bits {rest:#04x}"] if rest else [])) or NO_ERROR
 
 
-def _status_error(code: int) -> str:
+def _not_held(title: str, register: str, value: int, actual: int) -> ServoRefused:
+    return ServoRefused(f"{title}: {register} was written as {value} but reads back as {actual}.")
+
+
+def describe_status_error(code: int) -> str:
+    """Return the error number of a status packet in words, e.g. "data range error"."""
     try:
         return StatusError(code).name.replace("_", " ").lower() + " error"
     except ValueError:

@@ -162,7 +162,7 @@ def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
 def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> None:
     """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more."""
     for servo in servos.values():
-        _uninterrupted(lambda servo=servo: servo.write("Bus Watchdog", 0), interrupts)  # type: ignore[misc]
+        _uninterrupted(lambda servo=servo: servo.write_despite_error("Bus Watchdog", 0), interrupts)  # type: ignore[misc]
 
 
 def cut_again(servo: Servo, *, armed: bool) -> bool:
@@ -170,11 +170,11 @@ def cut_again(servo: Servo, *, armed: bool) -> bool:
 
     armed: whether its Bus Watchdog was armed before torque was switched on; if so, it is switched off.
     """
-    if servo.read("Torque Enable"):
-        servo.write("Torque Enable", 0)
+    if servo.read_despite_error("Torque Enable"):
+        servo.write_despite_error("Torque Enable", 0)
     rebooted = armed and was_rebooted(servo)
     if armed:
-        servo.write("Bus Watchdog", 0)
+        servo.write_despite_error("Bus Watchdog", 0)
     return rebooted
 
 
@@ -190,7 +190,7 @@ def was_rebooted(servo: Servo) -> bool:
 
 def _confirm(servo: Servo, attempts: int | None, interrupts: list[BaseException]) -> Exception | None:
     """Write torque off and read it back; return None, or the failure."""
-    return _uninterrupted(lambda: servo.write("Torque Enable", 0, attempts), interrupts)
+    return _uninterrupted(lambda: servo.write_despite_error("Torque Enable", 0, attempts), interrupts)
 
 
 def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) -> Exception | None:

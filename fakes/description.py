@@ -206,8 +206,9 @@ def load_fake(path: Path | str) -> FakeArm:
 
     Other tables of the file are ignored. Raises `DescriptionError`.
     """
+    path = find_arm(path)
     try:
-        document = load_toml(find_arm(path))
+        document = load_toml(path)
     except TomlFileError as error:
         hint = _known_names(str(path)) if isinstance(error.__cause__, OSError) else ""
         raise DescriptionError(f"{str(error).rstrip('.')}{hint}") from error

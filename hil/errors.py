@@ -52,6 +52,7 @@ class Cause(Enum):
     NOT_A_NUMBER = "not a number"
     ALERT = "alert"
     MISSING = "missing replies"
+    ERRORS = "errors in replies"
     LATE = "missed deadlines"
     JUMP = "encoder jump"
     NOT_FOLLOWING = "current does not follow"

@@ -65,19 +65,19 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
     Each is read back. Raises WrongSetting while torque is on, otherwise as `Servo.write`, but only after all other
     registers were tried.
     """
-    if servo.read("Torque Enable"):
+    if servo.read_despite_error("Torque Enable"):
         raise WrongSetting(f"{servo.title}: its settings cannot be restored while its torque is on.")
-    if servo.read("Bus Watchdog") != 0:
-        servo.write("Bus Watchdog", 0)  # goals are read-only while it is tripped
+    if servo.read_despite_error("Bus Watchdog") != 0:
+        servo.write_despite_error("Bus Watchdog", 0)  # goals are read-only while it is tripped
     written: dict[str, tuple[int, int]] = {}
     failures: list[DriverError] = []
     for name in (*EEPROM, *RAM, "Bus Watchdog"):
         if name not in settings or name not in servo.table:
             continue
         try:
-            present = servo.read(name)
+            present = servo.read_despite_error(name)
             if present != settings[name]:
-                servo.write(name, settings[name])
+                servo.write_despite_error(name, settings[name])
                 written[name] = present, settings[name]
         except DriverError as error:
             failures.append(error)

@@ -15,6 +15,7 @@ import numpy as np
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
 from hil.drivers.packet import ALERT, StatusError
+from hil.drivers.servo import describe_status_error
 from hil.drivers.servo_model import HARDLY_ANY, Mode
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
@@ -37,6 +38,9 @@ EARLY_MOTION_RAD = 0.05
 
 BELOW_VOLTAGE = 0.9
 """Speed that is proposed as a limit, relative to one at which the supply could not drive the commanded current."""
+
+_ERRORS_IN_A_ROW = 3
+"""Consecutive replies with values and an error number at which a servo is stopped; it may not accept its goals."""
 
 NONE_HEARD = "No servo was heard"
 """Beginning of the message of a stop because all replies are missing."""
@@ -91,6 +95,9 @@ class Guard:
         self._apart = Apart()
         self._status = StatusCheck(config)
         self._missing = self._silence.counts
+        self._errors = [0] * len(config.joints)
+        """Errors reported in a row together with values, by joint."""
+        self._any_errors = False
         self._resting: tuple[float, ...] | None = None
         self._shortest = float("inf")
         self._supply = [float("nan")] * len(config.joints)
@@ -129,7 +136,7 @@ class Guard:
         unsure = took - self._shortest
         if self._deadlines.any_missed and not between:
             self._deadlines.met()
-        if any(state.error) or True in state.missing or self._silence.any_missed:
+        if any(state.error) or True in state.missing or self._silence.any_missed or self._any_errors:
             self._look_one_by_one(state, now, unsure)
         else:
             fault = self._checks.look(state, unsure)
@@ -160,10 +167,24 @@ class Guard:
             if missing[index]:
                 self._count_missing(index, error[index], now, alone=not all(missing))
                 continue
+            self._count_errors(index, error[index])
             fault = self._checks.look_at(index, state, unsure, self._missing[index])
             if fault != joint_checks.FINE:
                 self._stop_for(fault, state)
             self._silence.heard(index, now)
+        self._any_errors = any(self._errors)
+
+    def _count_errors(self, index: int, error: int) -> None:
+        """Count the errors that a servo reports in a row together with its values; too many are a stop."""
+        self._errors[index] = self._errors[index] + 1 if error else 0
+        if self._errors[index] >= _ERRORS_IN_A_ROW:
+            self._stop(
+                index,
+                Cause.ERRORS,
+                f"reports an error ({describe_status_error(error)}) with its values, {_ERRORS_IN_A_ROW} times in a row, although "
+                "nothing that it was sent should cause one: whether it accepts its goals is unknown. Power-cycle it "
+                "and check its firmware; a device between adapter and servo may also change replies.",
+            )
 
     def _stop_for(self, fault: int, state: State) -> NoReturn:
         """Raise SafetyStop for a fault found by the joint checks."""
@@ -208,7 +229,7 @@ class Guard:
             self._stop(
                 index,
                 Cause.MISSING,
-                f"answers with error {error} instead of its state; its last state was {too_long}. It refuses reads: "
+                f"answers with an error ({describe_status_error(error)}) instead of its state; its last state was {too_long}. It refuses reads: "
                 "power-cycle it.",
             )
         self._stop(

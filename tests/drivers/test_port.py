@@ -2,12 +2,14 @@
 
 import os
 import time
+from types import SimpleNamespace
 
 import pytest
 
 from hil.drivers.errors import PortLost, PortNotOpened
-from hil.drivers.port import open_port
+from hil.drivers.port import Port, open_port
 from hil.drivers.sdk_port import SdkPort
+from hil.fakes.bus.clock import VirtualClock
 
 
 @pytest.fixture
@@ -71,3 +73,11 @@ def test_the_sdk_can_never_leave_the_port_marked_as_in_use(pty: tuple[int, str])
     sdk_port.is_using = True
     assert not sdk_port.is_using
     os.close(master)
+
+
+def test_a_handler_that_returns_early_is_read_on_until_time_is_up() -> None:
+    clock = VirtualClock()
+    parts = [b"ab", b"cd", b""]
+    opened = SimpleNamespace(timeout=None, clock=clock, read=lambda _: parts.pop(0))
+    assert Port("early://", 1_000_000, opened).read(4, 0.01) == b"abcd" and parts == [b""]
+    assert Port("early://", 1_000_000, opened).read(4, 0.01) == b""

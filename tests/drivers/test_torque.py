@@ -10,6 +10,7 @@ import pytest
 
 from hil.drivers.bus import BusConfig, ServoBus
 from hil.drivers.errors import ServoRefused, TorqueNotOff
+from hil.drivers.preparation.settings import put_back, read_settings
 from hil.fakes.bus.faults import Fault, FaultKind
 
 Make = Callable[..., BusConfig]
@@ -233,3 +234,18 @@ def test_all_servos_confirmed_takes_no_silence(fake_config: Make) -> None:
             bus.exchange([0.3, 0.3])
             begun = bus.port.clock.now()
         assert bus.port.clock.now() - begun < 0.03
+
+
+def test_torque_that_reads_0_is_off_whatever_error_the_replies_report(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        servo = bus.drives[bus.joints[1]]
+        settings = read_settings(servo)
+        ask = servo._sdk.txRxPacket
+        with bus.torque(watchdog=0.1):
+            monkeypatch.setattr(servo._sdk, "txRxPacket", lambda *packet: (*ask(*packet)[:2], 4))
+        assert bus.torque_off_report is not None and not bus.torque_off_report.unconfirmed
+        assert put_back(servo, {**settings, "Goal Current": 7}) == {"Goal Current": (0, 7)}
+        with pytest.raises(ServoRefused, match="data range"):
+            servo.read("Goal Current")

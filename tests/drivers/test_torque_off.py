@@ -54,7 +54,7 @@ class Bench:
             if failures:
                 raise failures.pop(0)
 
-        return SimpleNamespace(id=number, table=load_control_table("XM430-W350"), write=write)
+        return SimpleNamespace(id=number, table=load_control_table("XM430-W350"), write_despite_error=write)
 
     def cut(self, *silent: Joint) -> Any:
         self.interrupts: list[BaseException] = []

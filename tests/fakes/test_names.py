@@ -7,10 +7,12 @@ import pytest
 import serial
 
 from hil import fakes
+from hil.config.bundled import bundled_configs
 from hil.config.schema import load_config, port_url
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.description import DescriptionError, load_fake, make_bus
 from hil.fakes.names import arm_names, find_arm
+from hil.setup.servo_session import servo_session
 from tests.support.command_line import hil
 
 READY = {
@@ -36,13 +38,29 @@ def test_shadows_of_the_viperx_listen_to_their_leaders() -> None:
     assert {servo_id: servo.shadow_id for servo_id, servo in servos.items() if servo.shadow_id} == {3: 2, 5: 4}
 
 
-@pytest.mark.parametrize("name", [*READY, "fake_two_link", "fake_pendulum"])
-def test_a_name_is_a_url_a_port_and_an_arm(name: str) -> None:
-    assert name in arm_names()
+@pytest.mark.parametrize("name", arm_names())
+def test_a_name_is_a_url_a_port_and_an_arm_anywhere(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    monkeypatch.chdir(tmp_path)
     fakes.register()
     with serial.serial_for_url(f"fake://{name}", 1_000_000, timeout=0.1) as port:
-        assert port.bus.servos
+        ids, baud = list(port.bus.servos), next(iter(port.bus.servos.values())).baud
     assert Path(port_url(name).removeprefix("fake://")).is_file()
+    assert hil("fake", name) == 0 and f"ID {ids[0]}:" in capsys.readouterr().out
+    assert hil("scan", f"fake://{name}", "--baud", str(baud), "--json") == 0
+    assert f'"id": {ids[0]}' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", sorted({*arm_names()} & {*bundled_configs()} - {*READY}))
+def test_a_bundled_fake_arm_is_opened_by_its_configurations_name(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = load_config(Path(name))
+    with servo_session(config) as bus:
+        assert len(bus.joints) == len(config.joints)
 
 
 def test_a_file_of_that_name_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -440,3 +440,13 @@ def test_another_goal_in_the_servo_is_named_before_the_supply(arm: Arm) -> None:
     said = str(not_followed(Guard(arm()), 0.12, 3.6, volt=12.0, held=0.12))
     assert "Its goal register reads 0.120 A" in said and "another program commands it" in said
     assert "supply" not in said
+
+
+def test_errors_reported_with_values_stop_when_they_are_several_in_a_row(arm: Arm) -> None:
+    guard, wrong = Guard(arm()), STILL._replace(error=(0, 4))
+    for number, state in enumerate((STILL, wrong, wrong, STILL, wrong)):
+        guard.look(at(number, state))
+    guard.look(at(5, wrong))
+    with pytest.raises(SafetyStop, match=r"'elbow'.*data range error.*3 times in a row") as stop:
+        guard.look(at(6, wrong))
+    assert stop.value.cause is Cause.ERRORS
