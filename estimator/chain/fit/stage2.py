@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.chain.fit.coordinates import kind_of
 from hil.estimator.chain.fit.held_zeros import HeldZeros, held_zeros
 from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.fit.options import DEFAULTS, ChainOptions
