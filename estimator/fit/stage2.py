@@ -29,7 +29,7 @@ from hil.estimator.fit.ripple import WAVES, find_waves
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
 from hil.estimator.fit.stage1 import LinearEstimate
-from hil.estimator.models.bounds import beyond_range, dependent, finite_std, step_beyond
+from hil.estimator.models.bounds import beyond_range, finite_std, matters, step_beyond
 from hil.estimator.models.model import Model
 from hil.estimator.models.terms import FRICTIONS, term_of
 from hil.estimator.options import LikelihoodOptions
@@ -300,7 +300,7 @@ def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Arr
     names = coordinates.names
     step, white = step_beyond(minimum.at.normal, minimum.at.gradient, coordinates.slopes(minimum.x[: value.size]))
     beyond = beyond_range(value, step, white, *coordinates.ranges(value))
-    if not (beyond.any() and dependent(names, step, finite_std(std, white))):
+    if not (beyond.any() and matters(names, beyond, step, finite_std(std, white))):
         beyond[:] = False
     late = limited(dict(zip(names, value.tolist(), strict=True)))
     return tuple(name for name, over in zip(names, beyond, strict=True) if over or name in late)

@@ -61,10 +61,12 @@ def finite_std(std: Array, white: Array) -> Array:
     return finite
 
 
-def dependent(names: tuple[str, ...], step: Array, std: Array) -> bool:
-    """Return whether a base parameter, other than offsets, would move by more than its standard error."""
+def matters(names: tuple[str, ...], beyond: Mask, step: Array, std: Array) -> bool:
+    """Return whether a base parameter, other than offsets, is at its bound (`beyond`) or would move by more than its
+    standard error `std`. The standard error accounts for the misfit, which the bound of that parameter itself may cause.
+    """
     base = np.array([term_of(name).part == "base" and kind_of(name) != "offset" for name in names])
-    return bool(np.any(np.abs(step[base]) > MOVED * std[base]))
+    return bool(beyond[base].any() or np.any(np.abs(step[base]) > MOVED * std[base]))
 
 
 def bound_sentence(names: Sequence[str]) -> str:

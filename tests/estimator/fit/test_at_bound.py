@@ -28,9 +28,12 @@ def test_a_lag_that_would_have_to_be_negative_is_at_its_bound(
     assert found.at_bound == ("lag",)
 
 
-def test_viscous_friction_that_would_have_to_be_negative_is_at_its_bound(period: recorded_arm.SettledPeriod) -> None:
+@pytest.mark.parametrize("driven_by", [0.05, 0.07])
+def test_viscous_friction_that_would_have_to_be_negative_is_at_its_bound(
+    period: recorded_arm.SettledPeriod, driven_by: float
+) -> None:
     velocity = np.gradient(period.position, 1.0 / period.rate, axis=1)
-    driven = replace(period, torque=period.torque - 0.07 * velocity)
+    driven = replace(period, torque=period.torque - driven_by * velocity)
     assert "viscous_1" in identify(driven, MODEL).at_bound
 
 

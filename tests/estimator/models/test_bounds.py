@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hil.estimator.arrays import Array
-from hil.estimator.models.bounds import beyond_range, bound_sentence, dependent, step_beyond
+from hil.estimator.models.bounds import beyond_range, bound_sentence, matters, step_beyond
 from hil.estimator.simulation.back_emf import limited
 
 NAMES = ("inertia_1", "viscous_1", "load_1")
@@ -27,7 +27,9 @@ def pressed(truth: float, seed: int) -> tuple[Array, Array, Array]:
 def test_only_what_the_data_press_against_zero_is_found(seed: int) -> None:
     beyond, step, std = pressed(-0.02, seed)
     assert beyond.tolist() == [False, False, True]
-    assert dependent(NAMES, step, std)
+    assert matters(NAMES, beyond, step, std)
+    assert not matters(NAMES, beyond, step, 1e9 * std)
+    assert matters(NAMES, beyond[[0, 2, 1]], step, 1e9 * std), "viscous friction itself"
     beyond, _, _ = pressed(0.0, seed)
     assert not beyond.any()
 
