@@ -1,6 +1,6 @@
 """Attacks on the bytes between host and servos by a man in the middle, and attacks on the servos themselves."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -144,7 +144,12 @@ def packets_of(data: bytes) -> list[bytes]:
 
 def request_in(data: bytes) -> Request | None:
     """The group read in these bytes of the host; None if there is none."""
-    for packet in Framer().feed(data):
+    return request_among(Framer().feed(data))
+
+
+def request_among(packets: Iterable[Packet]) -> Request | None:
+    """The first group read among these packets; None if there is none."""
+    for packet in packets:
         if packet.instruction in (0x82, 0x8A) and len(packet.body) > 4:
             address, length = int.from_bytes(packet.body[:2], "little"), int.from_bytes(packet.body[2:4], "little")
             return Request(address, length, tuple(packet.body[4:]), packet.instruction == 0x8A)

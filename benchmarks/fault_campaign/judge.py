@@ -7,19 +7,20 @@ undisturbed motion. From the first moment at which one of these fails permanentl
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.fault_campaign.attack import Kind, Request, blocks_in, field_of, goals_in, request_in
+from benchmarks.fault_campaign.attack import Kind, Request, blocks_in, field_of, goals_in, request_among, request_in
 from benchmarks.fault_campaign.draw import HARMLESS, SHIFTED, UNHEARD, WORDS, Drawn, causes_of
 from benchmarks.fault_campaign.middle import Traffic
 from benchmarks.fault_campaign.twin import Heard, has_healthy_twin
 from benchmarks.fault_campaign.witness import STEP_S
 from hil.config.schema import Config
-from hil.drivers.packet import Framer
+from hil.drivers.packet import Framer, Packet
 from hil.fakes.bus.faults import FaultKind
 
 BOUND_MS = 100.0
@@ -238,8 +239,9 @@ class _Told:
         for time, is_read, data in traffic.passed:
             if not is_read:
                 if b"\x83" in data[:16]:
-                    request = request_in(data) or request
-                    self._keep_goals(time, data, index)
+                    packets = list(Framer().feed(data))
+                    request = request_among(packets) or request
+                    self._keep_goals(time, packets, index)
                 elif b"\x82" in data[:9] or b"\x8a" in data[:9]:
                     request = request_in(data)
                 else:
@@ -249,8 +251,8 @@ class _Told:
                 pending += data
                 self._keep_answers(time, pending, request, index)
 
-    def _keep_goals(self, time: float, data: bytes, index: dict[int, int]) -> None:
-        for packet in Framer().feed(data):
+    def _keep_goals(self, time: float, packets: Sequence[Packet], index: dict[int, int]) -> None:
+        for packet in packets:
             for servo_id, (_, goal) in goals_in(packet).items():
                 if servo_id in index:
                     self._begun = min(self._begun, time)
