@@ -69,6 +69,8 @@ EQUIVALENT = {
     ("is_home * (", "self._was_above * 1.0  ->  self._was_above / 1.0"): "chain_watch: the same number",
     ("is_home * (", "self._was_below * 1.0  ->  self._was_below / 1.0"): "chain_watch: the same number",
     ("self._seen_at = 0.0", "0.0  ->  1.0"): "chain_watch: not used before the first sample",
+    ("for _ in range(0, self._plan.end_samples", "0  ->  1"): "stream: a multiple of the window has as many steps",
+    ("ticks.wait() if number else", "0.0  ->  1.0"): "stream: a value that is not used",
     ("_NEVER = ", "62  ->  124"): "exchange: more cycles than any run has",
     ("self._modes_due = -math.inf", "-math.inf  ->  +math.inf"): "read_back: the first look sets it",
     (

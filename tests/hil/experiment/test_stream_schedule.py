@@ -168,7 +168,7 @@ def test_one_slow_exchange_is_forgotten_in_time(make: Make) -> None:
     assert bus.times("between") == [0.06, 0.0725, 0.08, *later, 0.26, 0.27, 0.28, 0.29]
 
 
-@pytest.mark.parametrize("turns", [1, 5])
+@pytest.mark.parametrize("turns", [1, 2, 5])
 def test_read_backs_are_made_right_before_the_exchanges_that_follow(make: Make, turns: int) -> None:
     stream, bus, _ = make(turns=turns)
     bus.read_back_at = -math.inf
@@ -203,6 +203,7 @@ def test_before_the_first_exchange_a_missed_tick_counts_from_its_deadline(make: 
     stream._ticks._start = 0.05
     play(stream, [0.1])
     assert guard.of("late") == [(0.15,)] and not bus.calls
+    assert not stream._recorder.samples["goal_current"].any()
 
 
 def test_progress_is_shown_twenty_times_a_second_and_with_slow_values(make: Make) -> None:
@@ -216,6 +217,10 @@ def test_progress_is_shown_twenty_times_a_second_and_with_slow_values(make: Make
     bus.slow = Slow((12.0,) * JOINTS, (30.0,) * JOINTS, NOTHING)
     play(stream, [0.1])
     assert [progress.taken for progress in seen] == [5, 10, 13]
+    seen.clear()
+    stream, _, _ = make(20.0, watch=seen.append)
+    play(stream, [0.1] * 3)
+    assert [progress.taken for progress in seen] == [1, 2, 3], "every sample at slow rates"
 
 
 @pytest.mark.parametrize(("status", "wants", "asked"), [(None, True, 0), ((None,) * JOINTS, False, 0), ((), True, 1)])
@@ -398,6 +403,15 @@ def test_a_run_plays_each_multisine_and_comes_to_rest(make: Make) -> None:
     segment = samples["segment"].tolist()
     assert segment == [0] * (4 + 4 + 16 + 32 + 4) + [1] * (len(samples) - 60)
     assert not any(call[2] for call in bus.calls[-4:])
+    goal = samples["goal_current"][:, 0]
+    for phase, sign in ((Phase.RAMP_IN, 1), (Phase.RAMP_OUT, -1)):
+        assert (sign * np.diff(goal[samples["phase"] == phase][:4]) > 0).all()
+
+
+def test_the_largest_goal_of_each_joint_is_that_of_all_multisines(make: Make) -> None:
+    segments = tuple(Segment("a", None, np.tile(each, (8, 1)), 4) for each in ([0.1, 0.5], [0.3, 0.2], [0.0, 0.0]))  # type: ignore[arg-type, list-item]
+    stream, _, _ = make(segments=segments)
+    assert module._largest_goals(stream._plan) == pytest.approx([0.3, 0.5])
 
 
 def test_an_arm_that_keeps_moving_without_current_is_waited_for(make: Make) -> None:
@@ -541,6 +555,7 @@ def test_an_arm_that_lies_or_was_not_seen_is_not_lowered(make: Make) -> None:
         assert lowered(stream, Lowers()) == []
         stream._state = whole
     assert len(bus.calls) == 1
+    stream._sent_at = None
     assert lowered(stream, Lowers()) == ["The arm was lowered to its rest pose."]
 
 
