@@ -181,9 +181,9 @@ class Guard:
             self._stop(
                 index,
                 Cause.ERRORS,
-                f"reports an error ({describe_status_error(error)}) with its values, {_ERRORS_IN_A_ROW} times in a row, although "
-                "nothing that it was sent should cause one: whether it accepts its goals is unknown. Power-cycle it "
-                "and check its firmware; a device between adapter and servo may also change replies.",
+                f"reports an error ({describe_status_error(error)}) with its values, {_ERRORS_IN_A_ROW} times in a "
+                "row, although nothing that it was sent should cause one: whether it accepts its goals is unknown. "
+                "Power-cycle it and check its firmware; a device between adapter and servo may also change replies.",
             )
 
     def _stop_for(self, fault: int, state: State) -> NoReturn:
@@ -229,8 +229,8 @@ class Guard:
             self._stop(
                 index,
                 Cause.MISSING,
-                f"answers with an error ({describe_status_error(error)}) instead of its state; its last state was {too_long}. It refuses reads: "
-                "power-cycle it.",
+                f"answers with an error ({describe_status_error(error)}) instead of its state; its last state was "
+                f"{too_long}. It refuses reads: power-cycle it.",
             )
         self._stop(
             index,
