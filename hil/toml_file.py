@@ -83,6 +83,8 @@ def _given_twice(error: str, text: str, number: int) -> str:
             continue
         what = key[1] if key else f"{header[1]}{header[2]}{header[3]}" if header else ""
         within = table if key else ""
+        if count == number and header and (said := _other_brackets(header, lines, [*begins])):
+            return said
         if count == number:
             return _repeated(what, within, number, given.get((within, what)))
         given[within, what] = count
@@ -92,6 +94,22 @@ def _given_twice(error: str, text: str, number: int) -> str:
             given = {each: at for each, at in given.items() if not _is_within(each, header[2])}
             table = f"the {what} of line {count}"
     return ""
+
+
+def _other_brackets(header: re.Match[str], lines: list[str], begins: list[int]) -> str:
+    """Say that the table of a header is given once as [name] and once as [[name]]; "" if it is not."""
+    at: dict[str, int] = {}
+    for count in begins:
+        other = _HEADER.match(lines[count - 1])
+        if other and other[2] == header[2]:
+            at.setdefault(other[1], count)
+    if len(at) < 2:
+        return ""
+    name = header[2]
+    return (
+        f"line {at['[']} has [{name}] and line {at['[[']} [[{name}]]. Write [[{name}]], with two brackets, wherever "
+        "there may be several such tables"
+    )
 
 
 def _repeated(what: str, table: str, number: int, first: int | None) -> str:

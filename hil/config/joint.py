@@ -40,6 +40,13 @@ class JointConfig(Table):
             raise ValueError(f"{name!a}: {bad[0]!a} is not a printable character")
         return name
 
+    @field_validator("turns", mode="before")
+    @classmethod
+    def _no_truth_value(cls, turns: object) -> object:
+        if any(isinstance(turn, bool) for turn in (turns if isinstance(turns, list) else [turns])):
+            raise ValueError("it must be 1, or -1 where the servo turns the other way")
+        return turns
+
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         low, high = self.position_limit

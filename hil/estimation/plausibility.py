@@ -11,6 +11,7 @@ from hil.plan.chain_model import torque_constant_stds
 
 DEVIATIONS = 4.0  # standard errors
 LENGTH_TOLERANCE = 0.05  # relative; link lengths are measured with a ruler
+_UPRIGHT = 0.5  # sine of a link's angle above the horizontal
 FLAT = 0.02  # of the largest commanded torque, below which gravity counts as absent
 
 
@@ -60,11 +61,18 @@ def _weight(config: Config, estimate: Estimate, largest_torque: float) -> list[s
                 said.append(
                     f"arm.gravity = 0, but gravity_{joint} is {value:.3g} +- {std:.1g} N m: the arm is not horizontal."
                 )
-        elif sure and value < 0.0:
+        elif sure and value < 0.0 and not _hangs_upwards(config, joint - 1):
             said.append(
-                f"gravity_{joint} is {value:.3g} N m, negative: zero_ticks is half a turn off, or direction is wrong."
+                f"gravity_{joint} is {value:.3g} N m, negative: zero_ticks is half a turn off, direction is wrong, or "
+                "a counterweight outweighs the link."
             )
     return said
+
+
+def _hangs_upwards(config: Config, joint: int) -> bool:
+    """Whether a link that rests as described, without being held, must have its centre of mass behind its joint."""
+    angle = float(np.sum(config.arm.rest_pose[: joint + 1]))
+    return config.stabiliser is None and np.sin(angle) > _UPRIGHT
 
 
 def conflicts_of(config: Config, estimate: Estimate) -> tuple[Conflict, ...]:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.errors import RecordingCutShort
 from hil.estimation.chain_estimate import estimate_chain_run
+from hil.estimation.drive.currents import current_disturbances
+from hil.estimation.drive.supply import supply_notes, supply_sag
 from hil.estimation.model_from_config import lever_of, voltage_driven, wanted_model
 from hil.estimation.physical import physical_of
 from hil.estimation.pilot_limit import torque_limit
@@ -21,7 +23,6 @@ from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.slips.position_jumps import jump_disturbances
 from hil.estimation.slips.rest_shift import rest_shift_warnings
-from hil.estimation.supply import supply_notes, supply_sag
 from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate
@@ -95,7 +96,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
         left_out,
         drift,
         torque,
-        jumps,
+        (*jumps, *current_disturbances(config, samples)),
         wrong,
         notes,
         tried_all=choice is not None,

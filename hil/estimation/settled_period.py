@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.errors import RecordingCutShort
+from hil.estimation.drive.supply import supply_sag, torque_factor
 from hil.estimation.lateness import acting_torque, lateness, velocity_of
-from hil.estimation.supply import supply_sag, torque_factor
 from hil.estimator.data.periodicity import settling_difference
 from hil.estimator.data.repeated_noise import coloured_noise, repeated_noise
 from hil.estimator.data.settled_period import SettledPeriod

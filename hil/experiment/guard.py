@@ -289,16 +289,17 @@ class Guard:
                 self._stop(
                     index,
                     Cause.OUT_OF_VOLTAGE,
-                    f"{said}: at that speed its supply cannot drive more current against the back-EMF. Lower "
-                    f"velocity_limit to {slower}, or raise the supply voltage.{self._lower_torque}",
+                    f"{said}: at that speed its supply cannot drive more current against the back-EMF, or its current "
+                    f"sensor is wrong. Lower velocity_limit to {slower}, or raise the supply voltage; if it stops at "
+                    f"lower speeds too, suspect the sensor.{self._lower_torque}",
                 )
             # Published figures are too uncertain to rule the supply out: the arm is braked all the same.
             self._stop(
                 index,
                 Cause.GOALS_CHANGED,
                 f"{said}: by the published figures {self._supply[index]:.1f} V would drive it at that speed. Its goals "
-                "are changed on the way or by another program, or its supply sags: check these. If neither is so, its "
-                f"motor is weaker than published: lower velocity_limit to {slower}.",
+                "are changed on the way or by another program, its supply sags, or its current sensor is wrong: check "
+                f"these. If none is so, its motor is weaker than published: lower velocity_limit to {slower}.",
             )
         seconds = self._joints[index]["found"]
         self._stop(

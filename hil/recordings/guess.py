@@ -10,7 +10,9 @@ from hil.errors import CsvError
 from hil.recordings.table import Table
 from hil.recordings.units import UNITS, split_head, unit_of
 
-_TIME = re.compile(r"(time|t|timestamp|stamp|time_?stamp|seconds|secs|elapsed|clock)(_?s|_?sec|_?ms|_?us|_?ns)?", re.I)
+_TIME = re.compile(
+    r"(time|t|date_?time|timestamp|stamp|time_?stamp|seconds|secs|elapsed|clock)(_?s|_?sec|_?ms|_?us|_?ns)?", re.I
+)
 _KINDS = {
     "position": re.compile(r"(?<![a-z])(q|pos|position|angle|theta|phi|state)(?![a-z])", re.I),
     "torque": re.compile(r"(?<![a-z])(tau|torque|effort|trq)(?![a-z])", re.I),
@@ -34,6 +36,7 @@ _NOT_POSITION = re.compile(
 )
 _LENGTHS = ("mm", "cm", "m", "in", "inch")
 _EXAMPLE = 5  # columns of a recording of two joints
+_EXAMPLE_OF_ONE = 3
 _SUPPLY = re.compile(r"(?<![a-z])(supply|battery|bus|input)(?![a-z])", re.I)
 
 
@@ -67,7 +70,7 @@ def said(columns: Columns, table: Table) -> str:
     driven = _described(drive, getattr(columns, drive), columns, table)
     used = {table.find(name)[0] for name in (columns.time, *(columns.position or []), *getattr(columns, drive)) if name}
     unused = [name for name in table.columns if name not in used]
-    left_out = f" Not used: {', '.join(unused)}." if unused else ""
+    left_out = f" Not used: {', '.join(name or 'a column without a name' for name in unused)}." if unused else ""
     return f"{table.source}: columns read: time: {time}; position: {position}; {drive}: {driven}.{left_out}"
 
 
@@ -153,6 +156,9 @@ def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
         example = (
             f"[columns]\ntime = {shown[0]}\nposition = [{shown[1]}, {shown[2]}]\ntorque = [{shown[3]}, {shown[4]}]"
         )
+    elif len(names) >= _EXAMPLE_OF_ONE:
+        shown = [json.dumps(split_head(name)[0], ensure_ascii=False) for name in names[:_EXAMPLE_OF_ONE]]
+        example = f"[columns]\ntime = {shown[0]}\nposition = [{shown[1]}]\ntorque = [{shown[2]}]"
     return CsvError(
         f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Specify them in --config ARM.toml "
         '(in Python: config="ARM.toml"), '

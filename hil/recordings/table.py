@@ -43,7 +43,8 @@ class Table:
         bad = np.nonzero(np.isinf(values))[0]
         if bad.size:
             raise CsvError(
-                f"{self.source}, {self.row_word} {bad[0] + self.first_row}: column {full!r} is not a number."
+                f"{self.source}, {self.row_word} {bad[0] + self.first_row}: column {full!r} is not a number. "
+                "Dates and times are read in the form 2026-03-01T12:00:00.008 (ISO 8601)."
             )
         return full, values, self.units.get(full) or split_head(full)[1]
 

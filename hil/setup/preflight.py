@@ -20,6 +20,7 @@ from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode
 from hil.errors import ConfigError
 from hil.plan.chain_plan import check_rest_pose
+from hil.plan.find_torque import how_to_find_torque
 from hil.plan.stabiliser import too_slow
 from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.setup.bus_rate import check_rate, goals_taken
@@ -83,13 +84,16 @@ def check_arm(config: Config) -> Iterator[Finding]:
 
 
 def _torque_of_pilot(config: Config) -> Iterator[Finding]:
-    """Report a torque that the pilot ignores."""
+    """Report a torque that the pilot ignores, and one that is missing without a pilot."""
     if config.experiment.pilot and config.experiment.peak_torque is not None:
         fix = (
             "`hil identify` ignores peak_torque: the pilot finds the torque, up to current_limit or voltage_limit. "
             "Remove peak_torque; or set pilot = false to use it."
         )
         yield Finding(Level.WARNING, "experiment", "torque", "pilot = true takes precedence over peak_torque", fix)
+    if not config.experiment.pilot and config.experiment.peak_torque is None:
+        fix = f"{how_to_find_torque(config)} Or let hil find it: pilot = true."
+        yield Finding(Level.STOP, "experiment", "torque", "experiment.peak_torque is missing", fix)
 
 
 def _described(config: Config) -> Iterator[Finding]:

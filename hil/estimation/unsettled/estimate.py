@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from hil.config.chain import only_planar
 from hil.config.experiment import ModelConfig
 from hil.errors import ConfigError
+from hil.estimation.drive.currents import current_warnings
 from hil.estimation.model_from_config import wanted_model
 from hil.estimation.plausibility import torque_scale_std
 from hil.estimation.result_checks import describe_segment_choice, describe_verdict
-from hil.estimation.settled_warnings import clipping_warnings
 from hil.estimation.unsettled.plausibility import implausible, undetermined
 from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.idim import fit_inverse_dynamics
@@ -78,7 +78,7 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
     given = Given(torque_scale_std(config), zeros=True)
     zeros, gravity = config.model.zeros, config.arm.gravity
     result = estimate_any([recording], config.model, 1.0, zeros, facts.config, gravity, given=given).result
-    result = replace(result, warnings=(*result.warnings, *clipping_warnings(config, samples)))
+    result = replace(result, warnings=(*result.warnings, *current_warnings(config, samples)))
     run.write_result(result)
     return result
 

@@ -50,6 +50,8 @@ def test_every_ready_file_is_right(path: Path) -> None:
         ("id = 2", "id = 300", r"joints\[2\]\.id = 300: must be at most 252"),
         ("id = 2", "id = 2.5", r"joints\[2\]\.id = 2\.5: must be a whole number"),
         ("direction = 1 ", "direction = 2 ", r"joints\[1\]\.direction = 2: must be one of -1 or 1"),
+        ("direction = 1 ", "direction = true ", r"joints\[1\]\.direction = true: it must be 1, or -1"),
+        ("seed = 1\n", "seed = 99999999999999999999999\n", r"experiment\.seed = 9+: must be at most"),
         ("[-4.2, 1.06]", "[1.06, -4.2]", r"the first value must be the smaller one"),
         ("[-4.2, 1.06]", "[-4.2]", r"joints\[1\]\.position_limit = \[-4\.2\]: needs at least 2 entries"),
         ("[-4.2, 1.06]", "[-1.2, 1.06]", r"arm\.rest_pose: -1\.5708 rad for joint 'shoulder' is outside"),

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hil.config.schema import load_config
-from hil.estimation.settled_warnings import clipping_warnings
+from hil.estimation.drive.currents import current_disturbances, current_warnings
+from hil.runs.recording import Phase
 from tests.support.paths import CONFIGS
 
 
@@ -13,21 +14,42 @@ def recording(rate: float, share: float, limit: float = np.inf) -> np.ndarray:
     time = np.arange(0.0, 4.0, 1.0 / rate)
     goal = 0.5 * np.sin(2 * np.pi * 0.5 * time) + 0.3 * np.sin(2 * np.pi * 5.0 * time)
     current = share * np.concatenate(([0.0], goal[:-1])).clip(-limit, limit)
-    samples = np.zeros(time.size, dtype=[("goal_current", float, (2,)), ("current", float, (2,))])
+    samples = np.zeros(time.size, dtype=[("goal_current", float, (2,)), ("current", float, (2,)), ("phase", int)])
     samples["goal_current"], samples["current"] = goal[:, None], current[:, None]
+    samples["phase"] = Phase.PERIODIC
     return samples
 
 
 @pytest.mark.parametrize("rate", [100.0, 200.0, 400.0])
 def test_a_current_read_one_sample_later_is_not_clipped(rate: float) -> None:
     config = load_config(CONFIGS / "fake_two_link.toml")
-    assert clipping_warnings(config, recording(rate, 1.0)) == []
-    assert clipping_warnings(config, recording(rate, 0.9)) == []
+    assert current_warnings(config, recording(rate, 1.0)) == []
+    assert current_warnings(config, recording(rate, 0.9)) == []
 
 
-@pytest.mark.parametrize("samples", [recording(100.0, 0.7), recording(400.0, 1.0, limit=0.45)])
+@pytest.mark.parametrize("samples", [recording(400.0, 1.0, limit=0.2), recording(400.0, 1.0, limit=0.45)])
 def test_a_clipped_current_is_named_for_each_joint(samples: np.ndarray) -> None:
     config = load_config(CONFIGS / "fake_two_link.toml")
-    said = clipping_warnings(config, samples)
+    said = current_warnings(config, samples)
     assert [each.split()[0] for each in said] == ["shoulder", "elbow"]
-    assert all("received less than" in each for each in said)
+    assert all(
+        "received less than" in each and "limit or, at speed, the supply voltage clips it" in each for each in said
+    )
+    assert current_disturbances(config, samples) == ()
+
+
+def overwritten(every: int) -> np.ndarray:
+    """Every `every`-th current is that of a foreign goal."""
+    samples = recording(200.0, 1.0)
+    samples["current"][::every] = -0.4
+    return samples
+
+
+@pytest.mark.parametrize("samples", [recording(100.0, 0.7), recording(400.0, 0.6), overwritten(6), overwritten(9)])
+def test_a_current_that_is_another_one_is_not_said_to_be_clipped(samples: np.ndarray) -> None:
+    config = load_config(CONFIGS / "fake_two_link.toml")
+    said = current_warnings(config, samples)
+    assert len(said) == 2
+    assert all("by another program, or its current sensor" in each and "supply" not in each for each in said)
+    (verdict,) = current_disturbances(config, samples)
+    assert verdict.startswith("The current of shoulder and elbow was not the commanded one")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hil.config.schema import Config, load_config
+from hil.estimation.drive.supply import supply_notes, supply_sag, torque_factor
 from hil.estimation.settled_estimate import estimate_run
-from hil.estimation.supply import supply_notes, supply_sag, torque_factor
 from hil.experiment.run import run_experiment
 from hil.runs.recording import sample_type
 from hil.runs.run_folder import RunFolder

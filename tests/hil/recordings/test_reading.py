@@ -140,7 +140,8 @@ def test_rows_that_can_be_put_right_are_and_it_is_said(
     [
         (lambda rows: rows[::-1], "time goes back"),
         (lambda rows: [row.replace(row.split(",")[0], row.split(",")[0][:3], 1) for row in rows], "too coarse"),
-        (lambda rows: ["x" + row for row in rows], "column 'time' is not a number"),
+        (lambda rows: ["x" + row for row in rows], "column 'time' is not a number.*ISO 8601"),
+        (lambda rows: [*rows[:9], *(f"{t},{float(q) + 6.28},{r}" for t, q, r in _parts(rows[9:]))], "unwrap the angle"),
         (lambda rows: [*rows[:9], "1,2,3", *rows[9:]], "line 11: 3 fields for 5 columns"),
         (lambda rows: [], "is empty"),
     ],
@@ -338,3 +339,27 @@ def test_a_speed_beyond_any_servo_is_refused_and_rotation_is_not() -> None:
             continue
         with pytest.raises(CsvError, match="more than 5 times that of any servo"):
             read(Path("a.csv"))
+
+
+def test_a_column_named_datetime_is_the_time_and_one_without_a_name_is_named() -> None:
+    Path("a.csv").write_text(
+        "datetime,q1,tau1,\n"
+        + "".join(
+            f"2026-03-01T00:00:{time:09.6f},{angle:.6f},{torque:.6f},0\n"
+            for time, angle, torque in zip(TIME, ANGLES[0], TORQUES[0], strict=True)
+        ),
+        encoding="utf-8",
+    )
+    (note, *_) = read(Path("a.csv")).notes
+    assert "time: datetime" in note and "Not used: a column without a name." in note
+
+
+def test_the_example_of_a_file_of_one_joint_has_its_own_names() -> None:
+    Path("a.csv").write_text("t,q1,cmd\n0,0,0\n1,1,1\n", encoding="utf-8")
+    with pytest.raises(CsvError, match=r'time = "t"\nposition = \["q1"\]\ntorque = \["cmd"\]'):
+        read(Path("a.csv"))
+
+
+def _parts(rows: list[str]) -> list[list[str]]:
+    """Time, first angle and the rest of each row."""
+    return [row.split(",", 2) for row in rows]

@@ -1,0 +1,129 @@
+"""Currents that differ from the commanded ones: clipped, or not those of this program's goals.
+
+A clipped current is smaller than a large goal, follows a small one, and never opposes it. Any other deviation has
+another cause: goals were changed on the way or by another program, or the reported current is wrong. The torque that
+drove the arm is then not the one that the estimate is based on.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config
+from hil.drivers.servo_model import Mode
+from hil.runs.recording import Phase
+
+Array = NDArray[np.float64]
+
+LARGE = 0.5
+"""Goals relative to the largest above which they are large; smaller ones say little about clipping."""
+
+SHORT = 0.85
+"""Ratio of measured to commanded current below which the current was clipped."""
+
+OFTEN = 0.05
+"""Fraction of the samples with large goals that is reported."""
+
+_RECENT = 4
+"""Number of latest goals, any of which a lagging current may still follow."""
+
+_BEYOND, _BEYOND_OFTEN = 0.25, 0.02
+"""Deviation from all recent goals and from 0, relative to the largest goal, and the fraction of samples reported."""
+
+_SMALL, _LEAST = 0.5, 0.1
+"""Range of goals relative to the largest current that was carried, in which nothing clips."""
+
+
+def current_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
+    """Warn about joints whose current was not the commanded one."""
+    lower = "current_limit" if config.experiment.pilot else "peak_torque"
+    return [
+        said
+        for name, goal, measured in _currents(config, samples)
+        if (said := _other(name, goal, measured) or _clipped(name, goal, measured, lower))
+    ]
+
+
+def current_disturbances(config: Config, samples: NDArray[np.void]) -> tuple[str, ...]:
+    """A sentence for the verdict if a current was neither the commanded one nor merely clipped."""
+    played = samples[samples["phase"] == Phase.PERIODIC]
+    names = [name for name, goal, measured in _currents(config, played) if _other(name, goal, measured)]
+    if not names:
+        return ()
+    return (
+        f"The current of {' and '.join(names)} was not the commanded one (see the warning), so the values, above all "
+        "offsets and friction, may be off by more than their standard errors.",
+    )
+
+
+def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Array, Array]]:
+    """Name, goals and currents of each joint that is driven by current and measures its motor's."""
+    return [
+        (joint.name, samples["goal_current"][:, index], samples["current"][:, index])
+        for index, joint in enumerate(config.joints)
+        if joint.drive_mode is Mode.CURRENT and not joint.joint.servo.senses_supply
+    ]
+
+
+def _other(name: str, goal: Array, measured: Array) -> str:
+    """Say that the current was another one than commanded; "" if it was not, or only clipped."""
+    if len(goal) < _RECENT or not goal.any():
+        return ""
+    recent = np.lib.stride_tricks.sliding_window_view(goal, _RECENT)
+    low, high = np.minimum(recent.min(axis=1), 0.0), np.maximum(recent.max(axis=1), 0.0)
+    late = measured[_RECENT - 1 :]
+    away = np.maximum(low - late, late - high)
+    beyond = float(np.mean(away > _BEYOND * np.abs(goal).max()))
+    why = (
+        "goals were changed on the way or by another program, or its current sensor is wrong. Make sure that nothing "
+        "else commands the servos, and record again."
+    )
+    if beyond > _BEYOND_OFTEN:
+        return (
+            f"{name} carried another current than commanded in {100 * beyond:.0f} % of the samples, of the other sign "
+            f"or larger: {why}"
+        )
+    part = _short_part(goal, measured)
+    if part > OFTEN and _follows_small_goals(goal, measured) < SHORT:
+        return (
+            f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
+            f"high-torque samples, and as little at low torque, where nothing clips it: {why}"
+        )
+    return ""
+
+
+def _clipped(name: str, goal: Array, measured: Array, lower: str) -> str:
+    """Describe a motor that receives less current than commanded, from a sagging supply or its own current limit."""
+    part = _short_part(goal, measured)
+    if part <= OFTEN:
+        return ""
+    return (
+        f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
+        "high-torque samples: the servo's own current limit or, at speed, the supply voltage clips it, if the reading "
+        f"is right; lower {lower} or raise the supply voltage."
+    )
+
+
+def _least(goal: Array) -> Array:
+    """The smaller of two successive goals, which the motor has had time to follow; 0 if their signs differ.
+
+    A sample's current is the response to the goal of the sample before it, and a lagging current loop is not clipping.
+    """
+    return np.asarray(np.minimum(np.abs(goal[1:]), np.abs(goal[:-1])) * (goal[1:] * goal[:-1] > 0.0))
+
+
+def _short_part(goal: Array, measured: Array) -> float:
+    """Fraction of the samples with large goals whose current is too small."""
+    least = _least(goal)
+    large = (least > LARGE * np.abs(goal).max()) & np.isfinite(measured[1:])
+    return float(np.mean(np.abs(measured[1:][large]) < SHORT * least[large])) if large.any() else 0.0
+
+
+def _follows_small_goals(goal: Array, measured: Array) -> float:
+    """Ratio of the measured to the commanded current while the goal is far below what the motor has carried."""
+    least = _least(goal)
+    most = np.nanquantile(np.abs(measured), 0.99)
+    small = (least > _LEAST * most) & (least < _SMALL * most) & np.isfinite(measured[1:])
+    if not small.any():
+        return 1.0
+    along = measured[1:][small] * np.sign(goal[1:][small])
+    return float(np.sum(along * least[small]) / np.sum(least[small] ** 2))
