@@ -178,6 +178,14 @@ def test_a_limit_that_cannot_overcome_friction_is_doubted(tmp_path: Path) -> Non
     assert changed and "current_limit of joint 'joint1' = 0.001 A" in doubt and "it probably would not move" in doubt
 
 
+@pytest.mark.parametrize(("turns", "doubted"), [(1, True), ([1, 1], True), ([1, -1], False)])
+def test_two_servos_that_turn_the_same_way_are_doubted(tmp_path: Path, turns: object, doubted: bool) -> None:
+    config = configured(tmp_path, TEXT)
+    second = config.joints[1].model_copy(update={"servos": [12, 22], "turns": turns})
+    found = list(doubts(config.model_copy(update={"joints": [config.joints[0], second, *config.joints[2:]]})))
+    assert any("they work against each other. Only motion shows it" in each for each in found) is doubted
+
+
 def one_joint(folder: Path, collision: str):  # type: ignore[no-untyped-def]
     path = folder / "arm.urdf"
     path.write_text(
