@@ -4,7 +4,8 @@ An identification cannot detect wrong IDs, directions, zeros and axes: a chain's
 geometry, they become wrong. A person notices at once.
 """
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,9 +54,22 @@ class Moved:
 
 
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
-    """The pose at these angles [rad]."""
+    """The pose at these angles [rad].
+
+    Whole turns, which a servo does not count while it is off, are taken off where a joint's position limits tell them.
+    """
+    limits = [joint.position_limit for joint in config.joints]
+    angles = tuple(_within_turns(*each) for each in zip(angles, limits, strict=True))
     x, y, z = end_point(described_arm(config), np.array(angles)).tolist()
     return Pose(angles, (x, y, z))
+
+
+def _within_turns(angle: float, limits: Sequence[float]) -> float:
+    """`angle` if it is within the limits, otherwise the angle a whole number of turns away nearest to their middle."""
+    low, high = limits
+    if low <= angle <= high:
+        return angle
+    return angle - math.tau * round((angle - 0.5 * (low + high)) / math.tau)
 
 
 def guided(

@@ -11,7 +11,7 @@ from hil.cli.app import app
 from hil.config.chain import base_up, described_arm
 from hil.config.schema import load_config
 from hil.description.motion import _towards, end_point, moves
-from hil.setup.by_hand import MOVED, Moved, guided, judge
+from hil.setup.by_hand import MOVED, Moved, guided, judge, pose_of
 from tests.support.paths import CONFIGS
 
 ARM = load_config(CONFIGS / "fake_viperx_300.toml")
@@ -129,6 +129,12 @@ def test_the_pose_of_the_fake_arm_is_its_rest_pose() -> None:
     np.testing.assert_allclose(list(angles.values()), ARM.arm.rest_pose, atol=0.02)
     table = CliRunner().invoke(app, ["pose", str(ARM.path)], env={"COLUMNS": "200"})
     assert "moves the end" in table.output
+
+
+def test_whole_turns_are_taken_off() -> None:
+    rest = np.array(ARM.arm.rest_pose)
+    turned = rest + 2 * np.pi * np.array([0, -2, 1, 0, 2, -1])
+    np.testing.assert_allclose(pose_of(ARM, tuple(turned)).angles, rest, atol=1e-9)
 
 
 def test_an_arm_without_description_has_none_to_compare() -> None:
