@@ -26,6 +26,7 @@ POSITION_RESERVE = 0.08
 DEFAULT_BAND = (0.1, 1.5)
 """Default band of a spatial arm's pilot [Hz]."""
 
+_MOST_TURNED_RAD = 4.5 * math.pi
 _SAME_GRAVITY = 0.1  # m/s^2
 _HARMONICS = 2  # of a path, at least
 _PLANAR = 2
@@ -60,6 +61,10 @@ def doubted_limits(config: "Config") -> Iterator[str]:
         if lower >= upper:
             wrong = ": they are equal" if lower == upper else ", the lower one first: they are the wrong way round"
             yield f"{where}{wrong}. They are ignored; correct them."
+            continue
+        if max(-lower, upper) > _MOST_TURNED_RAD:
+            in_rad = f"[{math.radians(lower):.3g}, {math.radians(upper):.3g}]"
+            yield f"{where}: are these degrees? They must be in radians, then {in_rad}."
             continue
         low, high = joint.position_limit
         free = POSITION_RESERVE * (high - low)

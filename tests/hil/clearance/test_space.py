@@ -158,6 +158,8 @@ LIMITS = '<limit lower="-0.94" upper="1.38"'
         ((LIMITS, '<limit lower="0.5" upper="0.5"'), "they are equal"),
         ((LIMITS, '<limit lower="-0.94" upper="0.9"'), "but position_limit lets it move from"),
         (('iyy="', 'iyy="9'), "no mass distribution can have this inertia"),
+        ((LIMITS, '<limit lower="-80" upper="80"'), "are these degrees? They must be in radians, then [-1.4, 1.4]"),
+        (("<inertia ", "<no_inertia "), "it has a mass but no <inertia>"),
         (("<box size=", "<mesh filename="), "replaced by a capsule"),
         (("", ""), ""),
     ],
@@ -170,6 +172,15 @@ def test_doubts_about_a_description(tmp_path: Path, edit: tuple[str, str], said:
     path.write_text(text.replace(*edit), encoding="utf-8")
     found = list(doubts(load_config(config.path)))
     assert any(said in doubt for doubt in found) if said else not found
+
+
+def test_a_mesh_in_millimetres_is_named(tmp_path: Path) -> None:
+    corners = "".join(f"v {x} {y} {z}\n" for x in (0, 160) for y in (0, 40) for z in (0, 40))
+    (tmp_path / "part.obj").write_text(corners, encoding="utf-8")
+    shape = '<collision><geometry><mesh filename="part.obj"{}/></geometry></collision>'
+    (doubt,) = shapes_of(one_joint(tmp_path, shape.format(""))).doubts
+    assert 'it is 160 m long: if it is in millimetres, add scale="0.001 0.001 0.001"' in doubt
+    assert not shapes_of(one_joint(tmp_path, shape.format(' scale="0.001 0.001 0.001"'))).doubts
 
 
 def test_a_limit_that_cannot_overcome_friction_is_doubted(tmp_path: Path) -> None:
