@@ -157,7 +157,10 @@ class SafeShares:
                     break
             if not_safe:
                 why = f"{not_safe}. {_remedy(config, foreseen)}"
-            elif not_safe := self._unsafe_stop(config, plan):
+                continue
+            if self.tell is not None:  # stops are simulated next, which takes about as long
+                self.tell(ARMS, ARMS)
+            if not_safe := self._unsafe_stop(config, plan):
                 why = not_safe
             else:
                 return Found(share, plan, foreseen), why, shortage
