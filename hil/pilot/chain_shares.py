@@ -157,10 +157,7 @@ class SafeShares:
                     break
             if not_safe:
                 why = f"{not_safe}. {_remedy(config, foreseen)}"
-                continue
-            if self.tell is not None:  # stops are simulated next, which takes about as long
-                self.tell(ARMS, ARMS)
-            if not_safe := self._unsafe_stop(config, plan):
+            elif not_safe := self._unsafe_stop(config, plan):
                 why = not_safe
             else:
                 return Found(share, plan, foreseen), why, shortage
