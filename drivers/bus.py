@@ -283,6 +283,13 @@ class ServoBus:
             self._measured[place].angle(self._servos[self._drives[place]].read("Present Position")) for place in first
         )
 
+    def read_drives(self, joint: Joint) -> tuple[float, ...]:
+        """Read what each servo of a joint gives as its angle [rad], the first servo's first; see `read_positions`."""
+        return tuple(
+            self._measured[self._drives.index(drive)].angle(self._servos[drive].read("Present Position"))
+            for drive in joint.drives
+        )
+
     def exchange(self, goals: Sequence[float], *, between: bool = False) -> State:
         """Send goals, one per joint [A, or V in PWM mode], and return the arm's state.
 

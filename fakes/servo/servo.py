@@ -138,13 +138,16 @@ class EmulatedServo(Powered):
         """Power up at time `now` [s]; the servo does not respond for `boot_s` [s].
 
         angle: returns the joint's current position [rad]; called later as well.
-        RAM registers take their initial values (or the backup's, depending on Startup Configuration), torque is off,
-        errors are cleared, and the turn count is lost: Present Position starts within one turn (before Homing Offset).
+        RAM registers take their initial values (or the backup's, depending on Startup Configuration; the XL320's Torque
+        Limit takes Max Torque), torque is off, errors are cleared, and the turn count is lost: Present Position starts
+        within one turn (before Homing Offset).
         """
         memory = self.memory
         for register in memory.registers.values():
             if not register.eeprom:
                 memory.store(register, register.initial)
+        if "Torque Limit" in memory.registers:  # XL320
+            memory.set("Torque Limit", memory.get("Max Torque"))
         startup = memory.get("Startup Configuration")
         self._backup.mark(memory)
         if startup & _RESTORE_AT_BOOT:

@@ -3,10 +3,11 @@
 from collections.abc import Iterator
 
 from hil.clearance.space import Space
-from hil.config.chain import described_arm, doubted_inertias, doubted_limits
+from hil.config.chain import described_arm, doubted_gravity, doubted_inertias, doubted_limits
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
 from hil.drivers.servo_prior import servo_prior
+from hil.next_step import command
 
 
 def doubts(config: Config) -> Iterator[str]:
@@ -14,13 +15,40 @@ def doubts(config: Config) -> Iterator[str]:
     for joint in config.joints:
         if said := _weak(joint):
             yield said
+        if said := _same_direction(config, joint):
+            yield said
     if not config.is_chain:
         return
     arm = described_arm(config)
     yield from doubted_inertias(arm)
+    yield from doubted_gravity(config)
     yield from doubted_limits(config)
     for doubt in Space.of(config).shapes.doubts:
         yield f"{arm.path.name}: {doubt}"
+
+
+def _same_direction(config: Config, joint: JointConfig) -> str:
+    """Say that two servos of a joint are described as turning the same way, which is rarely so; "" otherwise."""
+    if len(joint.ids) == 1 or len(set(joint.directions)) > 1:
+        return ""
+    (first, second), sign = joint.ids, joint.direction
+    given = list(joint.directions) if isinstance(joint.turns, list) else sign
+    return (
+        f"direction = {given} means that IDs {first} and {second} of joint {joint.name!r} turn the same way. Servos "
+        f"that face each other turn oppositely: they need direction = [{sign}, {-sign}], or they work against each "
+        f"other. {_how_to_compare(config)}"
+    )
+
+
+def _how_to_compare(config: Config) -> str:
+    """Say how to find out which way the two servos of a joint turn."""
+    if config.arm.urdf is not None:
+        guided = command("pose", config.path, "--guide")
+        return f"Only motion shows it: `{guided}` compares both while you turn the joint by hand."
+    return (
+        "Only motion shows it: turn the joint by hand with torque off and compare both Present Positions in DYNAMIXEL "
+        "Wizard 2.0."
+    )
 
 
 def _weak(joint: JointConfig) -> str:

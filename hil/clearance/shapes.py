@@ -17,7 +17,7 @@ from hil.clearance.mesh import UnreadMesh, mesh_corners
 from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import is_mjcf
 from hil.description.mjcf import Geom, read_geoms
-from hil.description.urdf import parse_urdf, rotation_of
+from hil.description.urdf import MOST_LENGTH, parse_urdf, rotation_of
 
 Array = NDArray[np.float64]
 Placed = tuple[int, Array, Array, ET.Element | None]
@@ -232,6 +232,10 @@ def _of_shape(shape: ET.Element, arm: ArmDescription) -> list[tuple[Array, float
         corners = mesh_corners(shape.get("filename", ""), arm.path)
         corners = corners * np.array(_numbers(shape.get("scale"), 3, 1.0))
         low, high = corners.min(axis=0), corners.max(axis=0)
+        if (size := float((high - low).max())) > MOST_LENGTH:
+            raise UnreadMesh(
+                f'it is {size:.4g} m long: if it is in millimetres, add scale="0.001 0.001 0.001" to its <mesh>'
+            )
         return _of_box(0.5 * (low + high), high - low)
     return None
 

@@ -104,7 +104,7 @@ def pose(
             print_pose(arm, here)
         ask = (lambda text: print(text, file=sys.stderr)) if json_only else print
         found = []
-        for each in guided(arm, bus.read_positions, bus.port.clock, ask) if guide else ():
+        for each in guided(arm, bus.read_positions, bus.port.clock, ask, bus.read_drives) if guide else ():
             found.append(each)
             if not json_only:
                 print_moved(each)

@@ -1,5 +1,6 @@
 """Requirements on the configuration of a spatial arm, and its description read from a URDF."""
 
+import math
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -25,6 +26,8 @@ POSITION_RESERVE = 0.08
 DEFAULT_BAND = (0.1, 1.5)
 """Default band of a spatial arm's pilot [Hz]."""
 
+_MOST_TURNED_RAD = 4.5 * math.pi
+_SAME_GRAVITY = 0.1  # m/s^2
 _HARMONICS = 2  # of a path, at least
 _PLANAR = 2
 _WIDER_RAD = 1e-3
@@ -59,6 +62,10 @@ def doubted_limits(config: "Config") -> Iterator[str]:
             wrong = ": they are equal" if lower == upper else ", the lower one first: they are the wrong way round"
             yield f"{where}{wrong}. They are ignored; correct them."
             continue
+        if max(-lower, upper) > _MOST_TURNED_RAD:
+            in_rad = f"[{math.radians(lower):.3g}, {math.radians(upper):.3g}]"
+            yield f"{where}: are these degrees? They must be in radians, then {in_rad}."
+            continue
         low, high = joint.position_limit
         free = POSITION_RESERVE * (high - low)
         low, high = low + free, high - free
@@ -72,6 +79,28 @@ def doubted_limits(config: "Config") -> Iterator[str]:
                 f"{where}, but {key} lets it move from {low:.3g} to {high:.3g} rad ({shown}): it may run into its "
                 "stops. Narrow the one, or correct the other."
             )
+
+
+def doubted_gravity(config: "Config") -> Iterator[str]:
+    """Yield a sentence if the file has another gravity than the configuration, which alone decides."""
+    arm = described_arm(config)
+    if arm.gravity is None or np.abs(np.subtract(arm.gravity, base_gravity(config))).max() <= _SAME_GRAVITY:
+        return
+    used = [round(each, 4) + 0.0 for each in base_gravity(config).tolist()]
+    yield (
+        f"{arm.path.name}: its gravity is {list(arm.gravity)} m/s^2, which is not used: [arm] base and gravity decide, "
+        f"and give {used} in the frame of the base. {_mounted(np.array(arm.gravity))}"
+    )
+
+
+def _mounted(gravity: NDArray[np.float64]) -> str:
+    """Say which settings give this gravity in the frame of the base (3,) [m/s^2]."""
+    strength = float(np.linalg.norm(gravity))
+    if strength <= _SAME_GRAVITY:
+        return "Correct the file, where the arm is weightless."
+    x, y, z = (-gravity / strength + 0.0).tolist()
+    base = [round(angle, 4) for angle in (math.atan2(y, z), -math.asin(max(-1.0, min(1.0, x))), 0.0)]
+    return f"If the arm is mounted as the file says, set base = {base} and gravity = {strength:.4g} under [arm]."
 
 
 def base_gravity(config: "Config") -> NDArray[np.float64]:

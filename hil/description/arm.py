@@ -102,7 +102,9 @@ class ArmDescription:
     held: tuple[str, ...]
     """Movable joints outside the arm, such as a gripper's, which are assumed to be held at zero."""
     doubts: tuple[str, ...]
-    """Warnings about implausible inertias, one sentence each."""
+    """Warnings about implausible inertias and physics that is not modelled, one sentence each."""
+    gravity: tuple[float, float, float] | None = None
+    """Gravity that the file gives in the base's frame [m/s^2]; None if it gives none or its format's usual one."""
 
     @property
     def parameters(self) -> Array:

@@ -3,7 +3,7 @@ shapes.
 """
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ LOOPS = {0: "connect", 1: "weld"}
 KINDS = {0: "plane", 2: "sphere", 3: "capsule", 5: "cylinder", 6: "box"}
 SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2}
 COUPLED = 2  # an equality of two joints' angles
+USUAL_GRAVITY = (0.0, 0.0, -9.81)
 
 
 def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
@@ -53,7 +54,8 @@ def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
         for each in arm
         if not each.body.is_physical
     )
-    return ArmDescription(path, "world", tuple(arm), tuple(held), doubts)
+    doubts += tuple(tree.not_modelled(names, chosen))
+    return ArmDescription(path, "world", tuple(arm), tuple(held), doubts, tree.gravity)
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,31 @@ class _Tree:
     def hinges(self) -> list[str]:
         """Names of all hinge joints in MuJoCo's order, i.e. from the base outwards."""
         return [str(self.model.joint(j).name) for j in range(self.model.njnt) if self.model.jnt_type[j] == HINGE]
+
+    @property
+    def gravity(self) -> tuple[float, float, float] | None:
+        """Gravity [m/s^2]; None if it is MuJoCo's default."""
+        x, y, z = map(float, self.model.opt.gravity)
+        return None if (x, y, z) == USUAL_GRAVITY else (x, y, z)
+
+    def not_modelled(self, names: list[str], bodies: list[int]) -> Iterator[str]:
+        """Yield one sentence per kind of force in the file that an arm of rigid links and friction does not have."""
+        model = self.model
+        sprung = [name for name in names if np.any(model.jnt_stiffness[model.joint(name).id])]
+        if sprung:
+            yield (
+                f"{_listed('joint', sprung)} a stiffness, but springs are not modelled: the identified parameters "
+                "would absorb the spring's torque. Remove the spring from the arm; if it has none, from the file"
+            )
+        links = [body for body in range(1, model.nbody) if not {*bodies}.isdisjoint(self._way(body))]
+        floating = [self.name(body) for body in links if model.body_gravcomp[body]]
+        if floating:
+            yield (
+                f"{_listed('body', floating)} gravcomp, which is not used: gravity acts on every link of a real arm, "
+                "and the torque that carries it is identified"
+            )
+        if any(np.any(model.tendon_stiffness[each]) for each in range(model.ntendon)):
+            yield "a tendon has a stiffness, but tendons and springs are not modelled: their forces are ignored"
 
     def branch(self, names: list[str]) -> list[int]:
         """The bodies that these joints move. Raises ArmFileError unless they lie on one branch, in this order."""
@@ -244,6 +271,13 @@ class _Tree:
             return None
         low, high = map(float, self.model.jnt_range[joint])
         return low, high
+
+
+def _listed(what: str, names: list[str]) -> str:
+    """The names, with the verb "has" or "have"."""
+    plural = {"joint": "joints", "body": "bodies"}[what]
+    quoted = ", ".join(f'"{name}"' for name in names)
+    return f"{what} {quoted} has" if len(names) == 1 else f"{plural} {quoted} have"
 
 
 def _rotation(quaternion: Array) -> Array:

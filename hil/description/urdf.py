@@ -5,7 +5,7 @@ Format: wiki.ros.org/urdf/XML. Only geometry and inertias are read; meshes are n
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,6 +75,7 @@ def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
         for each in arm
         if not physical[each.link] or not each.body.is_physical
     )
+    doubts += tuple(_without_inertia(root, {link for each in arm for link in (each.link, *each.fixed)}))
     return ArmDescription(path, base, tuple(arm), tuple(held), doubts)
 
 
@@ -111,6 +112,20 @@ def _links(root: ET.Element, path: Path) -> tuple[dict[str, Body], dict[str, boo
     if not bodies:
         raise ArmFileError(f"{path} has no links")
     return bodies, {name: body.mass == 0.0 or body.is_physical for name, body in bodies.items()}
+
+
+def _without_inertia(root: ET.Element, links: Container[str | None]) -> Iterator[str]:
+    """Yield one sentence per moving link that has a mass but no inertia."""
+    for element in root.findall("link"):
+        inertial = element.find("inertial")
+        mass = None if inertial is None else inertial.find("mass")
+        if inertial is None or mass is None or inertial.find("inertia") is not None or element.get("name") not in links:
+            continue
+        if float(mass.get("value", "nan")) > 0.0:
+            yield (
+                f'link "{element.get("name")}": it has a mass but no <inertia>, so it counts as a point '
+                "mass; it is used only as an initial guess"
+            )
 
 
 def _body(element: ET.Element | None, where: str, path: Path) -> Body:
@@ -166,6 +181,8 @@ def _joints(root: ET.Element, bodies: dict[str, Body], path: Path) -> dict[str, 
             if link not in bodies:
                 raise ArmFileError(f"{path}: {where}: its {end} link {link!r} is not in the file")
             ends[end] = str(link)
+        if ends["parent"] == ends["child"]:
+            raise ArmFileError(f'{path}: {where}: link "{ends["child"]}" is both its parent and its child')
         if ends["child"] in moved:
             raise ArmFileError(
                 f'{path}: link "{ends["child"]}" is the child of both "{moved[ends["child"]]}" and "{name}": the links '

@@ -103,6 +103,7 @@ def predict_chain(
         together,
         rest,
         plan.rate,
+        _centre(plan),
     )
     return ChainPrediction(prediction, *worst[1:], rooms, np.median(tracking, axis=0), plan.segments[0].ramp_samples)
 

@@ -45,7 +45,8 @@ class Prediction:
     same as fractions of the distance from rest to the limit. limits: (quantities, joints). settled_after: number of
     periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over time of a
     few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: samples per second
-    [Hz].
+    [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at the farther one of rest
+    and centre.
     """
 
     values: Array
@@ -55,6 +56,7 @@ class Prediction:
     shown: Array
     rest: Array
     rate: float
+    centre: Array | None = None
 
     @property
     def median(self) -> Array:
@@ -94,7 +96,8 @@ class Prediction:
     def origin(self) -> Array:
         """The values from which distances to the limits are measured (quantities, joints)."""
         origin = np.zeros_like(self.limits)
-        origin[0] = origin[1] = self.rest
+        centre = self.rest if self.centre is None else self.centre
+        origin[0], origin[1] = np.maximum(self.rest, centre), np.minimum(self.rest, centre)
         return origin
 
     def _middle(self) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from hil.estimation.result_checks import describe_chain_choice
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.slips.position_jumps import jump_disturbances
-from hil.estimation.truth import back_emf
+from hil.estimation.truth import back_emf, scaled
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import SYSTEMATIC, ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -66,13 +66,14 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     seconds = round(time.perf_counter() - started, 3)
     linear = len(model.linear_names)
+    truth, extra = true_chain_parameters(config, known), _quantities(estimate, linear, len(estimate.names))
     result = SettledResult(
         method="settled period, least squares on Fourier lines, then maximum likelihood of each position by "
         f"one-step-ahead prediction with an observer of {estimate.softness:g} Hz; {model.description}",
         config=facts.config,
         joints=len(config.joints),
         parameters=_quantities(estimate, 0, linear),
-        extra=_quantities(estimate, linear, len(estimate.names)),
+        extra=extra,
         covariance=Covariance(estimate.names, tuple(map(tuple, estimate.covariance.tolist()))),
         fit=SettledFit(
             residual_rms_ticks=tuple(estimate.residual_steps.tolist()),
@@ -100,7 +101,8 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
         timing=RunTiming.of(timing(samples, config.experiment.rate), seconds),
         arm=arm_facts(config),
         chain=_facts(config, estimate, known),
-        truth=true_chain_parameters(config, known),
+        truth=truth,
+        truth_scaled=scaled(truth, config, extra),
     )
     save_periods(run.path, played)
     run.write_result(result)

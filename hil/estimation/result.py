@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from hil.arm_model import JointFacts
 from hil.config.schema import Config
-from hil.estimation.truth import true_parameters
+from hil.estimation.truth import scaled, true_parameters
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.identify import Estimate
 from hil.results.parts import ArmFacts, Covariance, ModelChoice, Quantity, RunTiming, SettledFit, Validation, Verdict
@@ -35,13 +35,14 @@ def make_result(
 ) -> SettledResult:
     """Build the result of one run; `mean_time` is the mean time of the period's samples on the port's clock [s]."""
     base = len(estimate.model.base_names)
+    truth, extra = true_parameters(config, mean_time), _quantities(estimate, base, len(estimate.names))
     return SettledResult(
         method=f"settled period, least squares on Fourier lines, then maximum likelihood; "
         f"{estimate.model.friction} friction, {estimate.model.drive} drive",
         config=shown_path,
         joints=len(config.joints),
         parameters=_quantities(estimate, 0, base),
-        extra=_quantities(estimate, base, len(estimate.names)),
+        extra=extra,
         covariance=Covariance(tuple(estimate.names), tuple(map(tuple, estimate.covariance.tolist()))),
         fit=SettledFit(
             residual_rms_ticks=tuple(estimate.residual_steps.tolist()),
@@ -58,7 +59,8 @@ def make_result(
         model_choice=checks.model_choice,
         timing=timing,
         arm=arm_facts(config),
-        truth=true_parameters(config, mean_time),
+        truth=truth,
+        truth_scaled=scaled(truth, config, extra),
     )
 
 

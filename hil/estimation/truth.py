@@ -5,7 +5,7 @@ constants imply, which need not be those of the fake arm's motors.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from hil.config.schema import Config
@@ -79,11 +79,21 @@ class Truth:
 
 def truth_of(result: Result, config: Config) -> Truth:
     """The truth stored in a result, in the unit of torque that the result has."""
-    ratios = _torque_ratios(config)
-    truth = result.truth or {}
+    return in_file_unit(result.truth or {}, config, result.extra, result.joints)
+
+
+def scaled(truth: Mapping[str, float] | None, config: Config, extra: Mapping[str, Quantity]) -> dict[str, float] | None:
+    """The entry `truth_scaled` of a result: its `truth` in the unit of its parameters, None if that is the same."""
+    found = in_file_unit(truth or {}, config, extra, len(config.joints))
+    return found.values if found.note else None
+
+
+def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str], joints: int) -> Truth:
+    """True values in the unit of torque of a result with parameters of these names."""
+    ratios, has_ratios = _torque_ratios(config), any(kind_of(each) == RATIO for each in names)
     if not truth or all(abs(ratio - 1.0) <= _EQUAL for ratio in ratios):
         return Truth(dict(truth), "")
-    factors = {name: _factor(name, ratios, result.extra, result.joints) for name in truth}
+    factors = {name: _factor(name, ratios, has_ratios, joints) for name in truth}
     values = {name: factor * truth[name] for name, factor in factors.items() if factor is not None}
     named = [
         f"{joint.name} {100 * (1 / ratio - 1):+.2g} %"
@@ -117,11 +127,11 @@ def _torque_ratios(config: Config) -> list[float]:
     return ratios
 
 
-def _factor(name: str, ratios: Sequence[float], extra: Mapping[str, Quantity], joints: int) -> float | None:
+def _factor(name: str, ratios: Sequence[float], has_ratios: bool, joints: int) -> float | None:
     """What the true value is multiplied by; None if the joints that determine it have different ratios."""
     if name in TILT or (kind_of(name) in TERMS and not term_of(name).of_torque):
         return 1.0
-    if any(kind_of(each) == RATIO for each in extra):
+    if has_ratios:
         return ratios[0]
     last = joint_of(name) or joints
     own_row = kind_of(name) in TERMS and (name not in RIGID_BODY.get(joints, ()) or name.startswith("armature"))

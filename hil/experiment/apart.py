@@ -3,13 +3,33 @@
 Two servos on one joint are coupled by their horns. A horn that slips, a loose screw or a broken gear lets one of them
 turn without the other, which the joint's angle, taken from the first servo, does not show. The difference between their
 angles is compared with what it was at the first sample, because horns are mounted at any angle.
+
+If the direction of one of them is wrong, they work against each other and the joint does not turn at all, which looks
+like an obstacle.
 """
 
 from collections.abc import Sequence
 from math import isnan
 
+from hil.drivers.joint import Joint
+
 ALLOWED_RAD = 0.1
 """Tolerance for backlash of two gear trains, encoder nonlinearity, and twist of the joint between its servos."""
+
+
+def opposed(joint: Joint) -> str:
+    """Ask whether a joint's two servos work against each other; "" if it has one servo."""
+    if not joint.seconds:
+        return ""
+    signs = [joint.direction, *(second.direction for second in joint.seconds)]
+    return f"its two servos work against each other: is one entry of direction = {signs} wrong?"
+
+
+def causes_of_standstill(joint: Joint) -> str:
+    """Say why a joint may stand still although it should move."""
+    if asked := opposed(joint):
+        return f"Something blocks it, its encoder is frozen, or {asked}"
+    return "Something blocks it, or its encoder is frozen."
 
 
 class Apart:

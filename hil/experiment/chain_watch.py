@@ -21,6 +21,7 @@ from hil.dry_run.chain_prior import prior_arms
 from hil.errors import Cause, SafetyStop
 from hil.estimator.chain.simulation.motion_observer import ChainObserver
 from hil.estimator.chain.simulation.rollout import ChainArms
+from hil.experiment.apart import causes_of_standstill
 from hil.plan.chain_model import known_chain
 
 Array = NDArray[np.float64]
@@ -59,6 +60,7 @@ class ChainWatch:
         # A light joint's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         self._observer = ChainObserver(arms.base, mean, covariance, largest, interval, _FRICTIONS)
         self._names = [joint.joint.title for joint in config.joints]
+        self._blocked_by = [causes_of_standstill(joint.joint) for joint in config.joints]
         self._rest = np.array(config.arm.rest_pose)
         count = arms.base.count
         gravity = arms.base.regressor(self._rest[:, None], *np.zeros((2, n, 1)))[:, 0] @ mean[:count]
@@ -108,8 +110,8 @@ class ChainWatch:
             recent = [torque[joint] for at, torque in self._commanded if self._seen_at - at <= WINDOW_S]
             said = (
                 f"{name} stands still, with {min(recent):+.3f} to {max(recent):+.3f} N m commanded in the last "
-                f"{WINDOW_S:g} s: any arm consistent with the prior and the data so far would move. Something blocks "
-                "it, or its encoder is frozen."
+                f"{WINDOW_S:g} s: any arm consistent with the prior and the data so far would move. "
+                f"{self._blocked_by[joint]}"
             )
         else:
             said = (

@@ -331,7 +331,8 @@ class Guard:
             index,
             Cause.APART,
             f"has servos that no longer turn together: ID {ids[servo]} has turned {turned:+.3f} rad relative to the "
-            "first one since the start. Its horn slips, a screw is loose, or one of their encoders is wrong.",
+            "first one since the start. Its horn slips, a screw is loose, one of their encoders is wrong, or its "
+            "direction is.",
         )
 
     def _disagree(self, index: int, state: State) -> NoReturn:

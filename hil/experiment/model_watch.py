@@ -23,6 +23,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled, only_version
 from hil.estimator.models.momentum_observer import NAMES, MomentumObserver
 from hil.estimator.models.parameters import CONSTANTS
+from hil.experiment.apart import causes_of_standstill
 
 ARMS = 64
 WIDENED = 1.5
@@ -169,6 +170,7 @@ class ModelWatch:
         is_described = arms is not None or config.arm.link_lengths is not None
         self._observer = MomentumObserver(mean, covariance, largest, interval, _FRICTIONS * is_described)
         self._names = [joint.joint.title for joint in config.joints]
+        self._blocked_by = [causes_of_standstill(joint.joint) for joint in config.joints]
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
         self._shortest = float("inf")
@@ -232,8 +234,7 @@ class ModelWatch:
             low, high = min(recent), max(recent)
             said = (
                 f"{name} stands still, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "
-                "arm consistent with the prior and the data so far would move. Something blocks it, or its encoder is "
-                "frozen."
+                f"arm consistent with the prior and the data so far would move. {self._blocked_by[joint]}"
             )
         else:
             said = (

@@ -26,6 +26,7 @@ from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.estimator.data.periodicity import periods_of_drift
+from hil.experiment.apart import opposed
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
 from hil.experiment.lowering import Lowering, may_lower
@@ -242,9 +243,10 @@ class Stream:
         """Detect a joint held by friction or an obstacle after one period, before more time is wasted."""
         for joint, way in zip(self._bus.joints, moved, strict=True):
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
+                against = f" Or {opposed(joint)}" if joint.seconds else ""
                 raise DidNotMove(
-                    f"{joint.title} moved by {way:.4f} rad in a whole period: it is stuck, or friction holds it. "
-                    "Move it by hand with torque off; if it is free, raise experiment.peak_torque."
+                    f"{joint.title} moved by {way:.4f} rad in a whole period: it is stuck, or friction holds it."
+                    f"{against} Move it by hand with torque off; if it is free, raise experiment.peak_torque."
                 )
 
     def _play_period(self, segment: Segment, period: int) -> None:

@@ -104,6 +104,7 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     ET.SubElement(root, "option", gravity=numbers(*model.base_gravity), timestep="0.001", integrator="implicitfast")
     parent = ET.SubElement(root, "worldbody")
+    _add_geoms(parent, [solid for solid in solids if solid.link == 0])
     for index, (joint, body) in enumerate(zip(found.arm.joints, found.bodies, strict=True)):
         number = index + 1
         place = {"pos": numbers(*joint.translation), "quat": numbers(*_quaternion(joint.rotation))}

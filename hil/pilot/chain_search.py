@@ -5,6 +5,8 @@ steps     larger fractions, safe for the ensemble as updated after each run
 full      the designed path at the largest safe fraction, and a held-out path
 """
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -36,6 +38,30 @@ RAISED = 1.3
 MOST_RAISE = 2.5
 """Largest ratio of a step's share of the amplitude to that of the previous run."""
 
+SILENT_S = 30.0
+"""Longest silence while a safe motion is searched for [s]."""
+
+
+class Said:
+    """Passes messages on, and reports that simulations go on when nothing has been said for a while.
+
+    now: the time [s].
+    """
+
+    def __init__(self, say: Say, now: Callable[[], float] = time.monotonic) -> None:
+        self._say, self._now = say, now
+        self._at = now()
+
+    def say(self, text: str) -> None:
+        """Pass a message on."""
+        self._at = self._now()
+        self._say(text)
+
+    def tell(self, done: int, total: int) -> None:
+        """Report progress after every SILENT_S of silence."""
+        if self._now() - self._at >= SILENT_S:
+            self.say(f"Still looking for a motion safe for all arms: {done} of {total} simulations of this one.")
+
 
 @dataclass(kw_only=True)
 class ChainSearch(SafeShares):
@@ -56,7 +82,8 @@ class ChainSearch(SafeShares):
             f"Designed a path that leaves the worst base parameter {100 * paths.identify.worst:.2g} % of its prior "
             f"standard error (held-out path, with random phases: {100 * paths.held_out.worst:.2g} %)."
         )
-        return cls(config, belief, paths, say, run=run, shown_path=shown_path, watch=watch)
+        said = Said(say)
+        return cls(config, belief, paths, said.say, tell=said.tell, run=run, shown_path=shown_path, watch=watch)
 
     def step(self, name: str, folder: str, shares: tuple[float, ...]) -> Found:
         """Play one step, compare it with the prediction, and update the belief."""

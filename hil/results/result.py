@@ -14,7 +14,8 @@ timing       how well the stream kept its deadlines, and the duration of the est
 arm          facts needed to use the model: gravity, rest pose, and per joint name, servo, mode, limits, torque per
              goal [N m/A, or N m/V in pwm mode]
 chain        only for a spatial arm: its geometry, and the combination that each base parameter stands for
-truth        only on a fake arm: the base parameters it was built with
+truth        only on a fake arm: the base parameters it was built with, in N m of its own motors
+truth_scaled the same in the unit of `parameters`, only if the file's torque constants are not those of the motors
 physical     masses, centres and inertias, if [known] gives any quantity
 stabiliser   its share of the torque, if there was one
 steps        with a pilot: predicted and measured peaks of each step
@@ -57,6 +58,8 @@ class Result:
     """The outcome of an identification. Fields are in the order of result.json.
 
     parameters, extra: by name, in the order of `covariance.names`. truth: by name [SI].
+
+    truth_scaled: `truth` in the unit of torque that the file's torque constants imply; None if that is the same.
     """
 
     schema: int = SCHEMA
@@ -75,6 +78,7 @@ class Result:
     arm: ArmFacts | None = None
     chain: ChainFacts | None = None
     truth: Mapping[str, float] | None = None
+    truth_scaled: Mapping[str, float] | None = None
     physical: Physical | None = None
 
     @property
@@ -96,7 +100,7 @@ class Result:
         return as_text(self._title, self.quantities, self._sentences)
 
     def _repr_html_(self) -> str:
-        return as_html(self._title, self.quantities, self.truth or {}, self._sentences)
+        return as_html(self._title, self.quantities, self.truth_scaled or self.truth or {}, self._sentences)
 
     @property
     def _title(self) -> str:

@@ -4,16 +4,19 @@ An identification cannot detect wrong IDs, directions, zeros and axes: a chain's
 geometry, they become wrong. A person notices at once.
 """
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.chain import base_up, described_arm
+from hil.config.joint import JointConfig
 from hil.config.schema import Config
 from hil.description.motion import end_point, moves
 from hil.drivers.clock import Clock
+from hil.drivers.joint import Joint
 
 MOVED = 0.15  # rad: a joint that has been moved by hand
 STILL = 0.02  # rad in STILL_S: a joint that is held still
@@ -23,6 +26,7 @@ PATIENCE_S = 60.0
 SEVERAL = 0.4  # of the largest motion: what another joint may move along with it
 Array = NDArray[np.float64]
 Read = Callable[[], tuple[float, ...]]
+ReadDrives = Callable[[Joint], tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -50,24 +54,45 @@ class Moved:
 
 
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
-    """The pose at these angles [rad]."""
+    """The pose at these angles [rad].
+
+    Whole turns, which a servo does not count while it is off, are taken off where a joint's position limits tell them.
+    """
+    limits = [joint.position_limit for joint in config.joints]
+    angles = tuple(_within_turns(*each) for each in zip(angles, limits, strict=True))
     x, y, z = end_point(described_arm(config), np.array(angles)).tolist()
     return Pose(angles, (x, y, z))
 
 
-def guided(config: Config, read: Read, clock: Clock, ask: Callable[[str], None]) -> Iterator[Moved]:
-    """Ask for each joint in turn to be moved in its positive direction, and compare."""
+def _within_turns(angle: float, limits: Sequence[float]) -> float:
+    """`angle` if it is within the limits, otherwise the angle a whole number of turns away nearest to their middle."""
+    low, high = limits
+    if low <= angle <= high:
+        return angle
+    return angle - math.tau * round((angle - 0.5 * (low + high)) / math.tau)
+
+
+def guided(
+    config: Config, read: Read, clock: Clock, ask: Callable[[str], None], read_drives: ReadDrives
+) -> Iterator[Moved]:
+    """Ask for each joint in turn to be moved in its positive direction, and compare.
+
+    read: angles of all joints [rad]. read_drives: angles of a joint according to each of its servos [rad].
+    """
     arm, up = described_arm(config), base_up(config)
     for index, joint in enumerate(config.joints):
-        before = np.array(read())
+        before, drives = np.array(read()), np.array(read_drives(joint.joint))
         asked = f"Move {joint.name!r} by hand by about 0.3 rad in the direction that {moves(arm, before, index, up)}."
         ask(asked)
         change = _awaited(read, clock, before)
-        yield judge(config, index, asked, change)
+        yield judge(config, index, asked, change, np.array(read_drives(joint.joint)) - drives)
 
 
-def judge(config: Config, asked_for: int, asked: str, change: Array) -> Moved:
-    """Compare a motion `change` (joints,) [rad] with the one that was asked for."""
+def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Array) -> Moved:
+    """Compare a motion `change` (joints,) [rad] with the one that was asked for.
+
+    drives: motion of that joint according to each of its servos [rad], the first servo's first.
+    """
     joint = config.joints[asked_for]
     most = int(np.argmax(np.abs(change)))
     angles = tuple(change.tolist())
@@ -84,10 +109,12 @@ def judge(config: Config, asked_for: int, asked: str, change: Array) -> Moved:
             "their names, in [[joints]]"
         )
         return Moved(joint.name, asked, angles, False, found)
+    if unlike := _unlike(joint, drives):
+        return Moved(joint.name, asked, angles, False, unlike)
     if change[most] < 0.0:
         found = (
             f"{joint.name!r} moved by {change[most]:+.2f} rad, so its angle increases in the opposite direction to the "
-            f"description's: set direction = {-joint.direction} and determine zero_ticks again, or correct the axis"
+            f"description's: set direction = {_reversed(joint)} and determine zero_ticks again, or correct the axis"
         )
         return Moved(joint.name, asked, angles, False, found)
     along = [
@@ -96,7 +123,29 @@ def judge(config: Config, asked_for: int, asked: str, change: Array) -> Moved:
         if number != most and abs(change[number]) > SEVERAL * abs(change[most])
     ]
     found = f"{joint.name!r} moved by {change[most]:+.2f} rad, as described"
+    found += ", and so did its second servo" if len(joint.ids) > 1 else ""
     return Moved(joint.name, asked, angles, True, found + (f"; {', '.join(along)} moved with it" if along else ""))
+
+
+def _reversed(joint: JointConfig) -> list[int] | int:
+    """The entry `direction` with every sign reversed."""
+    reverse = [-sign for sign in joint.directions]
+    return reverse if len(reverse) > 1 else reverse[0]
+
+
+def _unlike(joint: JointConfig, drives: Array) -> str:
+    """Say that a joint's two servos do not turn as their directions describe; "" if they do."""
+    if len(joint.ids) == 1 or abs(drives[1] - drives[0]) <= SEVERAL * abs(drives[0]):
+        return ""
+    first, second = joint.ids
+    measured = f"its servos disagree: ID {first} turned by {drives[0]:+.2f} rad, ID {second} by {drives[1]:+.2f} rad"
+    if abs(drives[1] + drives[0]) > SEVERAL * abs(drives[0]):
+        return f"{joint.name!r}: {measured}. Is ID {second} on this joint, and is its horn tight?"
+    right = [int(np.sign(turned)) * sign for turned, sign in zip(drives, joint.directions, strict=True)]
+    return (
+        f"{joint.name!r}: {measured}, so under torque they work against each other: set direction = {right}"
+        f"{' and determine zero_ticks again' if right[0] != joint.direction else ''}"
+    )
 
 
 def _awaited(read: Read, clock: Clock, before: Array) -> Array:

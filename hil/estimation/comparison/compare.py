@@ -8,7 +8,7 @@ import numpy as np
 
 from hil.config.schema import Config
 from hil.errors import ConfigError
-from hil.estimation.comparison.chain_compare import compare_chain, worst_chain_error
+from hil.estimation.comparison.chain_compare import compare_chain, truth_for, worst_chain_error
 from hil.estimation.model_from_config import voltage_driven, wanted_model
 from hil.estimation.settled_period import settled_period
 from hil.estimation.truth import true_parameters
@@ -78,12 +78,13 @@ def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> Comparison:
 
 
 def _compare_chain(run: RunFolder, config: str, mujoco: bool) -> Comparison:
-    truth, peers, judge = compare_chain(run, mujoco)
-    methods = {}
+    true, peers, judge = compare_chain(run, mujoco)
+    methods, shown = {}, run.load_config()
     for name, peer in peers.items():
-        worst, error = (None, None) if truth is None else worst_chain_error(peer.parameters, truth)
+        truth = truth_for(peer, true, shown)
+        worst, error = (None, None) if not truth else worst_chain_error(peer.parameters, truth)
         methods[name] = _entry(peer, judge.error(peer.parameters), worst, error)
-    compared = Comparison(SCHEMA, config, truth, methods)
+    compared = Comparison(SCHEMA, config, truth_for(peers["hil"], true, shown), methods)
     write_json(run.path / "compare.json", to_json(compared))
     return compared
 

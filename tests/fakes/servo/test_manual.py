@@ -122,6 +122,13 @@ def test_a_led_byte_out_of_range_does_not_keep_the_goal_from_being_taken(make_be
     assert bench.servo().value("Goal Position") == 2000
 
 
+def test_xl320_takes_its_torque_limit_from_max_torque_when_it_is_switched_on(make_bench: Make) -> None:
+    bench = make_bench({"model": load_model("XL320"), "registers": {"Max Torque": 400}})
+    assert bench.read(1, 35, 2) == 400
+    assert bench.write(1, 35, 200, 2) == 0
+    assert bench.read(1, 35, 2) == 200
+
+
 def test_xl320_has_a_led_of_three_colours(make_bench: Make) -> None:
     bench = make_bench({"model": load_model("XL320")})
     assert bench.write(1, 25, 7) == 0

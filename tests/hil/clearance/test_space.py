@@ -158,6 +158,8 @@ LIMITS = '<limit lower="-0.94" upper="1.38"'
         ((LIMITS, '<limit lower="0.5" upper="0.5"'), "they are equal"),
         ((LIMITS, '<limit lower="-0.94" upper="0.9"'), "but position_limit lets it move from"),
         (('iyy="', 'iyy="9'), "no mass distribution can have this inertia"),
+        ((LIMITS, '<limit lower="-80" upper="80"'), "are these degrees? They must be in radians, then [-1.4, 1.4]"),
+        (("<inertia ", "<no_inertia "), "it has a mass but no <inertia>"),
         (("<box size=", "<mesh filename="), "replaced by a capsule"),
         (("", ""), ""),
     ],
@@ -172,10 +174,27 @@ def test_doubts_about_a_description(tmp_path: Path, edit: tuple[str, str], said:
     assert any(said in doubt for doubt in found) if said else not found
 
 
+def test_a_mesh_in_millimetres_is_named(tmp_path: Path) -> None:
+    corners = "".join(f"v {x} {y} {z}\n" for x in (0, 160) for y in (0, 40) for z in (0, 40))
+    (tmp_path / "part.obj").write_text(corners, encoding="utf-8")
+    shape = '<collision><geometry><mesh filename="part.obj"{}/></geometry></collision>'
+    (doubt,) = shapes_of(one_joint(tmp_path, shape.format(""))).doubts
+    assert 'it is 160 m long: if it is in millimetres, add scale="0.001 0.001 0.001"' in doubt
+    assert not shapes_of(one_joint(tmp_path, shape.format(' scale="0.001 0.001 0.001"'))).doubts
+
+
 def test_a_limit_that_cannot_overcome_friction_is_doubted(tmp_path: Path) -> None:
     text, changed = re.subn(r"(?m)^current_limit = \S+", "current_limit = 0.001", TEXT, count=1)
     (doubt,) = doubts(configured(tmp_path, text))
     assert changed and "current_limit of joint 'joint1' = 0.001 A" in doubt and "it probably would not move" in doubt
+
+
+@pytest.mark.parametrize(("turns", "doubted"), [(1, True), ([1, 1], True), ([1, -1], False)])
+def test_two_servos_that_turn_the_same_way_are_doubted(tmp_path: Path, turns: object, doubted: bool) -> None:
+    config = configured(tmp_path, TEXT)
+    second = config.joints[1].model_copy(update={"servos": [12, 22], "turns": turns})
+    found = list(doubts(config.model_copy(update={"joints": [config.joints[0], second, *config.joints[2:]]})))
+    assert any("they work against each other. Only motion shows it" in each for each in found) is doubted
 
 
 def one_joint(folder: Path, collision: str):  # type: ignore[no-untyped-def]

@@ -1,11 +1,14 @@
 """MJCF as MuJoCo reads it, compared with the same arm's URDF; and error messages for invalid files."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
+from hil.config.chain import doubted_gravity
 from hil.description.arm import ArmFileError
 from hil.description.files import read_arm
 from hil.estimator.chain.model.dynamics import inverse_dynamics
@@ -26,6 +29,51 @@ def torque(path: Path, joints: list[str], q: np.ndarray, v: np.ndarray, a: np.nd
     arm = read_arm(path, joints)
     every = np.column_stack((arm.parameters, np.zeros(len(joints)))).reshape(-1)
     return inverse_dynamics(Chain(*arm.geometry, GRAVITY), every, q, v, a)
+
+
+def doubts_of(folder: Path, old: str, new: str) -> tuple[str, ...]:
+    path = folder / "arm.xml"
+    assert old in ARM
+    path.write_text(ARM.replace(old, new, 1).format(more=""))
+    return read_arm(path, ["one", "two"]).doubts
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('name="two"', 'name="two" stiffness="3"', 'joint "two" has a stiffness, but springs are not modelled'),
+        ('name="jaw"', 'name="jaw" gravcomp="1"', 'body "jaw" has gravcomp, which is not used'),
+        (
+            "</worldbody>",
+            '</worldbody><tendon><fixed stiffness="5"><joint joint="two" coef="1"/></fixed></tendon>',
+            "tendons and springs are not modelled",
+        ),
+        ("", "", ""),
+    ],
+)
+def test_physics_that_is_not_modelled_is_named(tmp_path: Path, old: str, new: str, said: str) -> None:
+    found = doubts_of(tmp_path, old, new)
+    assert any(said in doubt for doubt in found) if said else not found
+
+
+@pytest.mark.parametrize(
+    ("option", "base", "said"),
+    [
+        ("9.81 0 0", [0.0, 0.0, 0.0], "set base = [0.0, 1.5708, 0.0] and gravity = 9.81 under [arm]"),
+        ("9.81 0 0", [0.0, 1.5708, 0.0], ""),
+        ("0 0 0", [0.0, 0.0, 0.0], "weightless"),
+        ("0 0 -9.81", [0.0, 1.0, 0.0], ""),  # MuJoCo's default, which says nothing about the arm
+    ],
+)
+def test_another_gravity_than_the_configuration_is_named(
+    tmp_path: Path, option: str, base: list[float], said: str
+) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM.replace("<worldbody>", f'<option gravity="{option}"/><worldbody>').format(more=""))
+    arm = SimpleNamespace(urdf=str(path), base=base, gravity=9.81)
+    config: Any = SimpleNamespace(arm=arm, joints=[SimpleNamespace(name=name) for name in ("one", "two")])
+    found = list(doubted_gravity(config))
+    assert said in found[0] if said else not found
 
 
 def test_an_arm_is_the_same_from_urdf_and_from_mjcf(tmp_path: Path) -> None:

@@ -98,6 +98,7 @@ def test_an_inertia_that_no_body_has_is_a_doubt(tmp_path: Path) -> None:
     [
         (TWO + link("x"), None, "have no parent joint"),
         (TWO + joint("back", "lower", "upper"), None, "loop"),
+        (TWO + '<link name="stray"/>' + joint("own", "stray", "stray"), None, "is both its parent and its child"),
         (
             joint("a", "u", "l").join(
                 (HEAD.replace('<link name="base"/>', ""), link("u") + link("l") + joint("b", "l", "u"))

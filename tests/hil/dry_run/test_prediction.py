@@ -5,12 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hil.config.schema import Config, load_config, parse_config
+from hil.dry_run import chain_prediction
 from hil.dry_run.amplitude import Amplitude, largest_amplitude
 from hil.dry_run.ensemble import prior_ensemble
-from hil.dry_run.prediction import GUARDED, predict
+from hil.dry_run.prediction import GUARDED, Prediction, predict
 from hil.errors import ConfigError
 from hil.plan.plan import make_plan
 from tests.support.command_line import hil
@@ -125,3 +127,21 @@ def test_a_table_for_a_person_with_what_the_servos_say(
         "settle",
     ):
         assert part in said, part
+
+
+def test_bounds_of_a_path_enclose_its_peaks_wherever_its_centre_is() -> None:
+    """Distances to the limits and the bounds made of them start at the same values."""
+    rest, centre = np.array([0.0, -0.5]), np.array([0.9, 0.2])
+    limits = np.array([[-2.0, -1.0], [2.0, 1.5], [3.0, 3.0]])
+    values = np.array([[0.0, -0.6], [1.2, 0.7], [1.0, 1.5]]) * (1.0 + 1e-3 * np.arange(5)[:, None, None])
+    found = Prediction(
+        values,
+        chain_prediction._shares(values, limits, rest, centre),
+        limits,
+        np.ones(5, int),
+        np.empty(0),
+        rest,
+        100.0,
+        centre,
+    )
+    np.testing.assert_allclose(found.quantile, found.median, atol=0.05)

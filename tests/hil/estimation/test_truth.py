@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 
 from hil.config.schema import Config
-from hil.estimation.truth import truth_of
+from hil.estimation.comparison.chain_compare import truth_for
+from hil.estimation.truth import scaled, truth_of
+from hil.estimator.baselines.compare import Peer
 from hil.model_file import read_settled_result
 from hil.report.run_data import RunData
 from hil.report.sections.verdict import verdict
@@ -54,6 +56,24 @@ def test_what_both_joints_determine_has_no_unit_if_their_constants_differ(
     ratio = {**result.extra, "torque_scale_2": Quantity(1.06, 1e-3, "1")}
     whole = truth_of(dataclasses.replace(result, extra=ratio), config)
     assert whole.values == pytest.approx({name: 1.06 * value for name, value in (result.truth or {}).items()})
+
+
+def test_a_result_holds_the_truth_in_its_own_unit_too(result: SettledResult, identified_once: Path) -> None:
+    config = RunFolder.open(identified_once).load_config()
+    assert result.truth_scaled is None
+    found = scaled(result.truth, stronger(config, (1.06, 1.06)), result.extra)
+    assert found == pytest.approx({name: 1.06 * value for name, value in (result.truth or {}).items()})
+    assert scaled(None, config, {}) is None
+
+
+def test_compare_judges_each_method_in_its_own_unit(result: SettledResult, identified_once: Path) -> None:
+    config = stronger(RunFolder.open(identified_once).load_config(), (1.06, 1.0))
+    peer = Peer("hil", result.values, {}, 0.0, "", 1)
+    alone = truth_for(peer, result.truth, config)
+    assert alone is not None and alone["viscous_1"] == pytest.approx(1.06 * (result.truth or {})["viscous_1"])
+    with_ratio = dataclasses.replace(peer, parameters={**peer.parameters, "torque_scale_2": 1.06})
+    every = truth_for(with_ratio, result.truth, config)
+    assert every == pytest.approx({name: 1.06 * value for name, value in (result.truth or {}).items()})
 
 
 def test_a_value_near_zero_does_not_head_the_relative_errors(identified_once: Path) -> None:

@@ -5,8 +5,10 @@ from pathlib import Path
 import pytest
 
 import hil
+from hil.drivers.joint import Joint, SecondServo
+from hil.drivers.servo_model import servo_model
 from hil.errors import Cause, SafetyStop
-from hil.experiment.apart import ALLOWED_RAD, Apart
+from hil.experiment.apart import ALLOWED_RAD, Apart, causes_of_standstill
 from tests.support.paths import CONFIGS
 
 
@@ -15,6 +17,13 @@ def test_only_a_change_of_the_difference_counts() -> None:
     assert apart.look([(), (1.2, -0.4)]) is None
     assert apart.look([(), (1.2 + 0.9 * ALLOWED_RAD, float("nan"))]) is None
     assert apart.look([(), (1.2, -0.4 - 1.1 * ALLOWED_RAD)]) == (1, 1, pytest.approx(-1.1 * ALLOWED_RAD))
+
+
+def test_two_servos_that_stand_still_may_work_against_each_other() -> None:
+    one = Joint("hip", 2, servo_model("XM430-W350"))
+    two = Joint("hip", 2, servo_model("XM430-W350"), seconds=(SecondServo(7, 1),))
+    assert "against" not in causes_of_standstill(one)
+    assert "work against each other: is one entry of direction = [1, 1] wrong?" in causes_of_standstill(two)
 
 
 @pytest.mark.parametrize("slips", [True, False])

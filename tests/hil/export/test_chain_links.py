@@ -3,6 +3,7 @@
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -49,7 +50,12 @@ def test_a_gripper_keeps_its_inertia_and_the_arm_its_dynamics(
     tip = read_urdf(CONFIGS / "leg.urdf").joints[-1].link
     small = '<inertia ixx="2e-6" iyy="2e-6" izz="2e-6" ixy="0" ixz="0" iyz="0"/>'
     gripper = GRIPPER.format(tip=tip, mass=mass, small=small)
-    (tmp_path / "arm.urdf").write_text(text.replace("</robot>", gripper), encoding="utf-8")
+    shape = '<collision><origin xyz="0 0 0.1"/><geometry><cylinder radius="0.05" length="0.2"/></geometry></collision>'
+    base = read_urdf(CONFIGS / "leg.urdf").base
+    stands = f'<link name="pedestal">{shape}</link><joint name="on" type="fixed"><parent link="{base}"/>'
+    gripper = f'{stands}<child link="pedestal"/></joint>{gripper}'
+    text = text.replace("</robot>", gripper)
+    (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
     arm = read_urdf(tmp_path / "arm.urdf", [joint.name for joint in config.joints])
     identified = arm if whole else read_urdf(CONFIGS / "leg.urdf")  # too light for a gripper of 5 kg
     bodies = tuple(joint.body for joint in identified.joints)
@@ -68,6 +74,8 @@ def test_a_gripper_keeps_its_inertia_and_the_arm_its_dynamics(
         assert (each.mass == pytest.approx(mass if name == "finger" else 0.004)) is whole
     left = chain_files.export_chain_mjcf(cast("Any", None), model, tmp_path / "out.xml")
     assert any("grip, which were held" in each and tip in each for each in left)
+    stands_on = ET.parse(tmp_path / "out.xml").findall("worldbody/geom")
+    assert [(each.get("type"), each.get("size")) for each in stands_on][-1] == ("cylinder", "0.05 0.1")
 
 
 def test_an_unknown_rotor_is_that_of_its_servo() -> None:

@@ -20,7 +20,7 @@ from hil.pilot import chain_search
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import RESERVE, Paths, Reserve, chain_config
 from hil.pilot.chain_rehearsal import rehearse
-from hil.pilot.chain_search import ChainSearch
+from hil.pilot.chain_search import ChainSearch, Said
 from hil.pilot.chain_shares import PILOT_SHARES, Found, SafeShares, step_config
 from hil.pilot.steps import Say
 from hil.plan.chain_model import known_chain
@@ -356,3 +356,11 @@ def test_an_arm_that_settles_in_its_rest_pose_is_not_said_to_lie_elsewhere(
         chain_search.identify_chain_in_steps(config, Mock(), LEG, Mock(), said.append)
     assert len(said) == told
     assert all("does not lie in arm.rest_pose: '" in each for each in said)
+
+
+def test_a_long_search_is_not_silent() -> None:
+    times, lines = iter([0.0, 10.0, 31.0, 31.0, 50.0, 62.0, 62.0]), list[str]()
+    said = Said(lines.append, lambda: next(times))
+    for done in (1, 2, 3, 4):
+        said.tell(done, 9)
+    assert ["2 of 9" in lines[0], "4 of 9" in lines[1], len(lines)] == [True, True, 2]

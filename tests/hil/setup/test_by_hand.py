@@ -11,7 +11,7 @@ from hil.cli.app import app
 from hil.config.chain import base_up, described_arm
 from hil.config.schema import load_config
 from hil.description.motion import _towards, end_point, moves
-from hil.setup.by_hand import MOVED, Moved, guided, judge
+from hil.setup.by_hand import MOVED, Moved, guided, judge, pose_of
 from tests.support.paths import CONFIGS
 
 ARM = load_config(CONFIGS / "fake_viperx_300.toml")
@@ -45,8 +45,26 @@ def change(**by: float) -> np.ndarray:
     ],
 )
 def test_what_a_hand_moved_is_judged(moved: np.ndarray, well: bool, words: str) -> None:
-    found = judge(ARM, 2, "", moved)
+    found = judge(ARM, 2, "", moved, moved[2:3])
     assert found.well is well
+    assert words in found.found
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "directions", "words"),
+    [
+        (0.4, 0.39, [1, -1], "as described, and so did its second servo"),
+        (0.4, -0.4, [1, 1], "work against each other: set direction = [1, -1]"),
+        (-0.4, 0.4, [1, 1], "set direction = [-1, 1] and determine zero_ticks again"),
+        (-0.4, -0.4, [1, -1], "set direction = [-1, 1] and determine zero_ticks again"),
+        (0.4, 0.0, [1, -1], "Is ID 9 on this joint"),
+    ],
+)
+def test_two_servos_of_a_joint_are_compared(first: float, second: float, directions: list[int], words: str) -> None:
+    elbow = ARM.joints[2].model_copy(update={"servos": [3, 9], "turns": directions})
+    arm = ARM.model_copy(update={"joints": [*ARM.joints[:2], elbow, *ARM.joints[3:]]})
+    found = judge(arm, 2, "", change(elbow=first), np.array([first, second]))
+    assert found.well is words.startswith("as described")
     assert words in found.found
 
 
@@ -90,7 +108,7 @@ def test_every_joint_is_asked_for_and_waited_for() -> None:
             angles[index] = (-1 if index == 3 else 1) * 0.3 * min(1.0, (clock.now() - since) / 0.5)
         return tuple(angles.tolist())
 
-    found = list(guided(ARM, read, clock, lambda text: asked.append((clock.now(), text))))
+    found = list(guided(ARM, read, clock, lambda text: asked.append((clock.now(), text)), lambda _: (0.0,)))
     assert [each.well for each in found] == [True, True, True, False, True, True]
     assert all(abs(each.angles[index]) > 0.99 * 0.3 > MOVED for index, each in enumerate(found))
     assert all(joint.name in text for joint, (_, text) in zip(ARM.joints, asked, strict=True))
@@ -99,7 +117,7 @@ def test_every_joint_is_asked_for_and_waited_for() -> None:
 
 def test_patience_ends() -> None:
     clock = VirtualClock()
-    moves_: Iterator[Moved] = guided(ARM, lambda: (0.0,) * 6, clock, lambda _: None)
+    moves_: Iterator[Moved] = guided(ARM, lambda: (0.0,) * 6, clock, lambda _: None, lambda _: (0.0,))
     assert "did not move" in next(moves_).found
     assert clock.now() < 61.0
 
@@ -111,6 +129,12 @@ def test_the_pose_of_the_fake_arm_is_its_rest_pose() -> None:
     np.testing.assert_allclose(list(angles.values()), ARM.arm.rest_pose, atol=0.02)
     table = CliRunner().invoke(app, ["pose", str(ARM.path)], env={"COLUMNS": "200"})
     assert "moves the end" in table.output
+
+
+def test_whole_turns_are_taken_off() -> None:
+    rest = np.array(ARM.arm.rest_pose)
+    turned = rest + 2 * np.pi * np.array([0, -2, 1, 0, 2, -1])
+    np.testing.assert_allclose(pose_of(ARM, tuple(turned)).angles, rest, atol=1e-9)
 
 
 def test_an_arm_without_description_has_none_to_compare() -> None:
