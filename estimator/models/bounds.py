@@ -63,7 +63,7 @@ def finite_std(std: Array, white: Array) -> Array:
 
 def matters(names: tuple[str, ...], beyond: Mask, step: Array, std: Array) -> bool:
     """Return whether a base parameter, other than offsets, is at its bound (`beyond`) or would move by more than its
-    standard error `std`. The standard error accounts for the misfit, which the bound of that parameter itself may cause.
+    standard error `std`, which accounts for the misfit; a parameter's own bound may be what causes that misfit.
     """
     base = np.array([term_of(name).part == "base" and kind_of(name) != "offset" for name in names])
     return bool(beyond[base].any() or np.any(np.abs(step[base]) > MOVED * std[base]))
