@@ -91,7 +91,7 @@ def _torque_of_pilot(config: Config) -> Iterator[Finding]:
             "Remove peak_torque; or set pilot = false to use it."
         )
         yield Finding(Level.WARNING, "experiment", "torque", "pilot = true takes precedence over peak_torque", fix)
-    if not config.experiment.pilot and config.experiment.peak_torque is None:
+    if not (config.is_chain or config.experiment.pilot) and config.experiment.peak_torque is None:
         fix = f"{how_to_find_torque(config)} Or let hil find it: pilot = true."
         yield Finding(Level.STOP, "experiment", "torque", "experiment.peak_torque is missing", fix)
 

@@ -6,7 +6,7 @@ program left saved settings behind, these count as the servos' own and are resto
 """
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -30,6 +30,8 @@ from hil.setup.settings_file import Kept
 __all__ = ["SETTINGS_NAME", "Say", "ServoSession", "has_moved", "left_behind", "recover", "servo_session", "to_stderr"]
 
 Say = Callable[[str], None]
+
+_DELAY = "Return Delay Time"
 
 SETTINGS_NAME = "servo_settings.json"
 """Name of the copy of the saved settings in the run folder."""
@@ -57,6 +59,8 @@ class ServoSession:
     bus: ServoBus
     _say: Say
     _kept: dict[Joint, Kept] = field(default_factory=dict)
+    _delays: dict[Joint, int] = field(default_factory=dict)
+    """Return Delay Time of each servo at the beginning [2 us]."""
     shared: int = 0
     """Number of inner blocks that have used the bus."""
     was_stopped: bool = False
@@ -79,6 +83,7 @@ class ServoSession:
         }
         for joint, servo in bus.drives.items():
             settings = read_settings(servo)
+            self._delays[joint] = servo.read(_DELAY)
             if joint in left:
                 settings = _before(left[joint], settings)
                 self._say(
@@ -131,10 +136,27 @@ class ServoSession:
             clock.wait_until(clock.now() + REBOOT_S)
             failed = self._put_back(failed)
         return [
-            f"The settings of {and_list(map(str, joints))} could not be restored ({why}) The next hil identify, "
-            f"record, check or setup on this port restores them from {self._where(joints)}."
-            for why, joints in by_reason((joint, str(error)) for joint, error in failed.items()).items()
+            *self._changed_delays(failed),
+            *(
+                f"The settings of {and_list(map(str, joints))} could not be restored ({why}) The next hil identify, "
+                f"record, check or setup on this port restores them from {self._where(joints)}."
+                for why, joints in by_reason((joint, str(error)) for joint, error in failed.items()).items()
+            ),
         ]
+
+    def _changed_delays(self, silent: Collection[Joint]) -> Iterator[str]:
+        """Say which Return Delay Times were changed meanwhile, by another program or a factory reset."""
+        for joint, before in self._delays.items():
+            now = before
+            if joint not in silent:
+                with suppress(DriverError):
+                    now = self.bus.drives[joint].read(_DELAY)
+            if now != before:
+                yield (
+                    f"{joint.title}: {_DELAY} was changed meanwhile from {2 * before} to {2 * now} us, by another "
+                    "program or a factory reset, which changes other settings too. To set it: "
+                    f"hil setup {self.bus.port.url} --id {joint.id} --return-delay-us {2 * before}"
+                )
 
     def _where(self, joints: Sequence[Joint]) -> str:
         """The file that holds the settings of a servo; for several servos, their folder."""

@@ -122,6 +122,17 @@ def test_settings_are_on_the_disk_before_the_first_write(arm: Arm, tmp_path: Pat
     assert seen == [True, True] and not any(path.exists() for path in files)
 
 
+def test_a_return_delay_that_another_program_changed_is_named(
+    arm: Arm, bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with servo_session(arm(SHORT)):
+        servo = bench.servos[2]
+        servo.memory.store(servo.model.registers["Return Delay Time"], 250)
+    said = capsys.readouterr().err
+    assert "'elbow'" in said and "changed meanwhile from 0 to 500 us" in said and "--return-delay-us 0" in said
+    assert "'shoulder'" not in said
+
+
 @pytest.mark.parametrize("kind", ["silent_servo", "reboot", "overheating", "cable_pulled"])
 def test_whatever_stops_a_run_its_settings_are_put_back_then_or_at_the_next_start(
     arm: Arm, tmp_path: Path, bench: Bench, kind: str

@@ -161,6 +161,13 @@ def test_what_would_stop_an_experiment_is_found_with_how_to_mend_it(
         assert "Fix the servo problems above first" in found["bus", "rate"].fix
 
 
+def test_a_torque_that_identify_would_miss_is_missed_by_the_check(arm: Arm) -> None:
+    finding = look(
+        arm(("peak_torque = [0.80, 0.42]", "pilot = false"), ("rest_pose =", "link_lengths = [0.2, 0.2]\nrest_pose ="))
+    )["experiment", "torque"]
+    assert finding.level is Level.STOP and "pilot = true" in finding.fix
+
+
 def test_a_rate_that_the_bus_cannot_hold_is_a_stop_with_the_rate_that_it_can(arm: Arm) -> None:
     found = look(arm(("rate = 400.0", "rate = 1200.0")))
     assert found["bus", "rate"].level is Level.STOP
