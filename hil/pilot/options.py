@@ -19,7 +19,7 @@ class PilotOptions:
     """Maximum number of pilots; a still joint reaches its current limit in far fewer."""
     certain_share: float = 0.85
     """Fraction of a limit that a typical arm should reach; below it, uncertainty wastes too much of the range."""
-    certain_share_known: float = 0.72
+    certain_share_known: float = 0.68
     """Fraction of a limit that a typical arm should reach if the belief comes from an earlier result, whose uncertainty
     another run would hardly reduce.
     """
