@@ -1,6 +1,6 @@
 """Random conversations with fake servos of every X model, byte by byte, each answer compared with the manual.
 
-    python -m benchmarks.bus.conversations --conversations 2000 --seed 1
+    python benchmarks/bus/conversations.py [--conversations N] [--seed S] [--json]
 
 The host is `codec`, the expectation `servo_rules`; neither knows the fake's code. A conversation has one to four servos
 with random models, IDs, firmware, Return Delay Time and Status Return Level, and some dozen random instructions:
@@ -9,6 +9,7 @@ stuffing, and packets that are damaged, cut short, surrounded by noise or nonsen
 """
 
 import argparse
+import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -36,6 +37,7 @@ from benchmarks.bus.servo_rules import (
     Row,
     Rules,
 )
+from benchmarks.machine import machine
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.servo.registers import load_model
@@ -862,6 +864,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--conversations", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--json", action="store_true", help="print one JSON object and nothing else")
     chosen = parser.parse_args()
     kinds: Counter[str] = Counter()
     models: Counter[str] = Counter()
@@ -872,9 +875,18 @@ def main() -> None:
         models.update(servo.model for servo in talk.servos)
         wrong += bool(talk.differences)
         for difference in talk.differences:
-            print(f"seed {seed}: {difference}")
-    print(f"{wrong} of {chosen.conversations} conversations differ; {sum(kinds.values())} packets: {dict(kinds)}")
-    print(f"models: {dict(models)}")
+            print(f"seed {seed}: {difference}", file=sys.stderr if chosen.json else sys.stdout)
+    if chosen.json:
+        figures = {
+            "conversations": chosen.conversations,
+            "differ": wrong,
+            "packets": dict(kinds),
+            "models": dict(models),
+        }
+        print(json.dumps(figures | {"models": dict(models), "machine": machine()}))
+    else:
+        print(f"{wrong} of {chosen.conversations} conversations differ; {sum(kinds.values())} packets: {dict(kinds)}")
+        print(f"models: {dict(models)}")
     raise SystemExit(bool(wrong))
 
 

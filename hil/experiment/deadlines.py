@@ -1,5 +1,7 @@
 """Missed deadlines: how long the arm may go without a command, and what share of the deadlines may be missed."""
 
+from collections.abc import Callable
+
 from hil.config.schema import Config
 from hil.errors import Cause, SafetyStop
 from hil.plan.silence import late_limit
@@ -17,21 +19,32 @@ _WHY_LATE = (
 
 
 class Deadlines:
-    """Counts missed deadlines of the samples. Every method may raise SafetyStop."""
+    """Counts missed deadlines of the samples. Every method may raise SafetyStop.
 
-    def __init__(self, config: Config) -> None:
+    heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did.
+    """
+
+    def __init__(self, config: Config, heard_instead: Callable[[], str] = str) -> None:
         self._interval = 1.0 / config.experiment.rate
         self._watchdog = config.safety.watchdog
         self._limit = late_limit(config)
         self._most_often = max(_OFTEN_LATE, 0.5 * self._limit.seconds / self._interval)
         self._in_a_row = 0
         self._often = 0.0
+        self._heard_instead = heard_instead
+        self._counted = self._waited = 0
+        """Missed deadlines that make up `_often`, and those missed while waiting for a reply that never came."""
         self.any_missed = False
         """Whether some missed deadlines are not yet offset by deadlines met since."""
 
-    def missed(self, seconds: float = 0.0) -> None:
-        """Record a missed deadline, `seconds` after the last command."""
+    def missed(self, seconds: float = 0.0, *, waited: bool = False) -> None:
+        """Record a missed deadline, `seconds` after the last command.
+
+        waited: this program was waiting for a reply that was lost or damaged.
+        """
         self.any_missed = True
+        self._counted += 1
+        self._waited += waited
         self._in_a_row += 1
         if self._in_a_row <= _OF_ONE_STALL:
             self._often += 1.0
@@ -51,15 +64,22 @@ class Deadlines:
         self._in_a_row = 0
         if self._often <= 0.0:
             self.any_missed = False
+            self._counted = self._waited = 0
             return
         self._often = max(0.0, self._often - LATE_SHARE)
         if self._often >= self._most_often:
             raise SafetyStop(
-                f"More than {100 * LATE_SHARE:.0f} % of the deadlines are missed: the replies arrive too late for "
-                f"{1 / self._interval:g} Hz. `hil check` measures what this bus can do: check the adapter's latency "
-                "timer and the servos' return delay, or lower experiment.rate.",
-                Cause.LATE,
+                f"More than {100 * LATE_SHARE:.0f} % of the deadlines are missed{self._why_often()}", Cause.LATE
             )
+
+    def _why_often(self) -> str:
+        if 2 * self._waited > self._counted:
+            heard = self._heard_instead() or "Check the cables, the supply and what else may be sending on the bus."
+            return f", most of them while waiting for replies that were lost or damaged. {heard}"
+        return (
+            f": the replies arrive too late for {1 / self._interval:g} Hz. `hil check` measures what this bus can do: "
+            "check the adapter's latency timer and the servos' return delay, or lower experiment.rate."
+        )
 
     def check_gap(self, seconds: float) -> None:
         """Check the time between two exchanges: the servos' watchdogs must not have tripped."""

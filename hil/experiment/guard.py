@@ -89,7 +89,7 @@ class Guard:
         self._silence = Silence(config, interval, patience)
         self._patience = patience or float("inf")
         self._heard_instead = heard_instead
-        self._deadlines = Deadlines(config)
+        self._deadlines = Deadlines(config, heard_instead)
         self._joints = _joint_records(config, planned, left_by_a_run)
         self._checks = JointChecks(self._joints, interval)
         self._apart = Apart()
@@ -117,7 +117,7 @@ class Guard:
 
     def late(self, seconds: float = 0.0) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
-        self._deadlines.missed(seconds)
+        self._deadlines.missed(seconds, waited=any(self._missing))
 
     def look(self, state: State, watchdog_gap: float = 0.0, *, between: bool = False) -> None:
         """Check one exchange. Raises SafetyStop when a limit is exceeded or a reply is inconsistent.

@@ -214,3 +214,23 @@ def test_a_servo_is_never_silent_for_longer_than_either_limit(gaps: list[float],
             assert each is not None
         if each is None and count >= 2:
             assert count * interval < 0.015
+
+
+@pytest.mark.parametrize(
+    ("waited", "heard", "said"),
+    [
+        (3, "", "while waiting for replies that were lost or damaged. Check the cables"),
+        (3, "Bytes arrived, but damaged.", "lost or damaged. Bytes arrived, but damaged."),
+        (2, "Bytes arrived, but damaged.", "the replies arrive too late for 400 Hz. `hil check` measures"),
+    ],
+)
+def test_deadlines_missed_while_waiting_for_lost_replies_are_not_blamed_on_the_adapter(
+    arm: Arm, waited: int, heard: str, said: str
+) -> None:
+    deadlines = Deadlines(arm(), lambda: heard)
+    with pytest.raises(SafetyStop) as stop:
+        for _ in range(100):
+            for number in range(5):
+                deadlines.missed(waited=number < waited)
+            deadlines.met()
+    assert said in str(stop.value)
