@@ -19,6 +19,7 @@ from hil.experiment.stream import Progress, Watch
 from hil.fakes.protocol_fake import FakeSerial
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
+from tests.support.at_sample import at_sample
 from tests.support.short_experiment import CONFIG, short_config
 
 Arm = Callable[..., Config]
@@ -35,18 +36,6 @@ def run(config: Config, folder: Path, watch: Watch = ignore) -> RunFolder:
     made = RunFolder.create(folder, config)
     run_experiment(config, made, config.path, watch)
     return made
-
-
-def at_sample(count: int, action: Callable[[], Any]) -> Watch:
-    """A callback that calls `action` once, after `count` samples."""
-    done: list[bool] = []
-
-    def watch(progress: Progress) -> None:
-        if progress.taken >= count and not done:
-            done.append(True)
-            action()
-
-    return watch
 
 
 def assert_no_torque(port: Any) -> None:

@@ -13,23 +13,12 @@ from hil.config.schema import Config
 from hil.drivers.errors import PortLost, TorqueNotOff, WrongSetting
 from hil.errors import SafetyStop
 from hil.experiment.run import run_experiment
-from hil.experiment.stream import Progress
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 from hil.runs.timing import timing
+from tests.support.at_sample import at_sample
 
 Arm = Callable[..., Config]
-
-
-def once_at(count: int, action: Callable[[], None]) -> Callable[[Progress], None]:
-    done: list[bool] = []
-
-    def watch(progress: Progress) -> None:
-        if progress.taken >= count and not done:
-            done.append(True)
-            action()
-
-    return watch
 
 
 def test_a_stall_costs_the_periods_it_covers_and_no_burst_follows(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
@@ -39,7 +28,7 @@ def test_a_stall_costs_the_periods_it_covers_and_no_burst_follows(arm: Arm, tmp_
         ports[0].clock.wait_until(ports[0].clock.now() + 10.5 / 400)
 
     run = RunFolder.create(tmp_path / "run", config)
-    run_experiment(config, run, config.path, once_at(900, stall))
+    run_experiment(config, run, config.path, at_sample(900, stall))
     samples = load_samples(run.samples_path, 2)
     kept = timing(samples, 400.0)
     assert kept.missed_ticks == 9
@@ -73,7 +62,7 @@ def test_a_lost_port_carries_the_last_samples(arm: Arm, tmp_path: Path, ports: l
 
     config = arm()
     with pytest.raises(TorqueNotOff, match="NOT CONFIRMED") as caught:
-        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, once_at(900, pull))
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, at_sample(900, pull))
     lost: Any = caught.value.__context__
     assert isinstance(lost, PortLost)
     last: Any = caught.value.last_samples  # type: ignore[attr-defined]
