@@ -10,6 +10,7 @@ import pytest
 
 import hil
 from hil.config.schema import Config, load_config, parse_config
+from hil.dry_run import chain_summary
 from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_summary import chain_dry_run_lines, unsafe
@@ -312,7 +313,7 @@ def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) ->
 
     # More arms than the pilot looks at may add a doubt, which the dry run tells but does not decide by.
     with monkeypatch.context() as patch:
-        patch.setattr("hil.dry_run.chain_summary.unsafe", lambda *_: "joint 'knee' reaches speed 9")
+        patch.setattr(chain_summary, "unsafe", lambda *_: "joint 'knee' reaches speed 9")
         assert first.is_safe(first.config)
         assert any("'knee' reaches speed 9" in line for line in chain_dry_run_lines(first))
 
