@@ -210,13 +210,13 @@ class Exchange:
         back = self._read_back
         if back is None or not self._sent:
             return None
-        goals, modes = back.reads
-        if back.read is modes:
+        if back.is_of_modes:
+            goals, modes = back.reads
             # Only goals are overwritten by the next cycle. If there is time for them as well, they are read last.
             before_goals = due - self._takes(goals, back) - HOST_S
             if self._now() + self._takes(modes, back) <= before_goals:
                 found = self._held(back, before_goals)
-                if found is not None or back.read is modes:
+                if found is not None or back.is_of_modes:
                     return found
         return self._held(back, due)
 
@@ -227,7 +227,6 @@ class Exchange:
     def _held(self, back: ReadBack, due: float) -> Overruled | None:
         """Read back once if that is possible before `due` [s]."""
         port, now, read = self._port, self._now(), back.read
-        asked = read.reply_size + (len(read.request) if self._echoes else 0)
         takes = self._takes(read, back)
         if now + takes > due or self._late_possible:
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
@@ -239,10 +238,13 @@ class Exchange:
         if before + takes > due:  # woken up late
             self.read_back_at = before + TRY_AGAIN_S
             return None
-        received = port.ask(read.request, asked, due - before, before)
+        if self._echoes:
+            received = port.ask(read.request, len(read.request) + read.reply_size, due - before, before)
+            received = received.removeprefix(read.request)
+        else:
+            received = port.ask(read.request, read.reply_size, due - before, before)
         if port.overheard:
             self._overhear()
-        received = received.removeprefix(read.request)
         servos = read.unpack(received) or read.search(received)[0]
         now = self._now()
         self.read_back_at = now
