@@ -117,10 +117,11 @@ class Exchange:
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.strangers = 0
         """Number of packets received that this program neither sent nor asked for: another master is on the bus."""
-        self._write, *self._more_writes = [
+        self._writes = [
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
         ]
+        self._pack = self._writes[0].pack if len(self._writes) == 1 else self._pack_each
         every = [*spans] if status is None else [*spans, status]
         self._kinds = len(every)
         every += _of_other_lengths(every, len(self.ids))
@@ -128,9 +129,17 @@ class Exchange:
         self._expected = frozenset().union(*(read.expected for read in self._reads))
         self._slow_spans = len(spans) - 1
         least = max(patience, min(PATIENCE_SHARE * interval, MOST_PATIENCE_S))
-        self._timeouts = [max(self._timeout(read, return_delay), least) for read in self._reads]
         self._wire_s = {read: port.wire_time(self._bytes(read)) for read in self._reads}
-        self._soonest = [0.5 * self._wire_s[read] for read in self._reads]
+        self._plans = [
+            _Plan(
+                read,
+                span if span < self._kinds else 0,
+                max(self._timeout(read, return_delay), least),
+                self._wire_s[read],
+                0.5 * self._wire_s[read],
+            )
+            for span, read in enumerate(self._reads)
+        ]
         self._doubts = _DOUBTS
         self._status_every = _NEVER if status is None else status_every
         self._until_status = self._status_every
@@ -142,8 +151,7 @@ class Exchange:
         self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
         self._off_wire = math.inf
         """Duration of the latest cycle without its wire time [s]."""
-        self._was_unusual = False
-        """Whether the latest cycle read another span than the usual one, and so left less time than most."""
+        self._usual = self._latest_plan = self._plans[0]
         self._read_back: ReadBack | None = None
         self.read_back_at = math.inf
         """When `overruled` should be called again, before the next cycle [s on the port's clock]."""
@@ -164,7 +172,7 @@ class Exchange:
     @property
     def patience(self) -> float:
         """Longest time that a cycle waits for replies [s]."""
-        return max(self._timeouts)
+        return max(plan.timeout for plan in self._plans)
 
     def read_status_next(self) -> None:
         """Read the status in the next cycle instead of when it is due."""
@@ -202,13 +210,13 @@ class Exchange:
         back = self._read_back
         if back is None or not self._sent:
             return None
-        goals, modes = back.reads
-        if back.read is modes:
+        if back.is_of_modes:
+            goals, modes = back.reads
             # Only goals are overwritten by the next cycle. If there is time for them as well, they are read last.
             before_goals = due - self._takes(goals, back) - HOST_S
             if self._now() + self._takes(modes, back) <= before_goals:
                 found = self._held(back, before_goals)
-                if found is not None or back.read is modes:
+                if found is not None or back.is_of_modes:
                     return found
         return self._held(back, due)
 
@@ -219,22 +227,24 @@ class Exchange:
     def _held(self, back: ReadBack, due: float) -> Overruled | None:
         """Read back once if that is possible before `due` [s]."""
         port, now, read = self._port, self._now(), back.read
-        asked = read.reply_size + (len(read.request) if self._echoes else 0)
         takes = self._takes(read, back)
         if now + takes > due or self._late_possible:
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
-            self.read_back_at = now if self._was_unusual or self._late_possible else now + TRY_AGAIN_S
+            left_less_time = self._latest_plan is not self._usual
+            self.read_back_at = now if self._late_possible or left_less_time else now + TRY_AGAIN_S
             return None
         port.clock.wait_until(due - takes - HOST_S)
         before = self._now()
         if before + takes > due:  # woken up late
             self.read_back_at = before + TRY_AGAIN_S
             return None
-        received = port.ask(read.request, asked, due - before, before)
+        if self._echoes:
+            received = port.ask(read.request, len(read.request) + read.reply_size, due - before, before)
+            received = received.removeprefix(read.request)
+        else:
+            received = port.ask(read.request, read.reply_size, due - before, before)
         if port.overheard:
-            self._overhear(port.overheard)
-            port.overheard = b""
-        received = received.removeprefix(read.request)
+            self._overhear()
         servos = read.unpack(received) or read.search(received)[0]
         now = self._now()
         self.read_back_at = now
@@ -258,19 +268,19 @@ class Exchange:
         Raises PortLost; ValueError for the wrong number of goals or a goal that does not fit into two bytes.
         """
         port = self._port
-        self._until_slow -= not between
+        if not between:
+            self._until_slow -= 1
         self._until_status -= 1
-        usual = (between or self._until_slow > 0) and self._until_status > 0 and not self._late_possible
-        span = 0 if usual else self._other_span(between)
-        read = self._reads[span]
+        if self._until_status > 0 and (self._until_slow > 0 or between) and not self._late_possible:
+            plan = self._usual
+        else:
+            plan = self._plans[self._other_span(between)]
+        read, span, timeout, wire_s, soonest = plan
         try:
-            goals = self._write.pack(goal_ticks)
-            for write in self._more_writes:
-                goals += write.pack(goal_ticks)
+            goals = self._pack(goal_ticks)
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
         self._sent.append(tuple(goal_ticks))
-        timeout = self._timeouts[span]
         before = self._now()
         if self._echoes:
             received = self._ask_behind_echo(goals, read, timeout, before)
@@ -280,19 +290,20 @@ class Exchange:
             port.write(goals)
             received = port.ask(read.request, read.reply_size, timeout, before)
         if port.overheard:
-            self._overhear(port.overheard)
-            port.overheard = b""
+            self._overhear()
         servos = read.unpack(received)
+        after = self._now()
         if servos is None:
             servos = self._search(read, received, before + timeout)
+            after = self._now()
             if None in servos:
                 self._late_possible = True
-        elif self._doubts and self._now() - before < self._soonest[span]:
+        elif after - before < soonest and self._doubts:
             servos = self._latest(read, servos, before + timeout)
-        after = self._now()
-        self._off_wire = after - before - self._wire_s[read]
-        self._was_unusual = span > 0
-        return _reply((before, after, span if span < self._kinds else 0, servos))
+            after = self._now()
+        self._off_wire = after - before - wire_s
+        self._latest_plan = plan
+        return _reply((before, after, span, servos))
 
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
         """Handle replies that arrive sooner than the wire allows: they may belong to an earlier request.
@@ -367,9 +378,10 @@ class Exchange:
         lengths = {size + 4 for _, size in self._expected}
         return servo_id in (*self.ids, BROADCAST_ID) and length <= _LONGEST_CUT_OFF and length not in lengths
 
-    def _overhear(self, received: bytes) -> None:
+    def _overhear(self) -> None:
         """Examine bytes that were pending before the request: from another master, or a late or repeated reply."""
-        packets = _packets_within(received)
+        packets = _packets_within(self._port.overheard)
+        self._port.overheard = b""
         self._look_for_strangers(packets)
         if any(packet.is_status for packet in packets):
             self.late_at = self._now()
@@ -386,13 +398,34 @@ class Exchange:
             self._echoes = False  # an adapter that no longer echoes: waiting for it would make every cycle late
         return received.removeprefix(sent)
 
+    def _pack_each(self, goal_ticks: Sequence[int]) -> bytes:
+        """Return the packets for these goals, one per goal register."""
+        if len(goal_ticks) != len(self.ids):
+            raise ValueError(f"{len(goal_ticks)} goals for {len(self.ids)} servos")
+        return b"".join(write.pack([goal_ticks[place] for place in write.places]) for write in self._writes)
+
     def _timeout(self, read: GroupRead, return_delay: float) -> float:
         # Each servo's answer may contain up to two stuffing bytes.
         wire = self._port.wire_time(self._bytes(read) + 2 * len(self.ids))
         return wire + return_delay * len(self.ids) + self._port.latency + HOST_S
 
     def _bytes(self, read: GroupRead) -> int:
-        return sum(write.size for write in (self._write, *self._more_writes)) + len(read.request) + read.reply_size
+        return sum(write.size for write in self._writes) + len(read.request) + read.reply_size
+
+
+class _Plan(NamedTuple):
+    """One of the group reads of an exchange.
+
+    span: the span that a Reply reports. timeout: how long to wait for the replies [s]. wire_s: wire time of goals,
+    request and replies [s]. soonest: replies that are complete earlier after the start of a cycle may belong to an
+    earlier request [s].
+    """
+
+    read: GroupRead
+    span: int
+    timeout: float
+    wire_s: float
+    soonest: float
 
 
 class _GoalWrite:
@@ -402,22 +435,17 @@ class _GoalWrite:
         # A two-byte value between ID bytes (at most 252) can never hold FF FF FD: the goals are never stuffed.
         packet = struct.Struct("<12s" + "Bh" * len(places))
         self._pack = packet.pack
-        self._count = len(ids)
         self._fields: list[bytes | int] = [_front(goal, len(places))]
         for place in places:
             self._fields += [ids[place], 0]
-        self._places = None if len(places) == len(ids) else tuple(places)
+        self.places = tuple(places)
         self.size = packet.size + 2
 
     def pack(self, goal_ticks: Sequence[int]) -> bytes:
-        """Return the packet for these goals, one per servo of the exchange; raises struct.error for one that is too
-        large.
+        """Return the packet for these goals, one per servo of the subset; raises struct.error for one that is too
+        large, ValueError or struct.error for a wrong number of goals.
         """
-        fields, places = self._fields, self._places
-        if places is not None:
-            if len(goal_ticks) != self._count:
-                raise ValueError(f"{len(goal_ticks)} goals for {self._count} servos")
-            goal_ticks = [goal_ticks[place] for place in places]
+        fields = self._fields
         fields[2::2] = goal_ticks
         packet = self._pack(*fields)
         return packet + _pack_crc(_crc(packet))

@@ -31,6 +31,19 @@ _REASONS = {
 _MOST_OVERHEARD = 4096
 """Largest number of pending bytes that are examined; the others are discarded."""
 
+_LOOKS = 100
+"""Number of replies in a row, each complete and none too early, after which `DescriptorPort.ask` no longer looks for
+pending input in advance: on such a line, input that was pending shows because it arrives too early.
+"""
+
+_ALWAYS = 1 << 62
+"""As `_LOOKS`, for a line whose replies arrive earlier than its baud rate allows, such as a pty."""
+
+_EARLY_BITS = 9.0
+"""Bits of the ten per byte; a reply counts as early if it arrives before the request can have been transmitted at this
+number. The difference allows for baud rates that deviate.
+"""
+
 _WRITE_PATIENCE_S = 0.1
 """How long a device may refuse to accept bytes before it counts as lost [s]."""
 
@@ -183,6 +196,8 @@ class DescriptorPort(Port):
         poll = select.poll()
         poll.register(self._descriptor, select.POLLIN)
         self._wait_ms = poll.poll
+        self._looks = _LOOKS
+        """Number of requests before which `ask` still looks for pending input."""
 
     def write(self, data: bytes) -> None:
         try:
@@ -202,26 +217,52 @@ class DescriptorPort(Port):
 
     def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
         # One Python frame for the whole transaction, and three system calls in the normal case: after a wait of a
-        # millisecond the caches are cold, and every further call costs a microsecond.
+        # millisecond the caches are cold, and every further call costs several microseconds.
         try:
-            if self._wait_ms(0):
+            looks = self._looks
+            if looks and self._wait_ms(0):
                 self.put_aside()
+                looks = max(looks, _LOOKS)
             written = os.write(self._descriptor, data)
             if written < len(data):
                 self._write_rest(data[written:])
+            received = b""
             if self._wait_ms(int(timeout * 1e3)):
+                early_until = start + _EARLY_BITS * len(data) / self.baud
+                if time.perf_counter() < early_until:
+                    if not looks:
+                        return self._ask_behind_pending(count, early_until, start + timeout)
+                    looks = _ALWAYS
                 received = os.read(self._descriptor, count)
                 if len(received) == count:
+                    if looks:
+                        self._looks = looks - 1
                     return received
                 self._check_alive(received)
-            else:
-                received = b""
-            return self._read_on(received, count, start + timeout)
+            return self._ask_on(received, count, start + timeout, looks)
         except BlockingIOError:
             self._write_rest(data)
             return self.read(count, timeout)
         except OSError as error:
             raise self._lost(error) from error
+
+    def _ask_on(self, received: bytes, count: int, deadline: float, looks: int) -> bytes:
+        """Return the whole of a reply of which only a part, or nothing yet, was received within whole milliseconds."""
+        received = self._read_on(received, count, deadline)
+        self._looks = max(0, looks - 1) if len(received) == count else max(looks, _LOOKS)
+        return received
+
+    def _ask_behind_pending(self, count: int, early_until: float, deadline: float) -> bytes:
+        """Keep apart what arrives before the request can have been transmitted, then read the reply as `ask` does."""
+        self._looks = _LOOKS
+        while select.select([self._descriptor], [], [], max(0.0, deadline - time.perf_counter()))[0]:
+            is_early = time.perf_counter() < early_until
+            received = os.read(self._descriptor, count)
+            self._check_alive(received)
+            if not is_early:
+                return self._read_on(received, count, deadline)
+            self.overheard += received
+        return b""
 
     def put_aside(self) -> None:
         self.overheard = os.read(self._descriptor, _MOST_OVERHEARD)

@@ -80,7 +80,8 @@ class ReadBack:
         """Duration of the longest recent read-back [s]; decays from one read-back to the next."""
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
         self._modes = tuple(modes)
-        self._is_of_modes = True
+        self.is_of_modes = True
+        """Whether the next read-back is of the operating modes, instead of the goals."""
         self._modes_due = -math.inf
         self._goals_since = 0
         self._draw = Random(1)
@@ -95,14 +96,14 @@ class ReadBack:
     @property
     def read(self) -> GroupRead:
         """The group read to send next: that of the goals or that of the operating modes."""
-        return self.reads[self._is_of_modes]
+        return self.reads[self.is_of_modes]
 
     def took(self, seconds: float) -> None:
         self.longest = max(_FADES * self.longest, seconds)
 
     def look(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float) -> Overruled | None:
         """Compare the answers with what was written; return what only another master can have written."""
-        of_modes = self._is_of_modes
+        of_modes = self.is_of_modes
         is_nearly_sure = False
         for place, value in self._foreign(servos, sent):
             seen = (self._modes_sighted if of_modes else self._goals_sighted)[place]
@@ -126,22 +127,22 @@ class ReadBack:
 
     def _choose_next(self, now: float) -> None:
         """Choose what to read next; a change of mode resets the goal, so a foreign goal may be its first sign."""
-        if self._is_of_modes:
+        if self.is_of_modes:
             self._modes_due, self._goals_since = now + _MODES_S * (0.5 + self._draw.random()), 0
         else:
             self._goals_since += 1
         enough = _GOALS_PER_MODE_IN_DOUBT if now < self.doubts_until else 1
-        self._is_of_modes = now >= self._modes_due and self._goals_since >= enough
+        self.is_of_modes = now >= self._modes_due and self._goals_since >= enough
 
     def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
         """Place and value of each servo that holds a value that this program did not write."""
-        expected = self._modes if self._is_of_modes else sent[-1]
-        self.is_unexpected = any(
-            answer is not None and answer[-1] != value for answer, value in zip(servos, expected, strict=True)
-        )
+        self.is_unexpected = False
+        for answer, value in zip(servos, self._modes if self.is_of_modes else sent[-1], strict=True):
+            if answer is not None and answer[-1] != value:
+                self.is_unexpected = True
         if not self.is_unexpected:
             return []
-        if self._is_of_modes:
+        if self.is_of_modes:
             return [
                 (place, answer[-1])
                 for place, (answer, mode) in enumerate(zip(servos, self._modes, strict=True))

@@ -28,7 +28,7 @@ from hil.drivers.packet import (
     crc,
     encode_status,
 )
-from hil.fakes.bus.sync_reads import SPAN, Reply, StateReads
+from hil.fakes.bus.sync_reads import GroupReads, Reply
 from hil.fakes.servo.backup import RESET_ALL
 from hil.fakes.servo.servo import EmulatedServo
 
@@ -83,7 +83,7 @@ class Instructions:
         self._by_id: dict[int, tuple[EmulatedServo, ...]] = {}
         self._shadows: dict[int, tuple[EmulatedServo, ...]] = {}
         self._writers: dict[int, tuple[EmulatedServo, ...]] = {}
-        self._state_reads = StateReads(self._servos, line)
+        self._group_reads = GroupReads(self._servos, line)
         self._broadcast: dict[int, Callable[[bytes, float], None]] = {
             Instruction.PING: self._broadcast_ping,
             Instruction.SYNC_READ: self._sync_read,
@@ -98,7 +98,7 @@ class Instructions:
     def route(self) -> None:
         """Update the mapping from IDs to the servos that listen to them."""
         self._by_id, self._shadows, self._writers = {}, {}, {}
-        self._state_reads.forget()
+        self._group_reads.forget()
         for servo in self._servos:
             self._by_id[servo.id] = (*self._by_id.get(servo.id, ()), servo)
             if servo.shadow_id is not None:
@@ -223,8 +223,7 @@ class Instructions:
     def _sync_read(self, body: bytes, now: float) -> None:
         if len(body) < 4:
             return
-        usual = body.startswith(SPAN) and not self._line.servos_refuse
-        if usual and (replies := self._state_reads.sync_read(body, self._by_id, now)):
+        if not self._line.servos_refuse and (replies := self._group_reads.sync_read(body, self._by_id, now)):
             self._line.send(replies, now)
             return
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8
@@ -233,8 +232,7 @@ class Instructions:
     def _fast_sync_read(self, body: bytes, now: float) -> None:
         if len(body) < 5:
             return
-        usual = body.startswith(SPAN) and not self._line.servos_refuse
-        if usual and (replies := self._state_reads.fast_sync_read(body, self._by_id, now)):
+        if not self._line.servos_refuse and (replies := self._group_reads.fast_sync_read(body, self._by_id, now)):
             self._line.send(replies, now)
             return
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8

@@ -30,7 +30,11 @@ class Memory:
 
     def get(self, name: str, otherwise: int = 0) -> int:
         """Return the register's content, or `otherwise` if the model has no such register."""
-        return self.value(name) if name in self.registers else otherwise
+        register = self.registers.get(name)
+        if register is None:
+            return otherwise
+        raw = self.data[register.address : register.address + register.size]
+        return int.from_bytes(raw, "little", signed=register.signed)
 
     def set(self, name: str, value: int) -> None:
         """Store a value; do nothing if the model has no such register."""

@@ -2,6 +2,9 @@
 
 import os
 import time
+import tty
+from collections.abc import Iterator
+from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
@@ -81,3 +84,110 @@ def test_a_handler_that_returns_early_is_read_on_until_time_is_up() -> None:
     opened = SimpleNamespace(timeout=None, clock=clock, read=lambda _: parts.pop(0))
     assert Port("early://", 1_000_000, opened).read(4, 0.01) == b"abcd" and parts == [b""]
     assert Port("early://", 1_000_000, opened).read(4, 0.01) == b""
+
+
+class Line:
+    """A device with a scripted servo behind it, in a time of its own."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, is_wired: bool) -> None:
+        self.now, self.is_wired, self.answers = 100.0, is_wired, True
+        self.looks = 0
+        self._far, near = os.openpty()
+        tty.setraw(near)
+        os.set_blocking(self._far, False)
+        self._near = near
+        self.port = open_port(os.ttyname(near), 1_000_000)
+        self._ready = self.port._wait_ms  # type: ignore[attr-defined]
+        self.port._wait_ms = self.wait  # type: ignore[attr-defined]
+        monkeypatch.setattr("hil.drivers.port.time", SimpleNamespace(perf_counter=lambda: self.now))
+        monkeypatch.setattr("hil.drivers.port.select", SimpleNamespace(select=self.select))
+
+    def wait(self, milliseconds: int) -> object:
+        """What the port's poll returns; a servo answers while the port waits."""
+        if milliseconds == 0:
+            self.looks += 1
+        elif not self._ready(0):
+            self._answer()
+        return self._ready(0)
+
+    def select(self, *_: object) -> tuple[list[int], list[int], list[int]]:
+        if not self._ready(0):
+            self._answer()
+        return [self._near] if self._ready(0) else [], [], []
+
+    def _answer(self) -> None:
+        self.now += 1e-3 if self.is_wired else 1e-5
+        with suppress(BlockingIOError):
+            request = os.read(self._far, 64)
+            if self.answers:
+                self.send(request[:1] + b"-right")
+
+    def send(self, data: bytes) -> None:
+        os.write(self._far, data)
+
+    def ask(self, letter: bytes) -> bytes:
+        return self.port.ask(letter * 30, 7, 0.05, self.now)
+
+    def settle(self) -> None:
+        for _ in range(150):
+            assert self.ask(b"a") == b"a-right"
+
+    def close(self) -> None:
+        self.port.close()
+        os.close(self._near)
+        os.close(self._far)
+
+
+@pytest.fixture
+def wired(monkeypatch: pytest.MonkeyPatch) -> Iterator[Line]:
+    line = Line(monkeypatch, is_wired=True)
+    yield line
+    line.close()
+
+
+def test_pending_input_is_looked_for_only_until_the_line_has_proved_itself(wired: Line) -> None:
+    wired.settle()
+    looks = wired.looks
+    assert 0 < looks < 150
+    assert wired.ask(b"b") == b"b-right" and wired.looks == looks
+
+
+@pytest.mark.parametrize("pending", [b"a-right", b"a-ri", b"another-master's"])
+def test_pending_input_is_never_taken_for_the_reply(wired: Line, pending: bytes) -> None:
+    for line_has_proved_itself in (False, True):
+        if line_has_proved_itself:
+            wired.settle()
+        wired.send(pending)
+        assert wired.ask(b"b") == b"b-right"
+        assert wired.port.overheard == pending
+        wired.port.overheard = b""
+
+
+def test_pending_input_before_a_lost_reply_is_no_reply_either(wired: Line) -> None:
+    wired.settle()
+    wired.send(b"a-right")
+    wired.answers = False
+    assert wired.ask(b"b") == b""
+
+
+@pytest.mark.parametrize("event", ["pending", "lost"])
+def test_after_pending_input_or_a_lost_reply_the_port_looks_again(wired: Line, event: str) -> None:
+    wired.settle()
+    if event == "pending":
+        wired.send(b"a-right")
+    wired.answers = event != "lost"
+    wired.ask(b"b")
+    looks, wired.answers = wired.looks, True
+    wired.ask(b"c")
+    assert wired.looks == looks + 1
+
+
+def test_a_line_that_answers_sooner_than_its_baud_rate_allows_is_always_looked_at(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    line = Line(monkeypatch, is_wired=False)
+    line.settle()
+    assert line.looks == 150
+    line.send(b"a-right")
+    assert line.ask(b"b") == b"b-right" and line.port.overheard == b"a-right"
+    line.close()
