@@ -42,6 +42,8 @@ class AmplitudeOptions:
     damping: float = 0.85
     """Factor by which the exponent of the corrections decreases from one iteration to the next."""
     min_exponent: float = 0.4
+    least_change: float = 0.005
+    """Relative change of the torque below which another iteration is not worth its simulations."""
     polishing_ratio: float = 1.06
     """Ratio by which one of the final increases raises a joint's torque."""
     back_off: float = 0.93
@@ -136,24 +138,31 @@ def _search(
         prediction = predict(config, scaled(config, first, tried), ensemble, pose=pose, briefly=True, executor=executor)
         return _reached(config, prediction, share)
 
-    best, used = options.initial_safe_share * torque, 0.0
+    best, there, used = options.initial_safe_share * torque, None, 0.0
     torque = np.minimum(torque, most)
     exponent = 1.0
     for _ in range(options.max_rounds):
         reached = reached_with(torque)
         if reached.max() <= 1.0 and reached.min() > used:
-            best, used = torque, float(reached.min())
+            best, there, used = torque, reached, float(reached.min())
         if reached.max() <= 1.0 and ((reached >= options.close) | (torque >= AT_MOST * most)).all():
             break
         wanted = np.where(reached > 1.0, options.over, options.under) / np.clip(reached, 1e-3, 1e3)
+        former = torque
         torque = np.minimum(torque * np.clip(wanted**exponent, 1 / options.max_ratio, options.max_ratio), most)
+        if (np.abs(torque - former) <= options.least_change * former).all():
+            break
         exponent = max(options.min_exponent, options.damping * exponent)
-    return _polished(reached_with, best, most, options)
+    return _polished(reached_with, best, reached_with(best) if there is None else there, most, options)
 
 
-def _polished(reached_with: Callable[[Array], Array], torque: Array, most: Array, options: AmplitudeOptions) -> Array:
-    """Raise the joint that uses the least of its limits in small steps while all joints stay within their limits."""
-    reached = reached_with(torque)
+def _polished(
+    reached_with: Callable[[Array], Array], torque: Array, reached: Array, most: Array, options: AmplitudeOptions
+) -> Array:
+    """Raise the joint that uses the least of its limits in small steps while all joints stay within their limits.
+
+    reached: fraction of the allowed range that each joint uses with `torque`.
+    """
     blocked = np.zeros(torque.size, dtype=bool)
     for _ in range(options.max_polishing_rounds):
         blocked |= (reached >= options.close) | (torque >= AT_MOST * most)

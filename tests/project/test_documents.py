@@ -17,6 +17,10 @@ from tests.support.paths import ROOT
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 RUN_HERE = [path for path in DOCUMENTS if path.name != "first_evening.md"]
 """tests/project/test_first_evening.py types that page."""
+RUN_BY_OTHERS = {
+    "hil identify configs/fake_open_manipulator_x.toml": "tests/hil/estimation/test_chain_run.py",
+}
+"""Commands of a quarter of a minute that other tests run on the same file."""
 SHORT = (("period = 10.0 ", "period = 5.0 "), ("band = [0.1, 5.0]", "band = [0.2, 5.0]"))
 
 RUN_ELSEWHERE = {
@@ -99,7 +103,9 @@ def test_commands_run(document: Path, place: Path, capsys: pytest.CaptureFixture
         Path("first_run").symlink_to("runs/finished")
     for command in commands(document):
         words = as_here(command)
-        if words[0] == "hil" and words[1] != "fake":
+        if command in RUN_BY_OTHERS:
+            assert Path(words[2]).stem in (ROOT / RUN_BY_OTHERS[command]).read_text(encoding="utf-8")
+        elif words[0] == "hil" and words[1] != "fake":
             sys.argv = words
             with pytest.raises(SystemExit) as caught:
                 main()
