@@ -7,15 +7,16 @@ __all__ = ["rest_pose_hint", "within_limits"]
 
 
 def within_limits(position: float, limits: Sequence[float]) -> float:
-    """Return the angle within the position limits that is a whole number of turns from `position`, if there is one.
+    """Return `position` if it is within the limits, otherwise the angle whole turns away nearest to their middle.
 
-    An encoder only measures the angle within one turn. `position` assumes the turn closest to the rest pose, but a
-    joint that fell must be at an angle that it can reach. All angles are in rad; `position` is returned unchanged if it
-    is within the limits or no other turn is.
+    An encoder only measures the angle within one turn, and a servo does not count turns while it is off. `position`
+    assumes the turn closest to the rest pose or to zero, but the joint must be at an angle that it can reach. If no
+    turn is within the limits, the result is the one that is least beyond them. All angles are in rad.
     """
     low, high = limits
-    inside = [each for turn in (0, -1, 1) if low <= (each := position + turn * math.tau) <= high]
-    return inside[0] if inside else position
+    if low <= position <= high:
+        return position
+    return position - math.tau * round((position - 0.5 * (low + high)) / math.tau)
 
 
 def rest_pose_hint(position: float, rest: float, tolerance: float, zero_ticks: int) -> str:

@@ -21,7 +21,7 @@ SILENCE, GARBLED, LATE, CABLE, TORQUE, REBOOT = "silence", "garbled", "late", "c
 HEAT, OVERLOAD, VOLTAGE, STUCK, ENCODER = "heat", "overload", "voltage", "stuck", "encoder"
 LIMIT, SIGN, PROGRAM, SIGNAL, MODEL, POSE = "limit", "sign", "program", "signal", "model", "pose"
 REFUSED, STRANGER, DISK, MIXED = "refused", "stranger", "disk", "mixed"
-HAND, REPEATED = "hand", "repeated"
+HAND, REPEATED, SETTING = "hand", "repeated", "setting"
 
 WORDS = {
     SILENCE: r"heard nothing|received nothing|no (reply|answer)|not (yet )?answer|silent|miss(ed|ing|es) (\d+ )?repl"
@@ -47,6 +47,7 @@ WORDS = {
     STRANGER: r"another (program|master)|Drive Mode is|somebody else|not asked for|collision|other master",
     MIXED: r"another servo's|mixed up|swapped|ID has changed|same ID|was not addressed:",
     REPEATED: r"repeated|too late or twice",
+    SETTING: r"changed the settings.{0,80}(Homing Offset|Return Delay Time) is",
     HAND: r"pushes or holds|hit it|slips",
     DISK: r"\bdisk\b|no space|File too large|cannot be written",
     POSE: r"rest[_ ]pose|before the start|starts? (from|at)",
@@ -96,7 +97,7 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.WATCHDOG_OFF: frozenset({TORQUE, STRANGER}),
     Kind.WATCHDOG_LONG: frozenset({TORQUE, STRANGER}),
     Kind.TURNED_ROUND: _FORGED | {LIMIT, POSE, REFUSED, STRANGER},
-    Kind.SLOW_REPLIES: _SLOW | _BYTES,
+    Kind.SLOW_REPLIES: _SLOW | _BYTES | {SETTING},
     Kind.NEW_ID: frozenset({SILENCE}),
     Kind.NEW_BAUD: frozenset({SILENCE}),
     Kind.CLOCK_RATE: frozenset({LATE}),
@@ -121,7 +122,7 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.FACTORY_RESET: frozenset({SILENCE, REBOOT, TORQUE}),
     Kind.SHADOWED: _OTHER_GOALS,
     Kind.THROTTLED: _BY_MOTOR,
-    Kind.HOMING_MOVED: _FORGED | {LIMIT, POSE},
+    Kind.HOMING_MOVED: _FORGED | {LIMIT, POSE, SETTING},
     Kind.SLIP: _BY_HAND,
     Kind.OBSTACLE: _BY_HAND,
     Kind.SNAG: _BY_HAND,

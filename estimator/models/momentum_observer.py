@@ -73,7 +73,7 @@ _PENDING = _COVARIANCE + _COUNT
 # possible alarm, missing torque; then the time since the last parameter update and since the start.
 _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
 # Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration.
-_TAUGHT, _TEACHES = 0, 2
+_TAUGHT, _TEACHES, _SQUARE = 0, 2, 4
 # The constants: joints, interval, floors; from 4 drifts; then two least noises, the highest floors and their friction.
 _HIGHEST = 4 + _COUNT + 2
 
@@ -213,6 +213,7 @@ def _learn(m: Any, gain: Any, lacking: float, spread: float) -> None:
 def _static_friction(m: Any, rest: Any, j: int) -> float:
     """Return the torque that dry friction may hold at standstill [N m]."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
+    dry += 0.5 * max(m[_THETA, 6 + j], 0.0) * math.sqrt(m[_PENDING, _SQUARE + j])
     return float(max(_STATIC * dry, _withstood(rest)))
 
 
@@ -333,7 +334,10 @@ def _observe_loop(
         lacking, left_open = _lacks(m, j, row, gain)
         single[_LACKING + j] = lacking
         stands = min(max(single[_STANDS + j], 0.0), 1.0)
-        holds, rounding = stands * _static_friction(m, rests[j], j), _of_rounding(m, j, slope, math.cos(q2))
+        v = v1 if j == 0 else v2
+        m[_PENDING, _SQUARE + j] += min(dt / _NOISE_S, 1.0) * (v * v - m[_PENDING, _SQUARE + j])
+        may = stands
+        holds, rounding = may * _static_friction(m, rests[j], j), _of_rounding(m, j, slope, math.cos(q2))
         quiet = 1.0 - (1.0 - _STANDING_NOISE) * stands
         noise, floor = quiet * quiet * single[_NOISE + j], _floor(m, k, j)
         spread = left_open + rounding + noise

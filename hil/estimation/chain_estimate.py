@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hil.config.chain import described_arm, doubted_inertias
 from hil.config.schema import Config
 from hil.errors import RecordingCutShort
+from hil.estimation.drive.currents import settled_current_findings
 from hil.estimation.model_from_config import voltage_driven
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
 from hil.estimation.result_checks import describe_chain_choice
@@ -66,6 +67,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     held_out = played[HELD_OUT].relative_error if HELD_OUT in played else None
     seconds = round(time.perf_counter() - started, 3)
     linear = len(model.linear_names)
+    currents = settled_current_findings(config, samples)
     truth, extra = true_chain_parameters(config, known), _quantities(estimate, linear, len(estimate.names))
     result = SettledResult(
         method="settled period, least squares on Fourier lines, then maximum likelihood of each position by "
@@ -94,10 +96,14 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
             known,
             beyond,
             unmoved(config, period.position),
-            jump_disturbances(config, facts, samples),
+            (*jump_disturbances(config, facts, samples), *currents.disturbances),
         ),
         model_choice=None if choice is None else describe_chain_choice(choice),
-        warnings=(*warnings_of(config, facts, samples, period), *doubted_inertias(described_arm(config))),
+        warnings=(
+            *currents.warnings,
+            *warnings_of(config, facts, samples, period),
+            *doubted_inertias(described_arm(config)),
+        ),
         timing=RunTiming.of(timing(samples, config.experiment.rate), seconds),
         arm=arm_facts(config),
         chain=_facts(config, estimate, known),

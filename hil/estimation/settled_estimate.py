@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.errors import RecordingCutShort
 from hil.estimation.chain_estimate import estimate_chain_run
-from hil.estimation.drive.currents import current_disturbances
+from hil.estimation.drive.currents import settled_current_findings
 from hil.estimation.drive.supply import supply_notes, supply_sag
 from hil.estimation.model_from_config import lever_of, voltage_driven, wanted_model
 from hil.estimation.physical import physical_of
@@ -72,7 +72,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     left_out = candidates(period, estimate, {})
     estimate = replace(estimate, covariance=_with_neglected(considered(period, estimate), estimate))
     drift = None if other is None or between is None else friction_change(other, estimate, between)
-    jumps = jump_disturbances(config, facts, samples)
+    jumps, currents = jump_disturbances(config, facts, samples), settled_current_findings(config, samples)
     torque = _torque_instead(other, estimate, drift)
     if jumps:
         drift = None  # what changed was not friction
@@ -96,7 +96,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
         left_out,
         drift,
         torque,
-        (*jumps, *current_disturbances(config, samples)),
+        (*jumps, *currents.disturbances),
         wrong,
         notes,
         tried_all=choice is not None,
@@ -107,7 +107,7 @@ def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledRes
     checks = Checks(
         describe_validation(validation, held_out, None if as_fitted is None else as_fitted.relative_error),
         describe_verdict(judged),
-        (*warnings_of(config, facts, samples, period), *cut_short),
+        (*currents.warnings, *warnings_of(config, facts, samples, period), *cut_short),
         None if choice is None else describe_choice(choice),
     )
     seconds = round(time.perf_counter() - started, 3)

@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
-from hil.estimation.drive.currents import current_warnings
 from hil.estimation.pilot_limit import torque_limit
 from hil.estimation.slips.position_jumps import jump_warnings
 from hil.estimator.data.settled_period import SettledPeriod
@@ -18,9 +17,8 @@ BY_LATENESS = 0.3  # of the lost samples: with at least this share of late ones,
 
 
 def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], period: SettledPeriod) -> list[str]:
-    """One sentence per warning."""
-    found = current_warnings(config, samples[samples["phase"] == Phase.PERIODIC])
-    found += jump_warnings(config, facts, samples)
+    """One sentence per warning; those about currents come from `settled_current_findings`."""
+    found = [*jump_warnings(config, facts, samples)]
     for index, joint in enumerate(config.joints):
         swing = float(np.nanmax(period.position[index]) - np.nanmin(period.position[index]))
         steps = swing / facts.position_step[index]

@@ -98,7 +98,7 @@ class Guard:
         self._errors = [0] * len(config.joints)
         """Errors reported in a row together with values, by joint."""
         self._any_errors = False
-        self._resting: tuple[float, ...] | None = None
+        self._resting: Sequence[float] | None = None
         self._shortest = float("inf")
         self._supply = [float("nan")] * len(config.joints)
         """Lowest measured supply voltage of each joint [V]; NaN before the first reading."""
@@ -198,6 +198,10 @@ class Guard:
             self._turns_the_wrong_way,
         )
         said[check](index, state)
+
+    def rests_at(self, positions: Sequence[float]) -> None:
+        """The joints' angles before torque was switched on [rad]; by default, those of the first sample."""
+        self._resting = positions
 
     def look_at_rest(self, state: State) -> None:
         """Raise SafetyStop when a joint moves before anything has been commanded."""

@@ -26,10 +26,10 @@ from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
-from hil.setup.changed_settings import EXPLAINED, Settings, changed_settings, settings_now
+from hil.setup.changed_settings import EXPLAINED, WRITTEN, Settings, changed_settings, settings_now
 from hil.setup.lying import from_where_it_lies, said_of_the_rest, tolerance_now, wait_for_rest
 from hil.setup.realtime import on_time
-from hil.setup.servo_session import REBOOT_S, has_moved, servo_session
+from hil.setup.servo_session import REBOOT_S, has_moved, servo_session, settings_at_start
 
 __all__ = ["run_experiment"]
 
@@ -123,14 +123,17 @@ def _play(
 ) -> None:
     """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event."""
     stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
-    settings = settings_now(bus)
+    settings: Settings = {}
     try:
         # In this order, because on_time takes longer than the watchdog's timeout.
-        with on_time(bus.port.clock) as granted, bus.torque(config.safety.watchdog):
-            if granted:
-                note("; ".join(map(str, granted)))
-            note(f"torque on, watchdog {config.safety.watchdog:g} s")
-            stream.run()
+        with on_time(bus.port.clock) as granted:
+            settings = _check_unchanged(bus)
+            stream.begins_at(bus.read_positions())
+            with bus.torque(config.safety.watchdog):
+                if granted:
+                    note("; ".join(map(str, granted)))
+                note(f"torque on, watchdog {config.safety.watchdog:g} s")
+                stream.run()
     except BaseException as error:
         _explain_alert(bus, stream.state, error)
         _explain_by_settings(bus, settings, error)
@@ -186,14 +189,23 @@ def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> 
         return
 
 
+def _check_unchanged(bus: ServoBus) -> Settings:
+    """Check that the servos' settings are those of the start, by which the arm's pose was judged; return them."""
+    before = {each: value for each, value in settings_at_start().items() if each[1] not in WRITTEN}
+    now = settings_now(bus)
+    if changed := changed_settings(before, now):
+        raise WrongSetting(f"{changed} Torque has not been switched on. End that program, then start again.")
+    return now
+
+
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException) -> None:
     """Name settings that another program changed; read only once torque is off, because reading takes time."""
     stop = error if isinstance(error, SafetyStop) else error.__context__
-    if isinstance(stop, SafetyStop) and stop.cause in EXPLAINED:
-        changed = changed_settings(before, settings_now(bus))
-        if changed:
-            stop.args = (f"{changed} Symptom: {stop}",)
-            stop.overruled = True
+    if not isinstance(stop, SafetyStop) or stop.cause not in EXPLAINED:
+        return
+    if changed := changed_settings(before, settings_now(bus), stop.cause):
+        stop.args = (f"{changed} Symptom: {stop}",)
+        stop.overruled = True
 
 
 @contextmanager

@@ -128,9 +128,15 @@ class Stream:
         self._takes = 0.0
         self._sent_at: float | None = None
         self._awake_at = float("-inf")
+        self._is_undriven = True
+        """Whether nothing has driven the arm yet, as until a stabiliser has seen it."""
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
         self._repetition = Repetition(longest, len(bus.joints), self._interval)
+
+    def begins_at(self, positions: Sequence[float]) -> None:
+        """Process the joints' angles just before torque is switched on [rad]: the first sample must show the same."""
+        self._guard.rests_at(positions)
 
     @property
     def state(self) -> State | None:
@@ -360,8 +366,9 @@ class Stream:
         if state.status is not None and self._guard.wants_status:
             self._bus.read_status_next()
         self._model.look(state)
-        if phase is Phase.REST and self._stabiliser is None:
+        if self._is_undriven and phase is Phase.REST:
             self._guard.look_at_rest(state)
+            self._is_undriven = self._stabiliser is None or any(state.missing)
 
     def _brake(self) -> None:
         """Brake until the arm is slow, a read fails, time is up, or a second signal arrives. Never raises."""

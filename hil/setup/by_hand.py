@@ -4,8 +4,7 @@ An identification cannot detect wrong IDs, directions, zeros and axes: a chain's
 geometry, they become wrong. A person notices at once.
 """
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +16,7 @@ from hil.config.schema import Config
 from hil.description.motion import end_point, moves
 from hil.drivers.clock import Clock
 from hil.drivers.joint import Joint
+from hil.rest_pose_hint import within_limits
 
 MOVED = 0.15  # rad: a joint that has been moved by hand
 STILL = 0.02  # rad in STILL_S: a joint that is held still
@@ -59,17 +59,9 @@ def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
     Whole turns, which a servo does not count while it is off, are taken off where a joint's position limits tell them.
     """
     limits = [joint.position_limit for joint in config.joints]
-    angles = tuple(_within_turns(*each) for each in zip(angles, limits, strict=True))
+    angles = tuple(within_limits(*each) for each in zip(angles, limits, strict=True))
     x, y, z = end_point(described_arm(config), np.array(angles)).tolist()
     return Pose(angles, (x, y, z))
-
-
-def _within_turns(angle: float, limits: Sequence[float]) -> float:
-    """`angle` if it is within the limits, otherwise the angle a whole number of turns away nearest to their middle."""
-    low, high = limits
-    if low <= angle <= high:
-        return angle
-    return angle - math.tau * round((angle - 0.5 * (low + high)) / math.tau)
 
 
 def guided(

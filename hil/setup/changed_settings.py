@@ -6,13 +6,21 @@ from contextlib import suppress
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
+from hil.drivers.servo_model import RETURN_DELAY_UNIT
 from hil.errors import Cause
 
-__all__ = ["EXPLAINED", "Settings", "changed_settings", "settings_now"]
+__all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "settings_now"]
 
-_REGISTERS = ("Operating Mode", "Drive Mode", "Homing Offset")
+_DELAY = "Return Delay Time"
+_REGISTERS = ("Operating Mode", "Drive Mode", "Homing Offset", _DELAY)
 
-EXPLAINED = frozenset(
+WRITTEN = frozenset({"Operating Mode"})
+"""Those that this program writes itself."""
+
+_LATE = frozenset({Cause.LATE, Cause.MISSING})
+"""Causes of a stop that a longer Return Delay Time can explain."""
+
+_MOVED = frozenset(
     {
         Cause.POSITION,
         Cause.VELOCITY,
@@ -27,29 +35,47 @@ EXPLAINED = frozenset(
         Cause.EARLY_MOTION,
     }
 )
-"""Causes of a stop that such a change can explain."""
+"""Causes of a stop that a change of the other settings can explain."""
+
+EXPLAINED = _MOVED | _LATE
 
 Settings = Mapping[tuple[Joint, str], int]
 
 
 def settings_now(bus: ServoBus) -> Settings:
-    """Read the settings that determine how servos move and what they report; servos that do not answer are left out."""
-    found = {}
+    """Read the settings that determine how servos move and what they report.
+
+    Servos that do not answer are left out. Each register is read twice, in opposite orders, because a reply may belong
+    to an earlier request: where the two differ, the value is unknown and left out.
+    """
+    found: dict[tuple[Joint, str], int] = {}
     for joint, servo in bus.drives.items():
+        known = [register for register in _REGISTERS if register in servo.table]
         with suppress(DriverError):
-            for register in _REGISTERS:
-                if register in servo.table:
-                    found[joint, register] = servo.read(register, attempts=1)
+            first = {register: servo.read(register, attempts=1) for register in known}
+            again = {register: servo.read(register, attempts=1) for register in reversed(known)}
+            found |= {(joint, register): first[register] for register in known if first[register] == again[register]}
     return found
 
 
-def changed_settings(before: Settings, after: Settings) -> str:
-    """One sentence about the settings that differ; "" if there are none."""
+def changed_settings(before: Settings, after: Settings, cause: Cause | None = None) -> str:
+    """One sentence about the settings that differ; "" if there are none.
+
+    cause: that of a stop, by which settings that cannot explain it are left out.
+    """
     changed = [
-        f"{joint}: {register} is {after[joint, register]} and was {value}"
+        f"{joint}: {register} is {_told(register, after[joint, register])} and was {_told(register, value)}"
         for (joint, register), value in before.items()
-        if after.get((joint, register), value) != value
+        if after.get((joint, register), value) != value and _may_explain(register, cause)
     ]
     if not changed:
         return ""
     return f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."
+
+
+def _may_explain(register: str, cause: Cause | None) -> bool:
+    return cause is None or cause in (_LATE if register == _DELAY else _MOVED)
+
+
+def _told(register: str, value: int) -> str:
+    return f"{1e6 * RETURN_DELAY_UNIT * value:.0f} us" if register == _DELAY else str(value)

@@ -23,11 +23,22 @@ from hil.drivers.servo_model import Mode
 from hil.drivers.torque_off import and_list, by_reason, signals_held_back
 from hil.errors import RunFolderError, StopRequested
 from hil.setup import settings_file
+from hil.setup.changed_settings import Settings, settings_now
 from hil.setup.current_limit import current_limit_ticks
 from hil.setup.others import others_on_the_bus
 from hil.setup.settings_file import Kept
 
-__all__ = ["SETTINGS_NAME", "Say", "ServoSession", "has_moved", "left_behind", "recover", "servo_session", "to_stderr"]
+__all__ = [
+    "SETTINGS_NAME",
+    "Say",
+    "ServoSession",
+    "has_moved",
+    "left_behind",
+    "recover",
+    "servo_session",
+    "settings_at_start",
+    "to_stderr",
+]
 
 Say = Callable[[str], None]
 
@@ -61,6 +72,8 @@ class ServoSession:
     _kept: dict[Joint, Kept] = field(default_factory=dict)
     _delays: dict[Joint, int] = field(default_factory=dict)
     """Return Delay Time of each servo at the beginning [2 us]."""
+    settings: Settings = field(default_factory=dict)
+    """What `settings_now` found at the beginning."""
     shared: int = 0
     """Number of inner blocks that have used the bus."""
     was_stopped: bool = False
@@ -95,6 +108,7 @@ class ServoSession:
                 share = described[joint].goal_limit / len(described[joint].ids)
                 changed["Current Limit"] = current_limit_ticks(joint, share)
             self._keep(joint, settings, changed)
+        self.settings = settings_now(bus)
         if folder is not None:
             copies = {str(joint.id): kept.settings for joint, kept in self._kept.items()}
             settings_file.write_durably(folder / SETTINGS_NAME, {"port": bus.port.url, "servos": copies})
@@ -258,6 +272,12 @@ def has_moved() -> bool:
     """Whether an earlier run of this session may have left the arm away from its rest pose, held by friction."""
     outer = _outermost.get()
     return outer is not None and outer.shared > 1
+
+
+def settings_at_start() -> Settings:
+    """The servos' settings at the beginning of this session (`changed_settings.settings_now`)."""
+    outer = _outermost.get()
+    return {} if outer is None else outer.settings
 
 
 def left_behind(port: str, joint: Joint) -> Kept | None:

@@ -20,5 +20,6 @@ def test_otherwise_the_arm_is_moved_first_and_the_zero_set_only_at_rest() -> Non
 def test_a_joint_that_fell_is_shown_where_it_can_be() -> None:
     """The angle closest to the rest pose (-0.9 rad) would be -3.68 rad, far outside the limits."""
     assert within_limits(2.6 - math.tau, (-1.0, 2.8)) == pytest.approx(2.6)
-    assert within_limits(-3.68, (-1.0, 1.0)) == -3.68  # nowhere within them
+    assert within_limits(2.6 - 3 * math.tau, (-1.0, 2.8)) == pytest.approx(2.6), "any number of turns"
+    assert within_limits(-3.68, (-1.0, 1.0)) == pytest.approx(math.tau - 3.68), "none is within: the nearest"
     assert within_limits(0.5, (-7.0, 7.0)) == 0.5

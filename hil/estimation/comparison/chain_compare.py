@@ -10,7 +10,6 @@ from hil.config.schema import Config
 from hil.errors import ConfigError
 from hil.estimation.chain_estimate import true_chain_parameters, wanted_chain_model
 from hil.estimation.settled_period import settled_period
-from hil.estimation.truth import in_file_unit
 from hil.estimator.baselines.compare import Peer, joined
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.fit.regression import fit_filtered
@@ -54,11 +53,6 @@ def compare_chain(run: RunFolder, mujoco: bool) -> tuple[Mapping[str, float] | N
     judge = Judge(wanted_chain_model(config, known), held_out)
     peers = {peer.name: peer for peer in _methods(config, period, judge)}
     return true_chain_parameters(config, known), peers, judge
-
-
-def truth_for(peer: Peer, truth: Mapping[str, float] | None, config: Config) -> Mapping[str, float] | None:
-    """The truth in the unit of torque of a method's result, as for `hil identify`."""
-    return None if truth is None else in_file_unit(truth, config, peer.parameters, len(config.joints)).values
 
 
 class Judge:

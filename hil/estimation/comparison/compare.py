@@ -8,10 +8,10 @@ import numpy as np
 
 from hil.config.schema import Config
 from hil.errors import ConfigError
-from hil.estimation.comparison.chain_compare import compare_chain, truth_for, worst_chain_error
+from hil.estimation.comparison.chain_compare import compare_chain, worst_chain_error
 from hil.estimation.model_from_config import voltage_driven, wanted_model
 from hil.estimation.settled_period import settled_period
-from hil.estimation.truth import true_parameters
+from hil.estimation.truth import in_file_unit, true_parameters
 from hil.estimator.baselines.compare import Peer, compare_peers
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import EstimationError
@@ -71,8 +71,9 @@ def compare_run(run: RunFolder, mujoco: bool, seed: int = 1) -> Comparison:
     period = settled_period(config, facts, samples, IDENTIFY)
     held_out = settled_period(config, facts, samples, HELD_OUT) if HELD_OUT in facts.segments else None
     truth = true_parameters(config)
-    methods = {peer.name: judged(peer, truth, held_out) for peer in all_methods(config, period, truth, mujoco, seed)}
-    compared = Comparison(SCHEMA, facts.config, truth, methods)
+    peers = {peer.name: peer for peer in all_methods(config, period, truth, mujoco, seed)}
+    methods = {name: judged(peer, truth_for(peer, truth, config), held_out) for name, peer in peers.items()}
+    compared = Comparison(SCHEMA, facts.config, truth_for(peers[OURS], truth, config), methods)
     write_json(run.path / "compare.json", to_json(compared))
     return compared
 
@@ -84,9 +85,14 @@ def _compare_chain(run: RunFolder, config: str, mujoco: bool) -> Comparison:
         truth = truth_for(peer, true, shown)
         worst, error = (None, None) if not truth else worst_chain_error(peer.parameters, truth)
         methods[name] = _entry(peer, judge.error(peer.parameters), worst, error)
-    compared = Comparison(SCHEMA, config, truth_for(peers["hil"], true, shown), methods)
+    compared = Comparison(SCHEMA, config, truth_for(peers[OURS], true, shown), methods)
     write_json(run.path / "compare.json", to_json(compared))
     return compared
+
+
+def truth_for(peer: Peer, truth: Mapping[str, float] | None, config: Config) -> Mapping[str, float] | None:
+    """The truth in the unit of torque of a method's result, as for `hil identify`."""
+    return None if truth is None else in_file_unit(truth, config, peer.parameters, len(config.joints)).values
 
 
 def all_methods(
@@ -102,7 +108,8 @@ def all_methods(
 
         if length is None and period.joints == 2:
             raise ConfigError("mujoco.sysid needs the length of link 1: add length_1 under [known].")
-        centre = dict(truth) if truth else {name: ours.parameters[name] for name in ours.std if name in ours.parameters}
+        centre = {name: ours.parameters[name] for name in ours.std if name in ours.parameters}
+        centre |= truth_for(ours, truth, config) or {}
         yield _ours(period, OURS_PLAIN, Model(period.joints, "coulomb", "delay"))
         yield fit_with_mujoco(period, centre, length or 0.0, config.arm.gravity, seed)
 
@@ -118,7 +125,7 @@ def link_length(config: Config) -> float | None:
 
 def judged(peer: Peer, truth: Mapping[str, float] | None, held_out: SettledPeriod | None) -> MethodResult:
     """Evaluate one method for compare.json."""
-    name, worst = (None, None) if truth is None else worst_error(peer.parameters, truth)
+    name, worst = (None, None) if not truth else worst_error(peer.parameters, truth)
     return _entry(peer, None if held_out is None else _held_out(held_out, peer.parameters), name, worst)
 
 

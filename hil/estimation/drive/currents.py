@@ -5,6 +5,8 @@ another cause: goals were changed on the way or by another program, or the repor
 drove the arm is then not the one that the estimate is based on.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,26 +35,37 @@ _SMALL, _LEAST = 0.5, 0.1
 """Range of goals relative to the largest current that was carried, in which nothing clips."""
 
 
-def current_warnings(config: Config, samples: NDArray[np.void]) -> list[str]:
-    """Warn about joints whose current was not the commanded one."""
+@dataclass(frozen=True)
+class CurrentFindings:
+    """What is wrong with the currents of a recording.
+
+    warnings: one sentence per joint whose current was not the commanded one. disturbances: a sentence for the verdict
+    if a current was neither the commanded one nor merely clipped.
+    """
+
+    warnings: tuple[str, ...]
+    disturbances: tuple[str, ...]
+
+
+def current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindings:
+    """Compare the currents in `samples` with the commanded ones."""
     lower = "current_limit" if config.experiment.pilot else "peak_torque"
-    return [
-        said
-        for name, goal, measured in _currents(config, samples)
-        if (said := _other(name, goal, measured) or _clipped(name, goal, measured, lower))
-    ]
-
-
-def current_disturbances(config: Config, samples: NDArray[np.void]) -> tuple[str, ...]:
-    """A sentence for the verdict if a current was neither the commanded one nor merely clipped."""
-    played = samples[samples["phase"] == Phase.PERIODIC]
-    names = [name for name, goal, measured in _currents(config, played) if _other(name, goal, measured)]
-    if not names:
-        return ()
-    return (
+    warnings, names = [], []
+    for name, goal, measured in _currents(config, samples):
+        if said := _other(name, goal, measured):
+            names.append(name)
+        if said := said or _clipped(name, goal, measured, lower):
+            warnings.append(said)
+    disturbance = (
         f"The current of {' and '.join(names)} was not the commanded one (see the warning), so the values, above all "
-        "offsets and friction, may be off by more than their standard errors.",
+        "offsets and friction, may be off by more than their standard errors."
     )
+    return CurrentFindings(tuple(warnings), (disturbance,) if names else ())
+
+
+def settled_current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindings:
+    """The same for the periodic samples, which a settled estimate is based on."""
+    return current_findings(config, samples[samples["phase"] == Phase.PERIODIC])
 
 
 def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Array, Array]]:

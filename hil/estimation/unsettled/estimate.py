@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hil.config.chain import only_planar
 from hil.config.experiment import ModelConfig
 from hil.errors import ConfigError
-from hil.estimation.drive.currents import current_warnings
+from hil.estimation.drive.currents import current_findings
 from hil.estimation.model_from_config import wanted_model
 from hil.estimation.plausibility import torque_scale_std
 from hil.estimation.result_checks import describe_segment_choice, describe_verdict
@@ -78,7 +78,7 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
     given = Given(torque_scale_std(config), zeros=True)
     zeros, gravity = config.model.zeros, config.arm.gravity
     result = estimate_any([recording], config.model, 1.0, zeros, facts.config, gravity, given=given).result
-    result = replace(result, warnings=(*result.warnings, *current_warnings(config, samples)))
+    result = replace(result, warnings=(*result.warnings, *current_findings(config, samples).warnings))
     run.write_result(result)
     return result
 

@@ -1,6 +1,7 @@
 """A spatial arm from its TOML file to result, model and exports, on the fake bus."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ from hil.cli.views.result_table import print_result
 from hil.config.schema import Config, load_config, parse_config
 from hil.description.urdf import read_urdf
 from hil.errors import ConfigError
+from hil.estimation import chain_estimate
 from hil.estimation.calibrate import AddedMass, CalibrationFit, CalibrationResult, calibrate_runs, calibration_lines
 from hil.estimation.chain_estimate import _verdict, unmoved
 from hil.estimation.changes.diff import diff_runs
@@ -105,6 +107,21 @@ def test_with_identified_ratios_the_truth_scales_with_the_first_torque_constant_
     as_given, in_its_unit = in_std(1.0), in_std(1.02)
     for name in rows:
         assert in_its_unit[name] < 4.0 < as_given[name], name
+
+
+def test_a_current_that_is_not_the_commanded_one_lowers_the_verdict(
+    run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(run.path, tmp_path / "run")
+    samples = load_samples(run.samples_path, 4).copy()
+    samples["current"][::5, 1] = -0.8 * np.abs(samples["goal_current"][:, 1]).max()
+    monkeypatch.setattr(chain_estimate, "load_samples", lambda *_: samples)
+    found = estimate_run(RunFolder.open(tmp_path / "run"))
+    assert found.verdict.trust == "with care"
+    (said,) = [each for each in found.verdict.sentences if "was not the commanded one" in each]
+    assert said.startswith("The current of joint2 was not")
+    (warning,) = [each for each in found.warnings if "carried another current than commanded" in each]
+    assert warning.startswith("joint2 ")
 
 
 def test_a_joint_that_hardly_moves_is_named(run: RunFolder) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hil.config.schema import load_config
-from hil.estimation.drive.currents import current_disturbances, current_warnings
+from hil.estimation.drive.currents import current_findings, settled_current_findings
 from hil.runs.recording import Phase
 from tests.support.paths import CONFIGS
 
@@ -23,19 +23,20 @@ def recording(rate: float, share: float, limit: float = np.inf) -> np.ndarray:
 @pytest.mark.parametrize("rate", [100.0, 200.0, 400.0])
 def test_a_current_read_one_sample_later_is_not_clipped(rate: float) -> None:
     config = load_config(CONFIGS / "fake_two_link.toml")
-    assert current_warnings(config, recording(rate, 1.0)) == []
-    assert current_warnings(config, recording(rate, 0.9)) == []
+    assert current_findings(config, recording(rate, 1.0)).warnings == ()
+    assert current_findings(config, recording(rate, 0.9)).warnings == ()
 
 
 @pytest.mark.parametrize("samples", [recording(400.0, 1.0, limit=0.2), recording(400.0, 1.0, limit=0.45)])
 def test_a_clipped_current_is_named_for_each_joint(samples: np.ndarray) -> None:
     config = load_config(CONFIGS / "fake_two_link.toml")
-    said = current_warnings(config, samples)
+    found = settled_current_findings(config, samples)
+    said = found.warnings
     assert [each.split()[0] for each in said] == ["shoulder", "elbow"]
     assert all(
         "received less than" in each and "limit or, at speed, the supply voltage clips it" in each for each in said
     )
-    assert current_disturbances(config, samples) == ()
+    assert found.disturbances == ()
 
 
 def overwritten(every: int) -> np.ndarray:
@@ -48,8 +49,9 @@ def overwritten(every: int) -> np.ndarray:
 @pytest.mark.parametrize("samples", [recording(100.0, 0.7), recording(400.0, 0.6), overwritten(6), overwritten(9)])
 def test_a_current_that_is_another_one_is_not_said_to_be_clipped(samples: np.ndarray) -> None:
     config = load_config(CONFIGS / "fake_two_link.toml")
-    said = current_warnings(config, samples)
+    found = settled_current_findings(config, samples)
+    said = found.warnings
     assert len(said) == 2
     assert all("by another program, or its current sensor" in each and "supply" not in each for each in said)
-    (verdict,) = current_disturbances(config, samples)
+    (verdict,) = found.disturbances
     assert verdict.startswith("The current of shoulder and elbow was not the commanded one")

@@ -1,12 +1,14 @@
 """True values of a fake arm in the torque that the file's constants imply, which is what a result is in."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import pytest
 
 from hil.config.schema import Config
-from hil.estimation.comparison.chain_compare import truth_for
+from hil.estimation.comparison import compare
+from hil.estimation.comparison.compare import compare_run, truth_for
 from hil.estimation.truth import scaled, truth_of
 from hil.estimator.baselines.compare import Peer
 from hil.model_file import read_settled_result
@@ -74,6 +76,20 @@ def test_compare_judges_each_method_in_its_own_unit(result: SettledResult, ident
     with_ratio = dataclasses.replace(peer, parameters={**peer.parameters, "torque_scale_2": 1.06})
     every = truth_for(with_ratio, result.truth, config)
     assert every == pytest.approx({name: 1.06 * value for name, value in (result.truth or {}).items()})
+
+
+def test_compare_shows_a_planar_arms_truth_in_the_unit_of_the_file(
+    result: SettledResult, identified_once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(identified_once, tmp_path / "run")
+    run = RunFolder.open(tmp_path / "run")
+    config = stronger(run.load_config(), (1.06, 1.06))
+    monkeypatch.setattr(run, "load_config", lambda: config)
+    ours = Peer("hil", {name: 1.06 * value for name, value in (result.truth or {}).items()}, {}, 0.0, "", 1)
+    monkeypatch.setattr(compare, "all_methods", lambda *_: [ours])
+    found = compare_run(run, False)
+    assert found.truth == pytest.approx(ours.parameters)
+    assert found.methods["hil"].worst_relative_error == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_value_near_zero_does_not_head_the_relative_errors(identified_once: Path) -> None:

@@ -15,9 +15,9 @@ import serial
 
 from hil.config.schema import Config, parse_config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import TorqueNotOff, WrongModel
+from hil.drivers.errors import TorqueNotOff, WrongModel, WrongSetting
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
-from hil.experiment import work
+from hil.experiment import run, work
 from hil.experiment.model_watch import ModelWatch
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress
@@ -144,6 +144,53 @@ def test_settings_that_another_program_changed_are_the_cause_that_is_named(
     assert str(stop).startswith("Another program changed the settings of a servo during the run (joint 'elbow'")
     assert f"{register} is {value} and was 0" in str(stop) and "Symptom: " in str(stop)
     assert stop.overruled
+    assert_stopped(ports[0])
+
+
+def test_a_return_delay_that_another_program_raised_is_named_before_late_replies(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    def slow_down() -> None:
+        for servo in ports[0].bus.servos.values():
+            servo.memory.set("Return Delay Time", 254)
+            servo._derive()
+
+    config = arm(("rate = 400.0", "rate = 800.0"))
+    stop, _ = run_until_stopped(config, tmp_path / "run", once(slow_down), make_plan(config).first_segment())
+    assert re.match(r"Another program changed .*'elbow'.*Return Delay Time is 508 us and was 0 us\)\. Sym", str(stop))
+    assert "Operating Mode" not in str(stop) and stop.cause in (Cause.LATE, Cause.MISSING)
+    assert_stopped(ports[0])
+
+
+def test_settings_changed_before_torque_comes_on_are_refused(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def shift(*_: object) -> None:
+        ports[0].bus.servos[2].memory.set("Homing Offset", 30)  # 0.05 rad, within the tolerance of the rest pose
+
+    monkeypatch.setattr(run, "_write_facts", shift)
+    config = arm()
+    with pytest.raises(WrongSetting, match=r"'elbow'.*Homing Offset is 30 and was 0\)\. Torque has not been switched"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
+    assert_stopped(ports[0])
+
+
+@pytest.mark.parametrize("holds", [False, True], ids=["free", "with a stabiliser"])
+def test_an_arm_that_is_elsewhere_once_torque_is_on_has_moved_before_the_start(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch, holds: bool
+) -> None:
+    """With a stabiliser, the first sample must not differ: from the second one on, the arm is driven."""
+    torque = ServoBus._torque_on
+
+    def shift(bus: ServoBus, watchdog: float) -> None:
+        torque(bus, watchdog)
+        fault(ports, FaultKind.ENCODER_JUMP, servo=2, amount=60)
+
+    monkeypatch.setattr(ServoBus, "_torque_on", shift)
+    held = (("[experiment]\n", "[stabiliser]\nstiffness = [0.5, 0.2]\ndamping = [0.05, 0.02]\n\n[experiment]\n"),)
+    stop, samples = run_until_stopped(arm(*(held if holds else ())), tmp_path / "run", lambda _: None, plan)
+    assert stop.cause is Cause.EARLY_MOTION and "'elbow'" in str(stop) and "moves before the start: +0.09" in str(stop)
+    assert len(samples) <= 2 and not samples["goal_current"].any()
     assert_stopped(ports[0])
 
 
