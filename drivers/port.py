@@ -9,7 +9,7 @@ import os
 import select
 import termios
 import time
-from typing import Any, cast
+from typing import Any
 
 import serial
 
@@ -117,9 +117,10 @@ class Port:
             # Setting the timeout makes pyserial query the terminal settings, so it is set only when it changes.
             if self._timeout != timeout:
                 self._serial.timeout = self._timeout = timeout
-            return cast(bytes, self._serial.read(count))
+            received: bytes = self._serial.read(count)
         except _FAILURES as error:
             raise self._lost(error) from error
+        return received
 
     def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
         """Write, then read until `timeout` [s] after `start` [s, on the port's clock], as the control cycle does.
@@ -135,7 +136,7 @@ class Port:
     def put_aside(self) -> None:
         """Move bytes that were received but not read to `overheard`."""
         try:
-            self.overheard = cast(bytes, self._serial.read(self._serial.in_waiting))
+            self.overheard = self._serial.read(self._serial.in_waiting)
         except _FAILURES as error:
             raise self._lost(error) from error
 
