@@ -8,6 +8,7 @@ from hil.drivers.control_table import load_control_table, model_names
 from hil.drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel
 from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
+from hil.drivers.others.heard import MOST_STRANGERS
 from hil.drivers.packet import ALERT, HardwareError
 from hil.drivers.port import Port, open_port
 from hil.drivers.preparation.cadence import CHECK_S, cadence
@@ -31,10 +32,6 @@ __all__ = ["CHECK_S", "BusConfig", "ServoBus"]
 
 _PROBES = 3
 """Unanswered Fast Sync Reads after which Sync Read is used instead."""
-
-_RECENT_S = 0.1
-MOST_STRANGERS = 2
-"""Tolerated number of foreign packets heard during an experiment; a late reply can look like one."""
 
 
 @dataclass(frozen=True)
@@ -304,8 +301,8 @@ class ServoBus:
         reply = exchange.cycle(ticks, between=between)
         self._last_answers = reply.servos
         state = self._converter.state(ticks, reply)
-        if exchange.strangers > MOST_STRANGERS:
-            raise shared(f"has sent {exchange.strangers} packets, or made servos send them,")
+        if (strangers := exchange.heard.strangers) > MOST_STRANGERS:
+            raise shared(f"has sent {strangers} packets, or made servos send them,")
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def check_not_overruled(self, due: float) -> None:
@@ -321,26 +318,7 @@ class ServoBus:
         """What was received in the last 0.1 s instead of complete and timely replies, and what to do about it; "" if
         nothing was.
         """
-        exchange, since = self.prepared, self.port.clock.now() - _RECENT_S
-        if exchange.late_at > since:
-            return (
-                "Replies did arrive, but too late or twice: check the adapter's latency timer and whether other "
-                "programs keep this computer busy."
-            )
-        if exchange.damaged_at > since and (strange := [each for each in exchange.senders if each not in exchange.ids]):
-            return (
-                f"Intact replies came with ID {', '.join(map(str, dict.fromkeys(strange)))}, which was not addressed: "
-                f"a servo's ID has changed, or its reply is another servo's. `hil scan {self.port.url}` lists the IDs."
-            )
-        if exchange.damaged_at > since and len(set(exchange.senders)) < len(exchange.senders):
-            return (
-                f"Intact replies came with the IDs {', '.join(map(str, exchange.senders))}, although each servo was "
-                "asked once: replies are repeated or mixed up, or two servos have the same ID. "
-                f"`hil scan {self.port.url}` lists the IDs."
-            )
-        if exchange.damaged_at > since:
-            return "Bytes arrived, but damaged or incomplete: check the cables and what else may be sending on the bus."
-        return ""
+        return self.prepared.heard.advice(self.port.clock.now(), self.port.url)
 
     @property
     def is_watched(self) -> bool:

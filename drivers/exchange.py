@@ -15,16 +15,17 @@ loop needs.
 import math
 import struct
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
 from fastcrc import crc16
 
 from hil.drivers.control_table import Register
-from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction, Packet
+from hil.drivers.others.heard import Heard
+from hil.drivers.others.read_back import REMEMBERED, TRY_AGAIN_S, Overruled, ReadBack
+from hil.drivers.packet import BROADCAST_ID, HEADER, Instruction
 from hil.drivers.port import Port
-from hil.drivers.read_back import REMEMBERED, TRY_AGAIN_S, Overruled, ReadBack
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
 
 HOST_S = 0.75e-3
@@ -41,14 +42,8 @@ AFTER_LOSS = 5
 cycles late is recognised by its length.
 """
 
-_INSTRUCTIONS = frozenset(Instruction) - {Instruction.STATUS}
-_FRONT_SIZE = 8  # header, ID, LEN, INST
-_LONGEST_CUT_OFF = 64
-"""Largest LEN of an instruction that is recognised although its end is missing; a damaged LEN is usually larger."""
-
 _NEVER = 1 << 62
 _DOUBTS = 3
-_PART_OF_A_REPLY = 8  # bytes; at least the header of a fast reply, whose first servos have then answered
 
 _crc = crc16.umts
 _pack_crc = struct.Struct("<H").pack
@@ -111,12 +106,6 @@ class Exchange:
         self.ids = tuple(ids)
         self.fast = fast
         self.one_write = one_write
-        self.damaged_at = self.late_at = -math.inf
-        """When incomplete or damaged replies last arrived, and when an unexpected one did [s on the port's clock]."""
-        self.senders: list[int] = []
-        """IDs of the intact replies among those that arrived at `damaged_at`."""
-        self.strangers = 0
-        """Number of packets received that this program neither sent nor asked for: another master is on the bus."""
         self._writes = [
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
@@ -126,7 +115,7 @@ class Exchange:
         self._kinds = len(every)
         every += _of_other_lengths(every, len(self.ids))
         self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
-        self._expected = frozenset().union(*(read.expected for read in self._reads))
+        self.heard = Heard(self.ids, self._reads)
         self._slow_spans = len(spans) - 1
         least = max(patience, min(PATIENCE_SHARE * interval, MOST_PATIENCE_S))
         self._wire_s = {read: port.wire_time(self._bytes(read)) for read in self._reads}
@@ -185,7 +174,7 @@ class Exchange:
         """
         back = self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
         self._wire_s |= {read: self._port.wire_time(self._bytes(read)) for read in back.reads}
-        self._expected = self._expected.union(*(read.expected for read in back.reads))
+        self.heard.expect(back.reads)
         self.read_back_at = -math.inf
 
     @property
@@ -353,38 +342,13 @@ class Exchange:
                 break
             # One byte at a time, since the length of a stuffed packet is not known in advance.
             received += self._port.read(1, remaining)
-        self._look_for_strangers(_packets_within(received))
-        if not self._echoes:
-            self.strangers += sum(self._is_anothers(*front) for front in _fronts_of_instructions(received))
-        complete = sum(answer is not None for answer in answers) / len(answers)
-        if complete < 1.0 and len(received) > complete * read.reply_size + _PART_OF_A_REPLY:
-            self.damaged_at, self.senders = self._now(), read.senders(received)
+        self.heard.instead(read, received, answers, self._now(), echoes=self._echoes)
         return answers
 
-    def _look_for_strangers(self, packets: Sequence[Packet]) -> None:
-        if not self._echoes:
-            self.strangers += sum(self._is_strange(packet) for packet in packets)
-
-    def _is_strange(self, packet: Packet) -> bool:
-        """Whether this is another master's instruction or a reply to one. A reply without data, such as an error, may
-        be ours.
-        """
-        if not packet.is_status:
-            return True
-        return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
-
-    def _is_anothers(self, servo_id: int, length: int) -> bool:
-        """Whether an instruction whose end is missing is another master's, not a damaged reply of such a LEN."""
-        lengths = {size + 4 for _, size in self._expected}
-        return servo_id in (*self.ids, BROADCAST_ID) and length <= _LONGEST_CUT_OFF and length not in lengths
-
     def _overhear(self) -> None:
-        """Examine bytes that were pending before the request: from another master, or a late or repeated reply."""
-        packets = _packets_within(self._port.overheard)
+        """Examine bytes that were pending before the request."""
+        self.heard.pending(self._port.overheard, self._now(), echoes=self._echoes)
         self._port.overheard = b""
-        self._look_for_strangers(packets)
-        if any(packet.is_status for packet in packets):
-            self.late_at = self._now()
 
     def _ask_behind_echo(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:
         """Return the reply received through an adapter that echoes what is sent, with the echo removed."""
@@ -457,32 +421,6 @@ def _of_other_lengths(spans: Sequence[Span | Sequence[Span]], servos: int) -> li
     usual = one_each(spans[0], servos)
     lengths = [size for size in range(usual[0].size + 1, usual[0].size + AFTER_LOSS + len(taken)) if size not in taken]
     return [tuple(each.longer(size - each.size) for each in usual) for size in lengths[:AFTER_LOSS]]
-
-
-def _packets_within(received: bytes) -> list[Packet]:
-    """Return all whole packets, also those behind or within one that was cut off by a collision."""
-    found: list[Packet] = []
-    at = received.find(HEADER)
-    while at >= 0:
-        end = at + 7 + int.from_bytes(received[at + 5 : at + 7], "little")
-        packets = list(Framer().feed(received[at:end])) if end <= len(received) else []
-        found += packets
-        at = received.find(HEADER, end if packets else at + 1)
-    return found
-
-
-def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:
-    """ID and LEN of each instruction that is cut off by the next packet.
-
-    A master that transmits does not receive: of another one's packet it hears what preceded its own.
-    """
-    at = received.find(HEADER)
-    while (following := received.find(HEADER, at + len(HEADER))) >= 0:
-        if following - at >= _FRONT_SIZE and received[at + _FRONT_SIZE - 1] in _INSTRUCTIONS:
-            length = int.from_bytes(received[at + 5 : at + 7], "little")
-            if following - at < 7 + length:
-                yield received[at + 4], length
-        at = following
 
 
 def _front(goal: Register, count: int) -> bytes:

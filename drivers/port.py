@@ -9,7 +9,7 @@ import os
 import select
 import termios
 import time
-from typing import Any, cast
+from typing import Any
 
 import serial
 
@@ -36,8 +36,11 @@ _LOOKS = 100
 pending input in advance: on such a line, input that was pending shows because it arrives too early.
 """
 
+_LOOKS_AFTER_LOSS = 2 * _LOOKS
+"""As `_LOOKS`, after input was pending or a reply was lost: a late reply may then arrive at any time."""
+
 _ALWAYS = 1 << 62
-"""As `_LOOKS`, for a line whose replies arrive earlier than its baud rate allows, such as a pty."""
+"""As `_LOOKS`, for a line whose replies usually arrive earlier than its baud rate allows, such as a pty."""
 
 _EARLY_BITS = 9.0
 """Bits of the ten per byte; a reply counts as early if it arrives before the request can have been transmitted at this
@@ -117,9 +120,10 @@ class Port:
             # Setting the timeout makes pyserial query the terminal settings, so it is set only when it changes.
             if self._timeout != timeout:
                 self._serial.timeout = self._timeout = timeout
-            return cast(bytes, self._serial.read(count))
+            received: bytes = self._serial.read(count)
         except _FAILURES as error:
             raise self._lost(error) from error
+        return received
 
     def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
         """Write, then read until `timeout` [s] after `start` [s, on the port's clock], as the control cycle does.
@@ -135,7 +139,7 @@ class Port:
     def put_aside(self) -> None:
         """Move bytes that were received but not read to `overheard`."""
         try:
-            self.overheard = cast(bytes, self._serial.read(self._serial.in_waiting))
+            self.overheard = self._serial.read(self._serial.in_waiting)
         except _FAILURES as error:
             raise self._lost(error) from error
 
@@ -222,7 +226,7 @@ class DescriptorPort(Port):
             looks = self._looks
             if looks and self._wait_ms(0):
                 self.put_aside()
-                looks = max(looks, _LOOKS)
+                looks = max(looks, _LOOKS_AFTER_LOSS)
             written = os.write(self._descriptor, data)
             if written < len(data):
                 self._write_rest(data[written:])
@@ -232,7 +236,8 @@ class DescriptorPort(Port):
                 if time.perf_counter() < early_until:
                     if not looks:
                         return self._ask_behind_pending(count, early_until, start + timeout)
-                    looks = _ALWAYS
+                    if looks <= _LOOKS:
+                        looks = _ALWAYS
                 received = os.read(self._descriptor, count)
                 if len(received) == count:
                     if looks:
@@ -249,12 +254,12 @@ class DescriptorPort(Port):
     def _ask_on(self, received: bytes, count: int, deadline: float, looks: int) -> bytes:
         """Return the whole of a reply of which only a part, or nothing yet, was received within whole milliseconds."""
         received = self._read_on(received, count, deadline)
-        self._looks = max(0, looks - 1) if len(received) == count else max(looks, _LOOKS)
+        self._looks = max(0, looks - 1) if len(received) == count else max(looks, _LOOKS_AFTER_LOSS)
         return received
 
     def _ask_behind_pending(self, count: int, early_until: float, deadline: float) -> bytes:
         """Keep apart what arrives before the request can have been transmitted, then read the reply as `ask` does."""
-        self._looks = _LOOKS
+        self._looks = _LOOKS_AFTER_LOSS
         while select.select([self._descriptor], [], [], max(0.0, deadline - time.perf_counter()))[0]:
             is_early = time.perf_counter() < early_until
             received = os.read(self._descriptor, count)

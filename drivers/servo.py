@@ -102,27 +102,28 @@ class Servo:
 
         attempts: how often the write, and then the read, may be tried; by default as often as in all set-up work.
         """
-        attempts = _ATTEMPTS if attempts is None else attempts
-        # The status packet may be lost or switched off (Status Return Level 1); what counts is the register's value.
-        with suppress(NoReply):
-            self.write_only(register, value, attempts)
-        actual = self.read(register, attempts)
-        if actual != value:
-            raise _not_held(self.title, register, value, actual)
+        self._write_and_read_back(register, value, attempts, despite_error=False)
 
     def write_despite_error(self, register: str, value: int, attempts: int | None = None) -> None:
         """Write a register as `write` does, but ignore errors that replies report if the value reads back as written.
 
         What makes an arm safe, and what restores it, must not fail because of a servo that reports errors but obeys.
         """
+        self._write_and_read_back(register, value, attempts, despite_error=True)
+
+    def _write_and_read_back(self, register: str, value: int, attempts: int | None, *, despite_error: bool) -> None:
         attempts = _ATTEMPTS if attempts is None else attempts
         refused: ServoRefused | None = None
         try:
+            # The status packet may be lost or switched off (Status Return Level 1); what counts is the register's
+            # value.
             with suppress(NoReply):
                 self.write_only(register, value, attempts)
         except ServoRefused as error:
+            if not despite_error:
+                raise
             refused = error
-        actual = self.read_despite_error(register, attempts)
+        actual = self.read_entry(self.table[register], attempts, despite_error=despite_error)
         if actual != value:
             raise refused or _not_held(self.title, register, value, actual)
 

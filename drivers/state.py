@@ -4,7 +4,7 @@ import functools
 import operator
 from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple
 
 from hil.drivers.control_table import ControlTable
 from hil.drivers.exchange import Reply
@@ -164,7 +164,7 @@ class Converter:
         try:
             if span == 0:
                 # Most cycles: each servo answers with its ERR byte and the three values that are always read.
-                answers = cast("Sequence[tuple[int, int, int, int]]", servos)
+                answers: Any = servos
                 values = [
                     (raw_drive * drive, raw_velocity * velocity, (raw_position - zero) * position, error)
                     for (error, raw_drive, raw_velocity, raw_position), (drive, velocity, position, zero) in zip(

@@ -291,6 +291,8 @@ class Middle(FakeSerial):
 
     def _let_rivals_write(self, now: float) -> None:
         """Let other masters write at their own times, also between two calls of the program."""
+        if not self._again:
+            return
         for each in [each for each in self._again if each.kind == Kind.RIVAL and not self.over]:
             while self._again[each] <= min(now, each.end) and not self.bus.on_the_way:
                 self.bus.advance(self._again[each])

@@ -2,7 +2,7 @@
 
 import math
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from benchmarks.fault_campaign.attack import Attack, Kind
 from hil.fakes.bus.bus import FakeBus
+from hil.fakes.servo.memory import Memory
 from hil.fakes.servo.servo import EmulatedServo
 
 STEP_S = 1e-3
@@ -47,7 +48,7 @@ class Witness:
 
     def __init__(self, bus: FakeBus) -> None:
         self._plant = bus.plant
-        self._servos: tuple[EmulatedServo, ...] = bus._servos
+        self._tell = [_teller(servo) for servo in bus._servos]
         self._next = bus.time + STEP_S
         self._times: list[float] = []
         self._goals: list[tuple[tuple[bool, bool, int], ...]] = []
@@ -150,7 +151,7 @@ class Witness:
     def advance(self, until: float, current: Sequence[float]) -> None:
         plant = self._plant
         if self._next <= until:
-            told = tuple(map(_told, self._servos))  # no servo receives anything within this time
+            told = tuple([tell() for tell in self._tell])  # no servo receives anything within this time
         while self._next <= until:
             plant.advance(self._next, self._driven_by(current, self._next) if self._disturbed else current)
             self._times.append(self._next)
@@ -170,15 +171,27 @@ class Witness:
         return record
 
 
-def _told(servo: EmulatedServo) -> tuple[bool, bool, int]:
-    """Whether the servo drives its motor, whether torque is on, and the goal in its mode [ticks]."""
+def _teller(servo: EmulatedServo) -> Callable[[], tuple[bool, bool, int]]:
+    """Return a function that tells whether the servo drives its motor, whether torque is on, and its goal [ticks]."""
     memory = servo.memory
-    torque = memory.get("Torque Enable") == 1
-    mode = memory.get("Operating Mode")
-    if mode == CURRENT_MODE:
-        goal = memory.get("Goal Current")
-    elif mode == PWM_MODE:
-        goal = memory.get("Goal PWM")
-    else:
-        goal = int(torque)  # position and velocity control drive the motor whenever torque is on
-    return torque and goal != 0, torque, goal
+    torque_at, mode_at = (memory.registers[name].address for name in ("Torque Enable", "Operating Mode"))
+    current_at, pwm_at = (_bytes_of(memory, name) for name in ("Goal Current", "Goal PWM"))
+
+    def tell() -> tuple[bool, bool, int]:
+        data = memory.data  # called every millisecond: looking up registers by name takes five times as long
+        torque, mode = data[torque_at] == 1, data[mode_at]
+        if mode == CURRENT_MODE:
+            goal = int.from_bytes(data[current_at], "little", signed=True)
+        elif mode == PWM_MODE:
+            goal = int.from_bytes(data[pwm_at], "little", signed=True)
+        else:
+            goal = int(torque)  # position and velocity control drive the motor whenever torque is on
+        return torque and goal != 0, torque, goal
+
+    return tell
+
+
+def _bytes_of(memory: Memory, name: str) -> slice:
+    """Where the register's bytes are; nowhere if the model does not have it."""
+    register = memory.registers.get(name)
+    return slice(0) if register is None else slice(register.address, register.address + register.size)

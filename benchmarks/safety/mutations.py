@@ -52,7 +52,11 @@ TESTS = {
         *("tests/drivers/test_exchange_cycles.py", "tests/drivers/test_heard_instead.py"),
         *("tests/drivers/test_exchange.py", "tests/drivers/test_read_back.py"),
     ],
-    "hil/drivers/read_back.py": ["tests/drivers/test_sightings.py", "tests/drivers/test_read_back.py"],
+    "hil/drivers/others/heard.py": [
+        *("tests/drivers/test_heard_instead.py", "tests/drivers/test_exchange_cycles.py"),
+        "tests/drivers/test_exchange.py",
+    ],
+    "hil/drivers/others/read_back.py": ["tests/drivers/test_sightings.py", "tests/drivers/test_read_back.py"],
     "hil/drivers/torque_off.py": ["tests/drivers/test_torque_off.py"],
     "hil/estimator/models/standstill.py": ["tests/estimator/models/test_standstill.py"],
     "hil/experiment/chain_watch.py": [f"{_EXPERIMENT}/test_chain_watch.py"],

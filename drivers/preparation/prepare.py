@@ -4,10 +4,10 @@ from contextlib import suppress
 
 from hil.drivers.errors import BusShared, NoReply, ServoFault, WrongReply, WrongSetting
 from hil.drivers.joint import Joint
+from hil.drivers.others.read_back import Overruled
 from hil.drivers.packet import Framer, HardwareError
 from hil.drivers.port import Port
 from hil.drivers.preparation.settings import arms_itself
-from hil.drivers.read_back import Overruled
 from hil.drivers.servo import NO_ERROR, Servo, describe_error
 from hil.drivers.servo_model import Mode
 

@@ -44,18 +44,26 @@ class Products:
 
 def _loop(J: Any, r: Any, weight: Any, product: Any) -> None:
     rows, columns = J.shape
-    # Four rows at a time: a quarter of the memory accesses to the sums.
+    # Four rows and two columns at a time: fewer memory accesses, and half as many short loops.
     for first in range(0, rows, 4):
         i, j, k, m = first, min(first + 1, rows - 1), min(first + 2, rows - 1), min(first + 3, rows - 1)
         w = weight[i]
         x = weight[j] if first + 1 < rows else 0.0
         y = weight[k] if first + 2 < rows else 0.0
         z = weight[m] if first + 3 < rows else 0.0
-        for a in range(columns):
+        for a in range(0, columns, 2):
+            # A single last column is computed twice.
+            c = min(a + 1, columns - 1)
             p, q, s, t = w * J[i, a], x * J[j, a], y * J[k, a], z * J[m, a]
-            for b in range(min(columns, a // LANES * LANES + LANES)):  # the lower triangle, in whole vectors
-                product[a, b] += p * J[i, b] + q * J[j, b] + s * J[k, b] + t * J[m, b]
-            product[a, columns] += p * r[i] + q * r[j] + s * r[k] + t * r[m]
+            e, f, g, h = w * J[i, c], x * J[j, c], y * J[k, c], z * J[m, c]
+            for b in range(min(columns, c // LANES * LANES + LANES)):  # the lower triangle, in whole vectors
+                one, two, three, four = J[i, b], J[j, b], J[k, b], J[m, b]
+                total = product[a, b] + (p * one + q * two + s * three + t * four)
+                product[c, b] += e * one + f * two + g * three + h * four
+                product[a, b] = total
+            total = product[a, columns] + (p * r[i] + q * r[j] + s * r[k] + t * r[m])
+            product[c, columns] += e * r[i] + f * r[j] + g * r[k] + h * r[m]
+            product[a, columns] = total
 
 
 _multiply: Callable[[Array, Array, Array, Array], None] = compiled(_loop, fastmath={"contract"})

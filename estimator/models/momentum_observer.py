@@ -18,6 +18,9 @@ model lacks (Stribeck friction, backlash, flexibility) widen the admissible rang
 enters that estimate only once it has ended without one; otherwise a joint that is held for long would widen the range
 until nothing exceeds it. While a joint stands still its noise is lower, since most of it needs motion.
 
+What friction can hold includes the viscous friction at the speeds of the usual motion: over a small motion, in which
+the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once it stands.
+
 Errors of the model last longer than the interval between two updates, and so does the rounding of a velocity that stays
 below one tick: they are not new information each time. Therefore each update counts only as a fraction of one.
 """
@@ -55,6 +58,7 @@ _VISIBLE = 2.0  # velocity that shows in the register, in standard deviations of
 _VELOCITY_STD = 0.0135  # rad/s: rounding of the register, with steps of 0.024, and some noise
 _FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned torque
 _NOISE_S = 1.0  # time constant of the noise estimate
+_USUAL_S = 1.0  # time constant of the mean square velocity
 _CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in variances of the noise
 _STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
 _LESSONS = 2.0  # number of successive updates that share an error of the model
@@ -72,8 +76,8 @@ _PENDING = _COVARIANCE + _COUNT
 # Scalars: per joint filtered torque, noise variance, fraction of time at standstill, duration and sample count of a
 # possible alarm, missing torque; then the time since the last parameter update and since the start.
 _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
-# Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration.
-_TAUGHT, _TEACHES, _SQUARE = 0, 2, 4
+# Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration; mean square velocity.
+_TAUGHT, _TEACHES, _SQUARED = 0, 2, 4
 # The constants: joints, interval, floors; from 4 drifts; then two least noises, the highest floors and their friction.
 _HIGHEST = 4 + _COUNT + 2
 
@@ -210,11 +214,21 @@ def _learn(m: Any, gain: Any, lacking: float, spread: float) -> None:
             m[_COVARIANCE + i, n] -= gain[i] * gain[n] / spread
 
 
+def _keep_dissipative(m: Any) -> None:
+    """Return friction that has become negative to zero, and the other parameters with it as the covariance demands."""
+    for i in range(6, 10):
+        if m[_THETA, i] < 0.0 and m[_COVARIANCE + i, i] > 0.0:
+            share = m[_THETA, i] / m[_COVARIANCE + i, i]
+            for n in range(_COUNT):
+                m[_THETA, n] -= share * m[_COVARIANCE + n, i]
+
+
 def _static_friction(m: Any, rest: Any, j: int) -> float:
-    """Return the torque that dry friction may hold at standstill [N m]."""
+    """Return the torque that friction may hold at standstill [N m]."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
-    dry += 0.5 * max(m[_THETA, 6 + j], 0.0) * math.sqrt(m[_PENDING, _SQUARE + j])
-    return float(max(_STATIC * dry, _withstood(rest)))
+    viscous = m[_THETA, 6 + j] - math.sqrt(max(m[_COVARIANCE + 6 + j, 6 + j], 0.0))
+    peak = math.sqrt(2.0 * m[_PENDING, _SQUARED + j])  # velocity of a sine
+    return float(max(_STATIC * (dry + max(viscous, 0.0) * peak), _withstood(rest)))
 
 
 def _is_blocked(
@@ -297,6 +311,11 @@ def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> Non
     for_later[_TAUGHT + j] = for_later[_TEACHES + j] = 0.0
 
 
+def _remember_speed(m: Any, j: int, velocity: float, dt: float) -> None:
+    """Update the mean square of the joint's velocity."""
+    m[_PENDING, _SQUARED + j] += min(dt / _USUAL_S, 1.0) * (velocity * velocity - m[_PENDING, _SQUARED + j])
+
+
 def _floor(m: Any, k: Any, j: int) -> float:
     """Return the smallest torque that may raise an alarm: lower for a joint whose friction turns out to be small."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
@@ -331,13 +350,11 @@ def _observe_loop(
         _filter(m, j, momentum, rest, t1 if j == 0 else t2, fallen, slope, row)
         if not is_warm:
             continue
+        _remember_speed(m, j, v1 if j == 0 else v2, dt)
         lacking, left_open = _lacks(m, j, row, gain)
         single[_LACKING + j] = lacking
         stands = min(max(single[_STANDS + j], 0.0), 1.0)
-        v = v1 if j == 0 else v2
-        m[_PENDING, _SQUARE + j] += min(dt / _NOISE_S, 1.0) * (v * v - m[_PENDING, _SQUARE + j])
-        may = stands
-        holds, rounding = may * _static_friction(m, rests[j], j), _of_rounding(m, j, slope, math.cos(q2))
+        holds, rounding = stands * _static_friction(m, rests[j], j), _of_rounding(m, j, slope, math.cos(q2))
         quiet = 1.0 - (1.0 - _STANDING_NOISE) * stands
         noise, floor = quiet * quiet * single[_NOISE + j], _floor(m, k, j)
         spread = left_open + rounding + noise
@@ -354,14 +371,16 @@ def _observe_loop(
         if lesson and not is_beyond and not _is_suspect(rests[j]):
             taught_by = _LESSONS * (spread - left_open) + _STANDING_LESSONS * (1.0 - quiet) * rounding
             _learn(m, gain, lacking, left_open + taught_by + holds * holds)
+            _keep_dissipative(m)
     return alarm
 
 
 _inner: Any = numba.njit(nogil=True, error_model="numpy")
 _regressors, _begin_anew, _filter, _lacks, _learn = map(_inner, (_regressors, _begin_anew, _filter, _lacks, _learn))
+_keep_dissipative = _inner(_keep_dissipative)
 _withstood, _forget, _look_at_rest = standstill.withstood, standstill.forget, standstill.look
 _variance, _blocked, _is_suspect = standstill.variance, standstill.blocked, standstill.is_suspect
 _static_friction, _is_blocked = map(_inner, (_static_friction, _is_blocked))
 _second_moment, _of_rounding = map(_inner, (_second_moment, _of_rounding))
-_alarms, _teach_noise, _floor = map(_inner, (_alarms, _teach_noise, _floor))
+_alarms, _teach_noise, _floor, _remember_speed = map(_inner, (_alarms, _teach_noise, _floor, _remember_speed))
 _observe: Callable[..., int] = compiled(_observe_loop)

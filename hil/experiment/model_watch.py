@@ -31,9 +31,10 @@ WIDENED = 1.5
 
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
-_FRICTIONS = 8.0
-"""Lower bound on the torque scale, in multiples of the mean dry friction: up to twice that friction must not raise an
-alarm.
+_FRICTIONS, _FRICTIONS_UNDESCRIBED = 8.0, 3.0
+"""Lower bounds on the torque scale, in multiples of the mean dry friction: up to twice that friction must not raise an
+alarm. Without a description, friction is that of typical servos; the bound then only concerns arms whose planned torque
+hardly exceeds it.
 """
 _TILT_SHARE = 0.2  # standard deviation of gravity perpendicular to the assumed direction, relative to gravity
 _FRICTION_SPREAD = 3.0
@@ -168,7 +169,8 @@ class ModelWatch:
         interval = 1.0 / config.experiment.rate if interval is None else interval
         # A pilot's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         is_described = arms is not None or config.arm.link_lengths is not None
-        self._observer = MomentumObserver(mean, covariance, largest, interval, _FRICTIONS * is_described)
+        frictions = _FRICTIONS if is_described else _FRICTIONS_UNDESCRIBED
+        self._observer = MomentumObserver(mean, covariance, largest, interval, frictions)
         self._names = [joint.joint.title for joint in config.joints]
         self._blocked_by = [causes_of_standstill(joint.joint) for joint in config.joints]
         self._goal: Sequence[float] | None = None

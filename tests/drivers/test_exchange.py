@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from hil.drivers.control_table import load_control_table
 from hil.drivers.errors import PortLost
 from hil.drivers.exchange import HOST_S, Exchange
+from hil.drivers.others.read_back import TRY_AGAIN_S
 from hil.drivers.packet import HEADER, Framer, Instruction, crc, encode, encode_status
 from hil.drivers.port import Port
-from hil.drivers.read_back import TRY_AGAIN_S
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import read_back_spans, spans
 from hil.drivers.sync_read import FastSyncRead, Span, SyncRead
@@ -137,7 +137,7 @@ def test_what_another_master_sends_and_asks_for_is_counted_and_ones_own_late_rep
     for received, count in ((own, 0), (refusal, 0), (own[:-3], 0), *((packet, 1) for packet in foreign + cut_off)):
         exchanging = exchange(Wire([received]), fast=fast)
         exchanging.cycle([0, 0])
-        assert exchanging.strangers == count, received.hex()
+        assert exchanging.heard.strangers == count, received.hex()
 
 
 ticks16 = st.integers(-(2**15), 2**15 - 1)
@@ -363,7 +363,7 @@ def test_another_masters_instructions_between_two_cycles_are_counted() -> None:
     for pending, count in ((answer(1, 1, 2, 3) + b"\xff\xfd", 0), (goal + answer(2, 0, 0, 0), 1), (b"", 1)):
         wire.waiting = pending
         assert None not in cycles.cycle([0, 0]).servos
-        assert cycles.strangers == count
+        assert cycles.heard.strangers == count
 
 
 ONE_READ_BACK_S = 0.004
@@ -383,7 +383,7 @@ def test_another_masters_instructions_before_a_read_back_are_counted() -> None:
     cycles.cycle([0, 0])
     wire.waiting = encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")
     cycles.overruled(wire.now() + 0.1)
-    assert cycles.strangers == 1
+    assert cycles.heard.strangers == 1
 
 
 def test_modes_are_read_back_before_goals_if_there_is_time_for_both() -> None:
@@ -447,7 +447,7 @@ def test_an_instruction_of_another_master_that_ours_cuts_off_is_counted(front: i
     wire = Wire([encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")[:front] + fine])
     cycles = exchange(wire)
     assert None not in cycles.cycle([0, 0]).servos
-    assert cycles.strangers == count
+    assert cycles.heard.strangers == count
 
 
 def test_a_damaged_reply_is_not_taken_for_a_part_of_an_instruction() -> None:
@@ -460,7 +460,7 @@ def test_a_damaged_reply_is_not_taken_for_a_part_of_an_instruction() -> None:
                 wire = Wire([bytes(damaged) + answer(2, 4, 5, 6)])
                 cycles = exchange(wire)
                 cycles.cycle([0, 0])
-                assert not cycles.strangers, (start, count, value)
+                assert not cycles.heard.strangers, (start, count, value)
 
 
 def test_goals_are_compared_with_what_was_sent_though_the_caller_changes_its_list() -> None:
@@ -488,13 +488,13 @@ def test_damaged_bytes_are_told_from_silence_and_late_replies_from_both() -> Non
         wire = Wire([received])
         cycles = exchange(wire)
         assert None in cycles.cycle([0, 0]).servos
-        assert math.isfinite(cycles.damaged_at) is is_damaged and cycles.late_at == -math.inf
+        assert math.isfinite(cycles.heard.damaged_at) is is_damaged and cycles.heard.late_at == -math.inf
     wire = Wire([b"", fine])
     cycles = exchange(wire)
     cycles.cycle([0, 0])
     wire.waiting = fine
     cycles.cycle([0, 0])
-    assert math.isfinite(cycles.late_at)
+    assert math.isfinite(cycles.heard.late_at)
 
 
 def echoed(wire: Wire, reply: bytes, goals: list[int]) -> bytes:

@@ -44,7 +44,7 @@ def test_a_reply_with_data_that_this_program_did_not_ask_for_is_a_strangers(data
     wire = Wire([encode_status(9, 0, data) + FINE[:20]])
     cycles = exchange(wire)
     cycles.cycle([0, 0])
-    assert cycles.strangers == strangers
+    assert cycles.heard.strangers == strangers
 
 
 def test_a_second_reply_is_awaited_no_longer_than_any() -> None:

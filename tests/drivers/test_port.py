@@ -92,6 +92,8 @@ class Line:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *, is_wired: bool) -> None:
         self.now, self.is_wired, self.answers = 100.0, is_wired, True
         self.looks = 0
+        self.late = b""
+        """Reply that arrives right behind the next request."""
         self._far, near = os.openpty()
         tty.setraw(near)
         os.set_blocking(self._far, False)
@@ -106,6 +108,10 @@ class Line:
         """What the port's poll returns; a servo answers while the port waits."""
         if milliseconds == 0:
             self.looks += 1
+        elif self.late:
+            os.read(self._far, 64)
+            self.send(self.late)
+            self.late = b""
         elif not self._ready(0):
             self._answer()
         return self._ready(0)
@@ -128,8 +134,8 @@ class Line:
     def ask(self, letter: bytes) -> bytes:
         return self.port.ask(letter * 30, 7, 0.05, self.now)
 
-    def settle(self) -> None:
-        for _ in range(150):
+    def settle(self, count: int = 150) -> None:
+        for _ in range(count):
             assert self.ask(b"a") == b"a-right"
 
     def close(self) -> None:
@@ -191,3 +197,14 @@ def test_a_line_that_answers_sooner_than_its_baud_rate_allows_is_always_looked_a
     line.send(b"a-right")
     assert line.ask(b"b") == b"b-right" and line.port.overheard == b"a-right"
     line.close()
+
+
+def test_a_reply_that_was_lost_and_arrives_behind_the_next_request_does_not_make_a_line_fast(wired: Line) -> None:
+    wired.settle()
+    wired.answers = False
+    assert wired.ask(b"a") == b""
+    wired.answers, wired.late = True, b"a-right"
+    wired.ask(b"b")  # too early: the caller can tell by the time
+    wired.settle(300)
+    looks = wired.looks
+    assert wired.ask(b"c") == b"c-right" and wired.looks == looks

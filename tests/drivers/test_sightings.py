@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from hil.drivers.control_table import load_control_table
-from hil.drivers.read_back import Overruled, ReadBack
+from hil.drivers.others.read_back import Overruled, ReadBack
 from hil.drivers.sync_read import Answer, Span
 
 XM430 = load_control_table("XM430-W350")

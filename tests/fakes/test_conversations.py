@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 
 from benchmarks.bus import codec
 from benchmarks.bus.codec import Status, Wrong, packet
-from benchmarks.bus.conversations import NUMBERS, Conversation, converse
+from benchmarks.bus.conversation.groups import Conversation
+from benchmarks.bus.conversation.servos import NUMBERS
+from benchmarks.bus.conversations import converse
 from benchmarks.bus.servo_rules import TABLES, Row
 from hil.fakes.servo.registers import MODEL_NAMES
 from hil.fakes.servo.servo import EmulatedServo

@@ -14,7 +14,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.coordinates import LONGEST, ChainCoordinates
 from hil.estimator.chain.model.chain_model import ADDED_MASS, ChainModel
-from hil.estimator.chain.model.late_torque import as_moving, complete, lags_of
+from hil.estimator.chain.model.late_torque import as_moving, complete, lags_of, losses
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.simulation.sensitivity import ChainRun, Simulation, pieces
 from hil.estimator.data.settled_period import SettledPeriod
@@ -310,6 +310,7 @@ class ChainProblem:
         run = self.run_of(period, parameters)
         names = self.coordinates.names
         moved, added = self._of_period(index, parameters), self._added(index)
+        lost = losses(self.model.base, parameters, names)
         simulation = Simulation(self.model.base, moved, self.start(x, index), self.gain(period), names)
         kept: list[tuple[slice, Array, Array]] = []
         for part in pieces(len(run.measured)):
@@ -317,7 +318,7 @@ class ChainProblem:
             if position is None:  # the derivatives are not finite either
                 yield part, None, derivative
                 return
-            complete(self.model.base, parameters, names, derivative)
+            complete(lost, derivative)
             if added is not None:
                 derivative[:, :, names.index(ADDED_MASS)] = derivative[:, :, : added.size] @ added
             yield part, _missed(position, measured[part]), derivative

@@ -10,6 +10,7 @@ a second start is made from the prior's links, with the shape of friction free a
 the motion. The better of the two fits is continued.
 """
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -17,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.chain.fit.coordinates import ChainCoordinates, kind_of
+from hil.estimator.chain.fit.coordinates import SHAPES, ChainCoordinates, kind_of
 from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.fit.options import ChainOptions
 from hil.estimator.chain.fit.resolved_widths import resolved_widths
@@ -44,7 +45,7 @@ def first_problem(
     state_scale = np.repeat([options.angle_scale, velocity], model.joints)
     known = dict(zip(model.linear_names, linear.value.tolist(), strict=True))
     known |= {
-        "lag": max(linear.delay, options.min_initial_lag),
+        "lag": initial_lag(linear.delay, options),
         "delay": linear.delay if model.drive == "delay" else 0.0,
     }
     start = START | {"coulomb_width": options.initial_width}
@@ -56,6 +57,15 @@ def first_problem(
         tuple(periods), model, coordinates, prior, state_scale, weights, steps, softness=options.softness[0]
     )
     return problem, np.concatenate((coordinates.coordinates(value), *states))
+
+
+def initial_lag(delay: float, options: ChainOptions) -> float:
+    """Return the initial guess of the lag [s]: the geometric mean of stage 1's delay and the typical lag.
+
+    Stage 1's delay is too long by several milliseconds, since it makes up for the shape of friction near standstill.
+    """
+    least = options.min_initial_lag
+    return max(math.sqrt(max(delay, least) * SHAPES["lag"][0]), least)
 
 
 def integration_steps(periods: Sequence[SettledPeriod], longest: float) -> int:
@@ -127,7 +137,12 @@ def resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple[
 
 def _level(problem: ChainProblem, x: Array) -> float:
     """Return the RMS weighted residual at `x`; 1 for noise alone."""
-    return float(np.sqrt(replace(problem, prior_weight=0.0).cost(x) / problem.counted))
+    return float(np.sqrt(_of_data(problem, x) / problem.counted))
+
+
+def _of_data(problem: ChainProblem, x: Array) -> float:
+    """Return the sum of squares at `x` without the prior's part; infinite if the motion diverges."""
+    return replace(problem, prior_weight=0.0).cost(x)
 
 
 def narrowed(problem: ChainProblem, value: Array, starts: Sequence[Array], options: ChainOptions) -> Array:
@@ -153,8 +168,13 @@ def softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Arr
     for frequency in options.softness:
         last = frequency == options.softness[-1]
         every = 1 if last or coarse.steps > 1 else skip
+        trial = replace(coarse, softness=frequency, every=every)
+        growth = options.lost * (softness / frequency) ** 2
+        # What follows starts with this observer, so it need not be fitted here to be found good enough.
+        if last and cost is not None and _of_data(trial, x) <= growth * (cost + x.size):
+            return x, frequency, spent
         try:
-            found, trial = _minimised(replace(coarse, softness=frequency, every=every), x, options.ftol_coarse)
+            found, trial = _minimised(trial, x, options.ftol_coarse)
         except ConvergenceError:
             if cost is None:
                 raise
@@ -162,7 +182,6 @@ def softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Arr
         spent += found.iterations
         # The prior's weight differs from trial to trial, so only the residuals are compared.
         of_data = (found.at.cost - trial.prior_cost(found.x)) * every
-        growth = options.lost * (softness / frequency) ** 2
         if cost is not None and of_data > growth * (cost + x.size):
             break
         x, softness, cost = found.x, frequency, of_data

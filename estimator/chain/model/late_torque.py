@@ -30,6 +30,12 @@ def lags_of(parameters: Mapping[str, float], joints: int) -> Array:
     return parameters.get("lag", 0.0) * np.array(ratios)
 
 
+def lag_slopes(parameters: Mapping[str, float], joints: int) -> Array:
+    """Return the derivatives of each joint's lag with respect to the lag of joint 1 and its own ratio (2, joints)."""
+    lag = parameters.get("lag", 0.0)
+    return np.array([[parameters.get(f"lag_ratio_{j + 1}", 1.0), lag] for j in range(joints)]).T.copy()
+
+
 def as_moving(base: BaseParameters, parameters: Mapping[str, float]) -> dict[str, float]:
     """Return the parameters of the equivalent arm, with lighter rotors, whose back-EMF does not lag."""
     moving = dict(parameters)
@@ -71,33 +77,41 @@ def rotor(base: BaseParameters, joint: int) -> Array:
     return column
 
 
-def complete(base: BaseParameters, parameters: Mapping[str, float], names: tuple[str, ...], derivative: Array) -> None:
-    """Convert the simulation's derivatives (samples, joints, causes) to those with respect to `names`, in place.
+Losses = list[tuple[Array, dict[int, float]]]
+"""For each voltage-driven joint: its rotor (base parameters,), and by how much its inertia [kg m^2] decreases per unit
+of the parameters on which its lagging back-EMF depends, by their index.
+"""
 
-    The simulated arm is that of `as_moving`, and its derivatives are with respect to each joint's own lag. names: the
-    base parameters come first.
+
+def losses(base: BaseParameters, parameters: Mapping[str, float], names: tuple[str, ...]) -> Losses:
+    """Return how the arm of `as_moving` depends on what makes it lighter, for `complete`.
+
+    names: the parameters with respect to which to differentiate; the base parameters come first.
     """
-    at = {name: index for index, name in enumerate(names)}
-    generating = _generating(base.chain.joints, parameters)
-    # At the limit the loss no longer grows with its causes.
-    free = _possible(base, parameters, generating) == 1.0
-    for joint, share, viscous, late in generating if free else ():
-        by_rotor = derivative[:, :, : base.count] @ rotor(base, joint)
-        own_lag = f"lag_ratio_{joint + 1}"
-        for name, change in {
+    joints, at = base.chain.joints, {name: index for index, name in enumerate(names)}
+    generating = _generating(joints, parameters)
+    if _possible(base, parameters, generating) < 1.0:  # at the limit the loss no longer grows with its causes
+        return []
+    by_lag, by_ratio = lag_slopes(parameters, joints)
+    found = []
+    for joint, share, viscous, late in generating:
+        changes = {
             f"viscous_{joint + 1}": share * late,
             f"back_emf_{joint + 1}": viscous * late,
-            own_lag if own_lag in at else "lag": share * viscous,
+            "lag": share * viscous * float(by_lag[joint]),
+            f"lag_ratio_{joint + 1}": share * viscous * float(by_ratio[joint]),
             "delay": share * viscous if parameters.get("delay", 0.0) > 0.0 else 0.0,
-        }.items():
-            if name in at:
-                derivative[:, :, at[name]] -= change * by_rotor
-    own = [index for joint in range(base.chain.joints) if (index := at.get(f"lag_ratio_{joint + 1}")) is not None]
-    if own:  # consecutive: see `ChainModel.names`
-        rows = derivative.reshape(-1, derivative.shape[2])
-        of_own = rows[:, own[0] : own[-1] + 1]
-        rows[:, at["lag"]] += of_own @ np.array([parameters[names[index]] for index in own])
-        of_own *= parameters["lag"]
+        }
+        found.append((rotor(base, joint), {at[name]: change for name, change in changes.items() if name in at}))
+    return found
+
+
+def complete(lost: Losses, derivative: Array) -> None:
+    """Convert derivatives (samples, joints, causes) of the arm of `as_moving` to those of the arm itself, in place."""
+    for rotor_, changes in lost:
+        by_rotor = derivative[:, :, : rotor_.size] @ rotor_
+        for index, change in changes.items():
+            derivative[:, :, index] -= change * by_rotor
 
 
 def _generating(joints: int, parameters: Mapping[str, float]) -> list[tuple[int, float, float, float]]:

@@ -9,6 +9,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import places, split
 from hil.estimator.chain.model.kernels import room
+from hil.estimator.chain.model.late_torque import lag_slopes
 from hil.estimator.chain.model.tilt import TILT, tilt_slopes, tilted
 from hil.estimator.chain.simulation.stepping import JOINT_TERMS, run
 
@@ -25,7 +26,7 @@ class ChainRun:
     torque: Array
     """Mean motor torque over each step after each sample, unscaled (samples, steps, joints) [N m]."""
     slopes: Array
-    """Derivatives of `torque` with respect to delay and lag (samples, steps, 2, joints) [N m/s]."""
+    """Derivatives of `torque` with respect to delay and each joint's lag (samples, steps, 2, joints) [N m/s]."""
     measured: Array
     """Measured angles (samples, joints) [rad]; NaN where a sample is missing."""
     step: float
@@ -76,9 +77,11 @@ class Simulation:
             np.array(
                 [
                     [at.get("delay", spare)] * n,
-                    [at.get(f"lag_ratio_{j + 1}", at.get("lag", spare)) for j in range(n)],
+                    [at.get("lag", spare)] * n,
+                    [at.get(f"lag_ratio_{j + 1}", spare) for j in range(n)],
                 ]
             ),
+            lag_slopes(parameters, n),
             np.array([at[name] for name in TILT if name in at], dtype=np.int64),
             tilt_slopes(gravity, *tilt) if TILT[0] in at else np.zeros((2, 3)),
         )
@@ -104,8 +107,7 @@ class Simulation:
         """Simulate the next `piece` of the samples.
 
         Returns the angles (samples, joints) [rad], None if the motion diverges, and their derivatives (samples, joints,
-        causes). The column of a `lag_ratio` holds the derivative with respect to that joint's own lag, which the column
-        of `lag` excludes.
+        causes).
         """
         torque, measured = run_.torque[piece], run_.measured[piece]
         position = np.empty(measured.shape)

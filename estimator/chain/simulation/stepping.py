@@ -61,6 +61,7 @@ def _direct(
     left: Any,
     slopes: Any,
     times: Any,
+    late: Any,
     ghk: float,
     by: Any,
     row: Any,
@@ -68,8 +69,9 @@ def _direct(
     """Compute the direct derivatives of joint j's step equation with respect to the drive's parameters; those with
     respect to v go to `by`.
 
-    left: see `_left`. slopes: derivatives of the torque with respect to delay and lag. times: columns of the delay and
-    the lag of each joint. ghk: gamma h times the stage's acceleration.
+    left: see `_left`. slopes: derivatives of the torque with respect to delay and each joint's lag. times: columns of
+    the delay, lag and lag ratio of each joint. late: derivatives of a joint's lag with respect to the latter two. ghk:
+    gamma h times the stage's acceleration.
     """
     scale, width, fading = p[SCALE, j], p[WIDTH, j], p[FADING, j]
     motor = scale * t
@@ -95,7 +97,9 @@ def _direct(
     by_motor = load * sign * shape - 1.0
     row[at[SCALE, j]] = by_motor * t
     row[times[0, j]] = by_motor * scale * slopes[0, j]
-    row[times[1, j]] = by_motor * scale * slopes[1, j]
+    by_lag = by_motor * scale * slopes[1, j]
+    row[times[1, j]] = by_lag * late[0, j]
+    row[times[2, j]] = by_lag * late[1, j]
 
 
 # These take whole arrays and indices: a view of a row costs as much as its arithmetic.
@@ -206,13 +210,13 @@ def _follow(
     direct: Any,
 ) -> None:
     """Differentiate a solved stage's equation with respect to q and v (`work`) and the parameters (`direct`)."""
-    base, at, times, tilts, falls = columns
+    base, at, times, late, tilts, falls = columns
     total = solve[5]
     accelerate(links[1], chain[3], v, total, work)
     differentiate(chain[3], work)
     regress(base, total, work, direct)
     for j in range(v.size):
-        _direct(p, at, j, v[j], t[j], solve[0], slopes, times, gh * found[j], by, direct[j])
+        _direct(p, at, j, v[j], t[j], solve[0], slopes, times, late, gh * found[j], by, direct[j])
         work[7][j, j] += by[j]
     for j in range(v.size):
         column = at[ZERO, j]

@@ -18,7 +18,7 @@ from hil.estimator.chain.fit.uncertainty import neglected_covariance
 from hil.estimator.chain.identify import identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.dynamics import mass_matrix
-from hil.estimator.chain.model.late_torque import MOST_LOST, as_moving, complete, lags_of, limited, lost_inertia
+from hil.estimator.chain.model.late_torque import MOST_LOST, as_moving, complete, lags_of, limited, losses, lost_inertia
 from hil.estimator.chain.simulation.sensitivity import Simulation
 from hil.estimator.data.settled_period import SettledPeriod
 
@@ -141,9 +141,9 @@ def test_no_lag_takes_more_than_half_of_a_joints_inertia(setup: bench.Setup) -> 
     names = (*base.names, "viscous_1", "lag")
     derivative = np.random.default_rng(9).standard_normal((3, 4, len(names)))
     changed = derivative.copy()
-    complete(base, parameters, names, changed)
+    complete(losses(base, parameters, names), changed)
     np.testing.assert_array_equal(changed, derivative)  # what is at its limit does not change with its causes
-    complete(base, by_voltage(setup, 1e-3), names, changed)
+    complete(losses(base, by_voltage(setup, 1e-3), names), changed)
     assert np.abs(changed - derivative)[:, :, -2:].min() > 0.0
 
 

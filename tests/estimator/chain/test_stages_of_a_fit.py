@@ -99,13 +99,22 @@ def test_repeated_readings_count_as_a_few(setup: bench.Setup) -> None:
 
 @dataclass(frozen=True)
 class Softer:
-    """A problem whose minimum has a known cost under each observer, from the data and from the prior."""
+    """A problem whose minimum has a known cost under each observer, from the data and from the prior.
+
+    before: cost of the data elsewhere, relative to that.
+    """
 
     costs: dict[float, tuple[float, float]]
     periods: tuple[SettledPeriod, ...]
     steps: int = 2
     softness: float = 0.0
     every: int = 1
+    before: float = 1.0
+    prior_weight: float = 1.0
+
+    def cost(self, x: np.ndarray) -> float:
+        data, prior = self.costs[self.softness]
+        return self.before * data + self.prior_weight * prior
 
     def prior_cost(self, x: np.ndarray) -> float:
         return self.costs[self.softness][1]
@@ -118,19 +127,23 @@ class Softer:
 
 
 @pytest.mark.parametrize(
-    ("costs", "kept"),
+    ("costs", "before", "kept", "fits"),
     [
-        ({3.0: (1e3, 0.0), 1.5: (4e3, 0.0), 1.0: (9e3, 0.0)}, 1.0),  # as much as the softness explains
-        ({3.0: (1e3, 0.0), 1.5: (4e3, 0.0), 1.0: (9e4, 0.0)}, 1.5),  # the softest observer loses the motion
-        ({3.0: (1e3, 1e6), 1.5: (9e4, 0.0), 1.0: (9e5, 0.0)}, 3.0),  # so does this, whatever the prior costs
-        ({3.0: (1e3, 0.0), 1.5: (1e3, 1e6), 1.0: (1e3, 1e6)}, 1.0),  # only the prior counts more
+        ({3.0: (1e3, 0.0), 1.5: (4e3, 0.0), 1.0: (9e3, 0.0)}, 2.0, 1.0, 3),  # as much as the softness explains
+        ({3.0: (1e3, 0.0), 1.5: (4e3, 0.0), 1.0: (9e3, 0.0)}, 1.2, 1.0, 2),  # the last one need not be fitted for that
+        ({3.0: (1e3, 0.0), 1.5: (4e3, 0.0), 1.0: (9e4, 0.0)}, 1.2, 1.5, 2),  # the softest observer loses the motion
+        ({3.0: (1e3, 1e6), 1.5: (9e4, 0.0), 1.0: (9e5, 0.0)}, 1.2, 3.0, 1),  # so does this, whatever the prior costs
+        ({3.0: (1e3, 0.0), 1.5: (1e3, 1e6), 1.0: (1e3, 1e6)}, 1.2, 1.0, 2),  # only the prior counts more
     ],
 )
-def test_the_softest_observer_that_follows_is_kept(costs: dict[float, tuple[float, float]], kept: float) -> None:
-    problem: Any = Softer(costs, (sticking(1),))
-    x, softness, _ = starts.softened(problem, np.zeros(2), DEFAULTS)
+def test_the_softest_observer_that_follows_is_kept(
+    costs: dict[float, tuple[float, float]], before: float, kept: float, fits: int
+) -> None:
+    problem: Any = Softer(costs, (sticking(1),), before=before)
+    x, softness, spent = starts.softened(problem, np.zeros(2), DEFAULTS)
     assert softness == kept
-    np.testing.assert_array_equal(x, 1.0 + DEFAULTS.softness.index(kept))
+    np.testing.assert_array_equal(x, fits)
+    assert spent == 2 * (fits if kept == 1.0 else fits + 1)
 
 
 def fit_of(setup: bench.Setup, period: SettledPeriod, width: float, off: float) -> ChainFit:

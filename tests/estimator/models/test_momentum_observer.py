@@ -47,3 +47,15 @@ def test_what_friction_may_explain_is_no_push() -> None:
 @pytest.mark.parametrize("friction", [0.0, 0.02, 0.08, 0.15])
 def test_a_healthy_joint_is_never_stopped(friction: float) -> None:
     assert alarm_after(0.0, friction, frictions=8.0) == math.inf
+
+
+def test_friction_that_would_drive_the_joint_is_not_learnt() -> None:
+    covariance = np.diag(
+        [{"inertia_1": 2e-3, "viscous_1": 0.02, "coulomb_1": 0.05}.get(name, 0.0) ** 2 for name in NAMES]
+    )
+    observer = MomentumObserver({"inertia_1": INERTIA, "coulomb_1": 0.02}, covariance, np.array([1.0]), INTERVAL)
+    for index in range(600):
+        angle, speed = 5.0 * index * INTERVAL, math.cos(5.0 * index * INTERVAL)
+        drives = -0.05 * math.copysign(1.0, speed) - 5.0 * INERTIA * math.sin(angle)
+        assert observer.observe((0.2 * math.sin(angle),), (speed,), (drives,), INTERVAL) < 0
+    assert all(observer.parameters[name] > -2e-3 for name in ("viscous_1", "coulomb_1"))

@@ -13,6 +13,8 @@ from hil.errors import Cause, SafetyStop
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.closed_loop import Feedback, respond, resting
 from hil.experiment.model_watch import JOLT_BACK_S, JOLT_RAD_S, JOLT_TIMES, Jolts, ModelWatch
+from hil.fakes.plants.arm import Arm
+from hil.fakes.plants.plant import Plant, make_plant
 from tests.support.paths import CONFIGS
 
 RATE = 400.0
@@ -128,6 +130,39 @@ def test_an_arm_of_which_nothing_is_known_is_learnt_before_it_is_judged(config: 
     position[:, at:] = position[:, at - 1 : at]
     when = seen_after(ModelWatch(unknown, planned(config, torque)), config, torque, position, velocity)
     assert 0.0 < when - at / RATE < 0.1
+
+
+def small_arm(rest_pose: tuple[float, float]) -> Plant:
+    """An arm whose dry friction, after some presliding, is as large as half of the torque that it is moved with."""
+    motor = {
+        **{"mass": 0.018, "rotor_inertia": 1.8e-8, "gear_ratio": 353.5, "current_lag": 1e-3, "coulomb_width": 0.0},
+        **{"stribeck_rise": 0.4, "stribeck_velocity": 0.15},
+    }
+    shoulder = {"torque_constant": 1.37, "viscous": 0.0105, "coulomb": 0.0056, "presliding_stiffness": 1.385}
+    elbow = {"torque_constant": 1.517, "viscous": 0.006, "coulomb": 0.024, "presliding_stiffness": 2.46}
+    links = [
+        {"length": 0.147, "mass": 0.038, "centre": 0.081, "inertia": 1.5e-4},
+        {"length": 0.18, "mass": 0.029, "centre": 0.112, "inertia": 4.2e-5},
+    ]
+    drives = [motor | shoulder, motor | elbow]
+    return make_plant(Arm.model_validate({"start": rest_pose, "gravity": 9.81, "links": links, "drives": drives}))
+
+
+@pytest.mark.parametrize("seed", [180, 224, 370, 436])
+def test_friction_that_looks_viscous_over_a_small_motion_is_not_mistaken_for_a_fault(seed: int) -> None:
+    known = load_config(CONFIGS / "xc330_two_link.toml")
+    config = known.model_copy(update={"arm": known.arm.model_copy(update={"link_lengths": None})})
+    torque = waves(1.6, (0.069, 0.034), seed)
+    torque *= np.minimum(1.0, np.arange(torque.shape[1]) / (0.3 * RATE))
+    constants = [joint.torque_per_goal for joint in config.joints]
+    plant, current = small_arm(config.arm.rest_pose), (0.0, 0.0)
+    position, velocity = np.empty((2, *torque.shape))
+    for index, wanted in enumerate(torque.T):
+        plant.advance(index / RATE + 3e-4, current)
+        position[:, index] = np.round(np.array(plant.position) / STEP) * STEP
+        velocity[:, index] = np.round(np.array(plant.velocity) / TICK) * TICK
+        current = tuple(wanted / constants)
+    assert seen_after(ModelWatch(config, planned(config, torque)), config, torque, position, velocity) == math.inf
 
 
 def test_a_lost_reply_and_a_stall_begin_anew(config: Config) -> None:

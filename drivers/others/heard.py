@@ -1,0 +1,131 @@
+"""What is heard on the wire besides the replies that were asked for, or instead of them, and what to do about it."""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+
+from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction, Packet
+from hil.drivers.sync_read import Answer, GroupRead
+
+__all__ = ["MOST_STRANGERS", "Heard"]
+
+MOST_STRANGERS = 2
+"""Tolerated number of foreign packets heard during an experiment; a late reply can look like one."""
+
+_RECENT_S = 0.1
+_INSTRUCTIONS = frozenset(Instruction) - {Instruction.STATUS}
+_FRONT_SIZE = 8  # header, ID, LEN, INST
+_BEFORE_LENGTH = 7  # header, ID, LEN
+_BESIDE_DATA = 4  # INST, ERR, CRC
+_LONGEST_CUT_OFF = 64
+"""Largest LEN of an instruction that is recognised although its end is missing; a damaged LEN is usually larger."""
+
+_PART_OF_A_REPLY = 8  # bytes; at least the header of a fast reply, whose first servos have then answered
+
+
+class Heard:
+    """Packets of other masters, and late, repeated, damaged or foreign replies, for a fixed list of servos.
+
+    ids: the servos' IDs. reads: the group reads that are sent.
+    """
+
+    def __init__(self, ids: Sequence[int], reads: Iterable[GroupRead]) -> None:
+        self._ids = tuple(ids)
+        self._expected: frozenset[tuple[int, int]] = frozenset()
+        self.expect(reads)
+        self.damaged_at = self.late_at = -math.inf
+        """When incomplete or damaged replies last arrived, and when an unexpected one did [s on the port's clock]."""
+        self.senders: list[int] = []
+        """IDs of the intact replies among those that arrived at `damaged_at`."""
+        self.strangers = 0
+        """Number of packets received that this program neither sent nor asked for: another master is on the bus."""
+
+    def expect(self, reads: Iterable[GroupRead]) -> None:
+        """Take the replies to these reads for replies to this program from now on."""
+        self._expected = self._expected.union(*(read.expected for read in reads))
+
+    def pending(self, received: bytes, now: float, *, echoes: bool) -> None:
+        """Examine bytes that were pending before a request: from another master, or a late or repeated reply.
+
+        now: time on the port's clock [s]. echoes: whether the adapter echoes what this program sends.
+        """
+        packets = _packets_within(received)
+        self._count_strangers(packets, echoes=echoes)
+        if any(packet.is_status for packet in packets):
+            self.late_at = now
+
+    def instead(self, read: GroupRead, received: bytes, answers: Sequence[Answer], now: float, *, echoes: bool) -> None:
+        """Examine bytes received instead of the regular reply to `read`; `answers` were found in them."""
+        self._count_strangers(_packets_within(received), echoes=echoes)
+        if not echoes:
+            self.strangers += sum(self._is_anothers(*front) for front in _fronts_of_instructions(received))
+        complete = sum(answer is not None for answer in answers) / len(answers)
+        if complete < 1.0 and len(received) > complete * read.reply_size + _PART_OF_A_REPLY:
+            self.damaged_at, self.senders = now, read.senders(received)
+
+    def advice(self, now: float, url: str) -> str:
+        """What was received in the last 0.1 s instead of complete and timely replies, and what to do about it; "" if
+        nothing was.
+        """
+        since = now - _RECENT_S
+        if self.late_at > since:
+            return (
+                "Replies did arrive, but too late or twice: check the adapter's latency timer and whether other "
+                "programs keep this computer busy."
+            )
+        if self.damaged_at <= since:
+            return ""
+        if strange := [each for each in self.senders if each not in self._ids]:
+            return (
+                f"Intact replies came with ID {', '.join(map(str, dict.fromkeys(strange)))}, which was not addressed: "
+                f"a servo's ID has changed, or its reply is another servo's. `hil scan {url}` lists the IDs."
+            )
+        if len(set(self.senders)) < len(self.senders):
+            return (
+                f"Intact replies came with the IDs {', '.join(map(str, self.senders))}, although each servo was "
+                "asked once: replies are repeated or mixed up, or two servos have the same ID. "
+                f"`hil scan {url}` lists the IDs."
+            )
+        return "Bytes arrived, but damaged or incomplete: check the cables and what else may be sending on the bus."
+
+    def _count_strangers(self, packets: Sequence[Packet], *, echoes: bool) -> None:
+        if not echoes:
+            self.strangers += sum(self._is_strange(packet) for packet in packets)
+
+    def _is_strange(self, packet: Packet) -> bool:
+        """Whether this is another master's instruction or a reply to one. A reply without data, such as an error, may
+        be ours.
+        """
+        if not packet.is_status:
+            return True
+        return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
+
+    def _is_anothers(self, servo_id: int, length: int) -> bool:
+        """Whether an instruction whose end is missing is another master's, not a damaged reply of such a LEN."""
+        lengths = {size + _BESIDE_DATA for _, size in self._expected}
+        return servo_id in (*self._ids, BROADCAST_ID) and length <= _LONGEST_CUT_OFF and length not in lengths
+
+
+def _packets_within(received: bytes) -> list[Packet]:
+    """Return all whole packets, also those behind or within one that was cut off by a collision."""
+    found: list[Packet] = []
+    at = received.find(HEADER)
+    while at >= 0:
+        end = at + _BEFORE_LENGTH + int.from_bytes(received[at + 5 : at + 7], "little")
+        packets = list(Framer().feed(received[at:end])) if end <= len(received) else []
+        found += packets
+        at = received.find(HEADER, end if packets else at + 1)
+    return found
+
+
+def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:
+    """ID and LEN of each instruction that is cut off by the next packet.
+
+    A master that transmits does not receive: of another one's packet it hears what preceded its own.
+    """
+    at = received.find(HEADER)
+    while (following := received.find(HEADER, at + len(HEADER))) >= 0:
+        if following - at >= _FRONT_SIZE and received[at + _FRONT_SIZE - 1] in _INSTRUCTIONS:
+            length = int.from_bytes(received[at + 5 : at + 7], "little")
+            if following - at < _BEFORE_LENGTH + length:
+                yield received[at + 4], length
+        at = following
