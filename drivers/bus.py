@@ -314,6 +314,13 @@ class ServoBus:
             raise overruled(self._drives[found.place], found)
 
     @property
+    def goals_lost(self) -> tuple[int, str] | None:
+        """A joint that has missed many of the latest goals, and what was read back; None if there is none."""
+        if (lost := self.prepared.lost) is None:
+            return None
+        return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"
+
+    @property
     def heard_instead(self) -> str:
         """What was received in the last 0.1 s instead of complete and timely replies, and what to do about it; "" if
         nothing was.

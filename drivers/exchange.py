@@ -187,6 +187,11 @@ class Exchange:
         """A value that a servo held a moment ago although this program did not write it; None if there was none."""
         return self._read_back.sighted if self._read_back is not None and self.is_in_doubt else None
 
+    @property
+    def lost(self) -> Overruled | None:
+        """A servo that has missed many of the latest goals, as read-backs showed; None if there is none."""
+        return self._read_back.lost if self._read_back is not None else None
+
     def overruled(self, due: float) -> Overruled | None:
         """Read goals or operating modes back if there is time before the next cycle, which is due at `due` [s].
 

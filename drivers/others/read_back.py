@@ -40,6 +40,13 @@ _UNSURE_S = 0.01
 TRY_AGAIN_S = 0.005
 """Delay after which a read-back for which a cycle left no time is tried again [s]."""
 
+LOST_GOALS, LOST_OF = 3, 6
+"""A servo that misses this many of so many goals does not accept them, although the next one may arrive.
+
+The status, in which two consecutive goals must be missed, may not show for 0.1 s that every second goal is lost. If a
+hundredth is lost, three of six are rarer than two consecutive ones.
+"""
+
 _FADES = 0.98
 _IN_DOUBT_S = 0.3
 """Time after a foreign value was read, during which others are expected [s]."""
@@ -89,6 +96,12 @@ class ReadBack:
         self._modes_sighted: list[_Sightings] = [deque() for _ in ids]
         self.is_unexpected = False
         """Whether the latest read-back found anything else than the latest goals or the modes that were set."""
+        self.lost: Overruled | None = None
+        """A servo that has missed `LOST_GOALS` of `LOST_OF` goals, and the older goal that it holds."""
+        self._looks = 0  # read-backs of goals so far
+        self._missed: list[deque[int]] = [
+            deque(maxlen=LOST_GOALS) for _ in ids
+        ]  # number of each that found an older one
         self.doubts_until = -math.inf
         self.sighted: Overruled | None = None
         """The latest value read back that this program did not write; it is recent until `doubts_until`."""
@@ -137,6 +150,7 @@ class ReadBack:
     def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
         """Place and value of each servo that holds a value that this program did not write."""
         self.is_unexpected = False
+        self._looks += not self.is_of_modes
         for answer, value in zip(servos, self._modes if self.is_of_modes else sent[-1], strict=True):
             if answer is not None and answer[-1] != value:
                 self.is_unexpected = True
@@ -148,6 +162,7 @@ class ReadBack:
                 for place, (answer, mode) in enumerate(zip(servos, self._modes, strict=True))
                 if answer is not None and answer[-1] != mode and len(answer) > 1
             ]
+        self._count_missed(servos, sent)
         # A servo that received its neighbour's goal is not commanded by another master.
         own = set().union(*islice(reversed(sent), _RECENT))
         return [
@@ -155,3 +170,13 @@ class ReadBack:
             for place, answer in enumerate(servos)
             if answer is not None and answer[-1] not in own and len(answer) > 1
         ]
+
+    def _count_missed(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> None:
+        """Count the goals that did not arrive: the servo holds one of this program's before."""
+        before = list(islice(reversed(sent), 1, _RECENT))
+        for place, (answer, missed) in enumerate(zip(servos, self._missed, strict=True)):
+            if answer is None or answer[-1] == sent[-1][place] or all(answer[-1] != each[place] for each in before):
+                continue
+            missed.append(self._looks)
+            if len(missed) == LOST_GOALS and self._looks - missed[0] < LOST_OF:
+                self.lost = Overruled(place, self._goals[place], answer[-1], sent[-1][place])

@@ -14,6 +14,7 @@ import numpy as np
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
+from hil.drivers.others.read_back import LOST_GOALS, LOST_OF
 from hil.drivers.packet import ALERT, StatusError
 from hil.drivers.servo import describe_status_error
 from hil.drivers.servo_model import HARDLY_ANY, Mode
@@ -185,6 +186,15 @@ class Guard:
                 "row, although nothing that it was sent should cause one: whether it accepts its goals is unknown. "
                 "Power-cycle it and check its firmware; a device between adapter and servo may also change replies.",
             )
+
+    def goals_are_lost(self, index: int, held: str) -> NoReturn:
+        """Raise SafetyStop for a joint that misses many goals; `held` says what was read back."""
+        self._stop(
+            index,
+            Cause.GOALS_LOST,
+            f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF}. Goals are lost on the "
+            "way, or the servo refuses them: check its cable and limits.",
+        )
 
     def _stop_for(self, fault: int, state: State) -> NoReturn:
         """Raise SafetyStop for a fault found by the joint checks."""

@@ -358,6 +358,8 @@ class Stream:
         deadline = self._deadline
         if deadline is not None and self._exchange.read_back_at <= deadline + later:
             self._bus.check_not_overruled(deadline + later)
+            if (lost := self._bus.goals_lost) is not None:
+                self._guard.goals_are_lost(*lost)
 
     def _look(self, state: State, phase: Phase, *, between: bool = False) -> None:
         former, self._state = self._state, state

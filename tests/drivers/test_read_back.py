@@ -203,3 +203,24 @@ def test_one_long_read_back_is_not_the_last(fake_config: Make) -> None:
         with pytest.raises(BusShared):
             after_each(bus, lambda servos: servos[2].write(102, b"\xf9\xff"), 200)
         assert bus.port.clock.now() - start < 1.0
+
+
+@pytest.mark.parametrize(("every", "is_lost"), [(2, True), (4, False), (8, False)])
+def test_a_servo_that_misses_half_of_its_goals_is_found_although_others_arrive(
+    fake_config: Make, every: int, is_lost: bool
+) -> None:
+    cycle, held = 0, b""
+
+    def lose(servos: Any) -> None:
+        nonlocal cycle, held
+        cycle += 1
+        if cycle % every == 0:
+            servos[2].write(102, held)  # as if the latest goal had not arrived
+        held = servos[2].goal_current_ticks.to_bytes(2, "little")
+
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        after_each(bus, lose, 7 if is_lost else 60)
+        assert (bus.goals_lost is not None) == is_lost
+        if is_lost:
+            joint, held_instead = bus.goals_lost
+            assert joint == 1 and re.fullmatch(r"its Goal Current reads \d+ but \d+ was written", held_instead)
