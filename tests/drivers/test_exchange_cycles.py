@@ -3,8 +3,8 @@
 import pytest
 
 from hil.drivers.exchange import Exchange
+from hil.drivers.others.read_back import TRY_AGAIN_S
 from hil.drivers.packet import encode_status
-from hil.drivers.read_back import TRY_AGAIN_S
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import spans, status_span
 from tests.drivers.test_exchange import XM430, Wire, answer, exchange, read_back_of

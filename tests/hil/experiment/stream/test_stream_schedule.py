@@ -41,6 +41,7 @@ class Bus:
         self.read_back_at = math.inf
         self.heard_instead = self.commanded_by_another = ""
         self.is_watched = True
+        self.goals_lost: tuple[int, str] | None = None
         self.takes = takes
         self.calls: list[Call] = []
         self.velocity = NOTHING
@@ -85,6 +86,9 @@ class Checks:
 
     def look(self, _state: State, gap: float = 0.0, *, between: bool = False) -> None:
         self.calls.append(("look", round(gap, 6), between))
+
+    def goals_are_lost(self, joint: int, held: str) -> None:
+        self.calls.append(("lost", joint, held))
 
     def look_at_rest(self, _state: State) -> None:
         self.calls.append(("at rest",))
@@ -180,6 +184,16 @@ def test_read_backs_are_made_right_before_the_exchanges_that_follow(make: Make, 
     bus.read_back_at = dues[-1] + 0.05 - 1e-6
     play(stream, [0.3])
     assert bus.times("read back") == [*dues, round(dues[-1] + 0.05, 6)], "only where it is due by then"
+
+
+def test_goals_that_read_backs_find_lost_are_told_to_the_guard(make: Make) -> None:
+    stream, bus, guard = make()
+    bus.read_back_at = -math.inf
+    play(stream, [0.1])
+    assert guard.of("lost") == []
+    bus.goals_lost = (1, "its Goal Current reads 3 but 5 was written")
+    play(stream, [0.2])
+    assert guard.of("lost") == [(1, "its Goal Current reads 3 but 5 was written")]
 
 
 def test_missed_ticks_are_told_and_the_goal_stays(make: Make) -> None:
