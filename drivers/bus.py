@@ -334,7 +334,7 @@ class ServoBus:
 
     @property
     def commanded_by_another(self) -> str:
-        """Which servo held a value that this program did not write, read back a moment ago; "" for none.
+        """Which servo held a value that this program did not write when goals were last read back; "" for none.
 
         One such value does not prove another master: a servo that misses writes holds an older goal.
         """

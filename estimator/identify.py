@@ -149,6 +149,6 @@ def predict(
             return measured(physics, position)
         state = end
     raise PeriodicityError(
-        f"after {settling.max_periods} periods the simulated arm changes by {change:.2g} rad or rad/s from one to "
-        "the next: lower the torque, or check the identified friction"
+        f"after {settling.max_periods} periods the simulated motion still changes by {change:.2g} rad or rad/s "
+        "from one period to the next: lower the torque, or check the identified friction"
     )

@@ -80,7 +80,7 @@ def filtered_rows(
     if highest >= 0.45 / dt or position.shape[1] < 3 * trim:
         raise RecordingError(
             f"{position.shape[1]} samples at {1 / dt:.4g}/s cannot be filtered at {highest:g} Hz: "
-            "record longer or faster"
+            "record for longer, or at a higher sample rate"
         )
     from scipy.signal import butter, sosfiltfilt
 

@@ -122,7 +122,7 @@ class TorqueChange:
         return seen
 
     def explains_better_than(self, drift: Drift) -> bool:
-        """Whether a constant torque was seen that explains much more than a change of friction does."""
+        """Whether a change of constant torque is significant and explains much more than a change of friction does."""
         return bool(self.is_seen.any()) and self.left < TELLS * drift.left
 
 

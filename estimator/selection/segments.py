@@ -83,7 +83,8 @@ def held_out_errors(
     """Return the RMS error of predicted segments relative to the motion's RMS: per joint (joints,), and the median.
 
     The initial state of a segment is estimated from its first third; the rest is predicted from the torque alone. The
-    median is that over segments, since the error of a segment in which the arm tumbles can be arbitrarily large.
+    median is that over segments, since the error of a segment in which the arm tumbles can be arbitrarily large. A
+    prediction that diverges is wrong by half a turn.
     """
     problem = _posed(recordings, estimate, of)
     values, joints = estimate.parameters, estimate.model.joints
@@ -98,7 +99,10 @@ def held_out_errors(
         for _ in range(STATE_STEPS):
             rows, columns = problem.derivative_by_values(number, values, offsets, own, ())
             known = early.reshape(-1)
-            step = np.linalg.lstsq(columns[known, -own.size :], rows[known], rcond=None)[0]
+            r, J = rows[known], columns[known, -own.size :]
+            if not (np.isfinite(r).all() and np.isfinite(J).all()):
+                break  # the simulated arm diverges: its prediction is as wrong as one can be
+            step = np.linalg.lstsq(J, r, rcond=None)[0]
             own = own - np.clip(step, -1.0, 1.0)
             if float(np.abs(step).max()) < 1e-4:
                 break

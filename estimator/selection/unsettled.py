@@ -82,7 +82,7 @@ def choose_by_shooting(
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
         raise RecordingError(
             f"no recording has two segments of {length:g} s, one to fit and one to check: set model.friction to a "
-            "specific model, record longer, or choose shorter segments (columns.segment)"
+            "specific model, record for longer, or choose shorter segments (columns.segment)"
         )
     joints = recordings[0].joints
     unknown: tuple[Option, ...] = ("torque_scale",) if joints == 2 else ()
@@ -195,7 +195,7 @@ class _Search:
         if plainest.score < ratio * chosen.score:
             best, chosen = self.fit(simple, plain) or best, plainest
         if not np.isfinite(chosen.score):
-            raise ConvergenceError("no friction model could be fitted to half of the segments: record longer")
+            raise ConvergenceError("no friction model could be fitted to half of the segments: record for longer")
         return SegmentChoice(tuple(self._trials.values()), chosen, best)
 
     def _seen(self, estimate: ShootingEstimate) -> bool:

@@ -46,14 +46,20 @@ class CheckReport:
         return {"ready": self.ready, "findings": findings}
 
     def __repr__(self) -> str:
-        state = "ready" if self.ready else f"{len(self.problems)} blocking problems"
-        title = f"{self.config}: {state}, {len(self.warnings)} warnings"
-        told = (*self.problems, *self.warnings)
-        return "\n".join([title, *(f"  {each.level:>8} {each.where}: {each.what}: {each.found}" for each in told)])
+        state = "ready" if self.ready else _counted(len(self.problems), "blocking problem")
+        lines = [f"{self.config}: {state}, {_counted(len(self.warnings), 'warning')}"]
+        for each in (*self.problems, *self.warnings):
+            lines.append(f"  {each.level:>8} {each.where}: {each.what}: {each.found}")
+            lines += [f"{'':11}{line}" for line in each.fix.splitlines()]
+        return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        rows = [(str(each.level), each.where, each.what, each.found) for each in self.findings]
-        return html_table(("", "where", "what", "found"), rows)
+        rows = [(str(each.level), each.where, each.what, each.found, each.fix) for each in self.findings]
+        return html_table(("", "where", "what", "found", "what to do"), rows)
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def check(config: ConfigLike, *, on_progress: OnProgress = ignore) -> CheckReport:

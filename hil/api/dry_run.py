@@ -90,7 +90,7 @@ class Rehearsal:
                 *(f"{values[row, index]:.3g}" for values in (shown.median, shown.quantile, shown.limits)),
             )
             for index, joint in enumerate(self.config.joints)
-            for row, (name, unit) in enumerate(quantities_of(self.config))
+            for row, (name, unit) in enumerate(quantities_of(joint))
         ]
         return f"<p>{escape(repr(self))}</p>" + html_table(("joint", "peak", "unit", "median", "99 %", "limit"), rows)
 

@@ -12,12 +12,12 @@ from hil.api.run import Identification, Run, identification, load_run
 from hil.clearance.doubts import doubts
 from hil.config.schema import Config, load_config
 from hil.drivers.errors import DriverError
+from hil.dry_run.ensemble import earlier_result
 from hil.errors import ConfigError, ExperimentError, StopRequested
 from hil.estimation.after_a_stop import after_a_failure, after_a_stop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress as StreamProgress
-from hil.model_file import read_result
 from hil.report.page import FILE_NAME, write_report
 from hil.report.run_data import RunData
 from hil.results.result import Result
@@ -128,7 +128,7 @@ def _earlier(config: Config, shown: Path, path: Path) -> Result:
         raise ConfigError(
             f"{shown}: an earlier run replaces the prior of a planar arm's pilot (experiment.pilot = true), but {why}."
         )
-    return read_result(path)
+    return earlier_result(config, path)
 
 
 def _tell_doubts(config: Config, tell: OnProgress) -> None:

@@ -82,14 +82,14 @@ def doubted_limits(config: "Config") -> Iterator[str]:
 
 
 def doubted_gravity(config: "Config") -> Iterator[str]:
-    """Yield a sentence if the file has another gravity than the configuration, which alone decides."""
+    """Yield a sentence if the file's gravity differs from the configuration's, which is the one used."""
     arm = described_arm(config)
     if arm.gravity is None or np.abs(np.subtract(arm.gravity, base_gravity(config))).max() <= _SAME_GRAVITY:
         return
     used = [round(each, 4) + 0.0 for each in base_gravity(config).tolist()]
     yield (
-        f"{arm.path.name}: its gravity is {list(arm.gravity)} m/s^2, which is not used: [arm] base and gravity decide, "
-        f"and give {used} in the frame of the base. {_mounted(np.array(arm.gravity))}"
+        f"{arm.path.name}: its gravity is {list(arm.gravity)} m/s^2, which is not used: [arm] base and gravity "
+        f"give {used} in the frame of the base. {_mounted(np.array(arm.gravity))}"
     )
 
 

@@ -52,7 +52,10 @@ class ExperimentConfig(Table):
         if (self.band is None) == (self.lines is None):
             raise ValueError("give either band or lines")
         if self.detection and self.band is None:
-            raise ValueError("detection chooses lines from a band; with lines, omit the detection lines yourself")
+            raise ValueError(
+                "detection chooses lines from a band; with experiment.lines, leave some odd harmonics out of the lists "
+                "yourself"
+            )
         if self.band is not None:
             low, high = self.band
             if not 0 < low < high < self.rate / 4:

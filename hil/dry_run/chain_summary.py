@@ -143,7 +143,7 @@ def _table(run: ChainDryRun) -> Table:
         table.add_column(heading, justify="right")
     median, quantile = peaks.median, peaks.quantile
     for index, joint in enumerate(run.config.joints):
-        for row, (name, unit) in enumerate(quantities_of(run.config)):
+        for row, (name, unit) in enumerate(quantities_of(joint)):
             numbers = (median[row, index], quantile[row, index], peaks.limits[row, index])
             table.add_row(escape(joint.name) if row == 0 else "", name, unit, *(f"{value:.3g}" for value in numbers))
         table.add_section()

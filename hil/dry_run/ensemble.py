@@ -1,15 +1,18 @@
 """Arms that could be the one on the bench, drawn from a prior or from an earlier result with its covariance."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.prior import base_draws
+from hil.errors import ConfigError
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
+from hil.model_file import model_of, read_result
 from hil.plan.chain_model import torque_constant_stds
 from hil.results.result import Result
 
@@ -63,6 +66,28 @@ def scale_draws(config: Config, count: int, seed: int = 0) -> Array:
     return drawn
 
 
+def earlier_result(config: Config, path: Path) -> Result:
+    """Read the result of an earlier run on the same planar arm, from a run folder or result.json.
+
+    Raises ResultError, and ConfigError if the result is that of another arm.
+    """
+    result = read_result(path)
+    if result.chain is not None:
+        raise ConfigError(f"{config.path} describes a planar arm; {path} is the result of a spatial one.")
+    if result.joints != len(config.joints):
+        raise ConfigError(
+            f"{config.path} describes {_joints(len(config.joints))}; the earlier run {path} identified "
+            f"{result.joints}. Name a run of this arm."
+        )
+    if result.arm is not None:
+        model_of(result, path)  # complete and finite
+    return result
+
+
+def _joints(count: int) -> str:
+    return "1 joint" if count == 1 else f"{count} joints"
+
+
 def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
     """Draw arms from a result, whose covariance is widened by the model error that the residual indicates.
 
@@ -78,7 +103,7 @@ def result_draws(result: Result, count: int, farther: float = 1.0, seed: int = 0
     covariance = result.covariance.array()
     known = result.values
     value = np.array([known[name] for name in names])
-    ticks = max(result.fit.residual_rms_ticks)
+    ticks = max(result.fit.residual_rms_ticks, default=QUANTISATION_FLOOR_TICKS)
     covariance = np.where(np.isfinite(covariance), covariance, 0.0)
     # A residual above rounding indicates model error, which shifts parameters by more than their covariance suggests.
     widened = covariance * max(1.0, ticks / QUANTISATION_FLOOR_TICKS) ** 2

@@ -13,6 +13,7 @@ from math import erfc, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.config.joint import JointConfig
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 from hil.dry_run.ensemble import Ensemble
@@ -114,10 +115,10 @@ class Prediction:
         return float(np.quantile(worst, QUANTILE, method="higher"))
 
 
-def quantities_of(config: Config) -> tuple[tuple[str, str], ...]:
-    """Names and units of a prediction's rows; the goal is a voltage if the joints are driven by PWM."""
+def quantities_of(joint: JointConfig) -> tuple[tuple[str, str], ...]:
+    """Names and units of a prediction's rows for one joint; its goal is a voltage if it is driven by PWM."""
     named = tuple(zip(QUANTITIES, UNITS, strict=True))
-    if config.joints[0].drive_mode is not Mode.PWM:
+    if joint.drive_mode is not Mode.PWM:
         return named
     return tuple(("voltage", "V") if name == "current" else (name, unit) for name, unit in named)
 

@@ -7,12 +7,11 @@ from pathlib import Path
 from hil.config.chain import only_planar
 from hil.config.schema import Config
 from hil.dry_run.amplitude import largest_amplitude
-from hil.dry_run.ensemble import Ensemble, prior_ensemble, result_ensemble
+from hil.dry_run.ensemble import Ensemble, earlier_result, prior_ensemble, result_ensemble
 from hil.dry_run.prediction import predict
 from hil.dry_run.stopping_distance import stopping_distance
 from hil.dry_run.summary import DryRun
 from hil.dry_run.supply_speed import lowered, within_supply
-from hil.model_file import read_result
 from hil.plan.plan import make_plan
 from hil.setup.idle_bus import quiet_stream
 
@@ -47,5 +46,8 @@ def dry_run(
 
 
 def ensemble_of(config: Config, result: Path | None, arms: int) -> Ensemble:
-    """Draw an ensemble from the earlier result, or from the prior if `result` is None."""
-    return prior_ensemble(config, arms) if result is None else result_ensemble(read_result(result), arms)
+    """Draw an ensemble from the earlier result, or from the prior if `result` is None.
+
+    Raises ConfigError, also if the result is that of another arm, and ResultError.
+    """
+    return prior_ensemble(config, arms) if result is None else result_ensemble(earlier_result(config, result), arms)

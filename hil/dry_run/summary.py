@@ -139,7 +139,7 @@ def joints_json(config: Config, prediction: Prediction) -> dict[str, Any]:
                 "limit": float(prediction.limits[row, index]),
                 "chance": float(chance[row, index]),
             }
-            for row, (name, unit) in enumerate(quantities_of(config))
+            for row, (name, unit) in enumerate(quantities_of(joint))
         }
         for index, joint in enumerate(config.joints)
     }
@@ -160,7 +160,7 @@ def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
         table.add_column(heading, justify="right")
     median, quantile, chance = prediction.median, prediction.quantile, prediction.limit_chance
     for index, joint in enumerate(config.joints):
-        for row, (name, unit) in enumerate(quantities_of(config)):
+        for row, (name, unit) in enumerate(quantities_of(joint)):
             numbers = (median[row, index], quantile[row, index], prediction.limits[row, index])
             cells = [f"{value:.3g}" for value in numbers] + [_percent(chance[row, index])]
             table.add_row(escape(joint.name) if row == 0 else "", name, unit, *cells)

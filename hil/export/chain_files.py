@@ -16,10 +16,14 @@ from hil.clearance.shapes import Solid, solids_of
 from hil.description.arm import Body
 from hil.description.files import is_mjcf
 from hil.description.urdf import parse_urdf
+from hil.estimator.chain.model.tilt import TILT
 from hil.export.actuators import add_actuators
 from hil.export.chain_links import ChainLinks, chain_links, without_movable
+from hil.export.left_out import chain_left_out, torque_constants
 from hil.export.source import Source, write_text
 from hil.export.xml_text import comment, numbers, to_text
+
+_IN_MJCF = ("offset", "lag", "lag_ratio", *TILT)
 
 
 def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[str]:
@@ -56,7 +60,7 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
         dynamics.set("damping", numbers(model.values[f"viscous_{index + 1}"]))
         dynamics.set("friction", numbers(model.values[f"coulomb_{index + 1}"]))
     rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
-    left = [*rotors, *reduced, *found.left_out]
+    left = [*rotors, *reduced, *found.left_out, *chain_left_out(model), *torque_constants(model)]
     _describe(root, model, found, left)
     write_text(path, to_text(root))
     return left
@@ -67,6 +71,7 @@ def _export_own_urdf(found: ChainLinks, model: ChainArmModel, path: Path) -> lis
     root = ET.Element("robot", name=found.path.stem)
     rotors = [f"armature of {j.name} = {a:.6g} kg m^2" for j, a in zip(found.arm.joints, found.armature, strict=True)]
     left = ["the MJCF's shapes", *_held(found), *rotors, *found.left_out]
+    left += [*chain_left_out(model), *torque_constants(model)]
     _describe(root, model, found, left)
     ET.SubElement(root, "link", name=found.arm.base)
     parent = found.arm.base
@@ -94,11 +99,11 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
     found = chain_links(source, model)
     root = ET.Element("mujoco", model=found.path.stem)
     solids = solids_of(found.arm)
-    kept = ("offset_", "lag", "base_tilt")
     left = [
         *_not_in_mjcf(found, solids),
         *_held(found),
-        *(each for each in found.left_out if not each.startswith(kept)),
+        *found.left_out,
+        *chain_left_out(model, _IN_MJCF),
     ]
     _describe(root, model, found, left)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
@@ -135,7 +140,8 @@ def _held(found: ChainLinks) -> list[str]:
         return []
     with_links = [joint.link for joint in found.arm.joints if joint.movable]
     carried = f"; the links that they move are part of {', '.join(with_links)}" if with_links else ""
-    return [f"the joints {', '.join(found.arm.held)}, which were held during the identification{carried}"]
+    joints, were = ("joint", "was") if len(found.arm.held) == 1 else ("joints", "were")
+    return [f"the {joints} {', '.join(found.arm.held)}, which {were} held during the identification{carried}"]
 
 
 def _not_in_mjcf(found: ChainLinks, solids: Sequence[Solid]) -> list[str]:

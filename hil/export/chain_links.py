@@ -24,7 +24,6 @@ from hil.export.source import Source
 HALVINGS = 12
 LEAST_LEFT = 0.1  # of a link's mass, after separating what held joints move
 FAR = 3.0  # standard errors between physical links and identified parameters above which a note is added
-_SAID = ("viscous", "coulomb", "armature", "torque_scale", "moment", "inertia", "mass")
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class ChainLinks:
     bodies: tuple[Body, ...]
     armature: tuple[float, ...]
     left_out: tuple[str, ...]
-    """What a robot description cannot represent, one sentence each."""
+    """What the links cannot represent, one sentence each."""
 
 
 def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
@@ -66,7 +65,7 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
             f"{found.misfit:.1f} standard errors away"
         )
     bodies = tuple(_body(row) for row in found.links)
-    return ChainLinks(path, arm, bodies, tuple(found.armature.tolist()), (*said, *_left_out(model)))
+    return ChainLinks(path, arm, bodies, tuple(found.armature.tolist()), tuple(said))
 
 
 def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
@@ -116,10 +115,6 @@ def _rotor(model: ChainArmModel, number: int) -> float:
         return joint.servos * servo_prior(servo_model(joint.servo)).armature.median
     except DriverError:  # recordings of an unknown servo
         return 0.5 * ARMATURE
-
-
-def _left_out(model: ChainArmModel) -> list[str]:
-    return [f"{name} = {value:.6g}" for name, value in model.values.items() if not name.startswith(_SAID)]
 
 
 def _body(link: np.ndarray) -> Body:

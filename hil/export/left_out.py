@@ -1,7 +1,10 @@
 """What a robot description cannot represent: reported in the terminal and in the file, never dropped silently."""
 
 from hil.arm_model import ArmModel
-from hil.estimator.models.terms import term_of
+from hil.chain_model import ChainArmModel
+from hil.estimator.chain.model.late_torque import MEANINGS as LATE
+from hil.estimator.chain.model.tilt import MEANINGS
+from hil.estimator.models.terms import kind_of, term_of
 
 _SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torque_scale")
 """Terms that every robot description can represent or that `torque_constants` reports."""
@@ -9,13 +12,25 @@ _SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torq
 
 def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:
     """One sentence per model parameter that the format cannot represent, except those in `carried`."""
-    said = []
-    for name, value in model.values.items():
-        term = term_of(name)
-        if term.name not in (*_SAID_ELSEWHERE, *carried):
-            unit = "" if term.unit == "1" else f" {term.unit}"
-            said.append(f"{name} = {value:.6g}{unit} ({term.meaning})")
-    return said
+    elsewhere = (*_SAID_ELSEWHERE, *carried)
+    return [_sentence(name, value) for name, value in model.values.items() if kind_of(name) not in elsewhere]
+
+
+def chain_left_out(model: ChainArmModel, carried: tuple[str, ...] = ()) -> list[str]:
+    """The same for a spatial arm, whose base parameters every description represents by its links."""
+    elsewhere = {*_SAID_ELSEWHERE, *carried}
+    names = [name for name in model.values if name not in model.groups and kind_of(name) not in elsewhere]
+    return [_sentence(name, model.values[name]) for name in names]
+
+
+def _sentence(name: str, value: float) -> str:
+    if name in MEANINGS:
+        unit, meaning = "rad", MEANINGS[name]
+    elif kind_of(name) in LATE:
+        unit, meaning = "1", LATE[kind_of(name)]
+    else:
+        unit, meaning = term_of(name).unit, term_of(name).meaning
+    return f"{name} = {value:.6g}{'' if unit == '1' else f' {unit}'} ({meaning})"
 
 
 def torque_constants(model: ArmModel) -> list[str]:

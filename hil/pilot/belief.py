@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.dry_run.ensemble import Ensemble, result_draws, scale_draws, within_range
 from hil.dry_run.prior import base_draws
-from hil.errors import ConfigError
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
 from hil.estimator.simulation.many_arms import ManyArms
@@ -197,10 +196,6 @@ def earlier_belief(config: Config, result: Result, arms: int, seed: int = 0) -> 
     varies with temperature.
     """
     prior = prior_belief(config, arms, seed)
-    if result.joints != len(config.joints):
-        raise ConfigError(
-            f"{config.path} describes {len(config.joints)} joints; the earlier run identified {result.joints}."
-        )
     random = np.random.default_rng((seed, 10))
     drawn = result_draws(result, arms, seed=seed)
     supposed = dict(prior.fixed)

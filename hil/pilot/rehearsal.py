@@ -10,14 +10,13 @@ from pathlib import Path
 from hil.config.chain import only_planar
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude, largest_amplitude
-from hil.dry_run.ensemble import Ensemble
+from hil.dry_run.ensemble import Ensemble, earlier_result
 from hil.dry_run.prediction import predict
 from hil.dry_run.run import SHOWN, ensemble_of
 from hil.dry_run.stopping_distance import stopping_distance
 from hil.dry_run.summary import DryRun, FirstRun
 from hil.dry_run.supply_speed import lowered, within_supply
 from hil.errors import NoSafeTorque
-from hil.model_file import read_result
 from hil.pilot.search import Search
 from hil.pilot.steps import Player
 from hil.runs.run_folder import RunFolder
@@ -37,7 +36,7 @@ def rehearse_in_steps(
     said = quiet_stream(config) if servos else ()
     given, config = config, within_supply(config)
     said += lowered(given, config)
-    earlier = None if result is None else read_result(result)
+    earlier = None if result is None else earlier_result(config, result)
     # Nothing is run, so the folder and the player are never used.
     player = Player(config.path, lambda _: None, lambda _: None)
     search = Search.of(config, RunFolder(config.path.parent), player, earlier=earlier)

@@ -65,7 +65,7 @@ def convert(table: Table, columns: Columns) -> Converted:
     if not long:
         raise CsvError(
             f"{table.source}: no piece without a gap of more than {LONGEST_GAP:g} s is as long as a segment, "
-            f"{whole.segment:g} s: record longer, or set columns.segment."
+            f"{whole.segment:g} s: record for longer, or set columns.segment."
         )
     try:
         recordings = tuple(Recording(each.time, each.torque, each.position, step, whole.between) for each in long)

@@ -59,6 +59,6 @@ def _peaks(config: Config, shown: Prediction) -> Table:
             *(f"{values[row, index]:.3g}" for values in (shown.median, shown.quantile, shown.limits)),
         )
         for index, joint in enumerate(config.joints)
-        for row, (name, unit) in enumerate(quantities_of(config))
+        for row, (name, unit) in enumerate(quantities_of(joint))
     ]
     return Table(("joint and quantity", "median", "99 %", "limit"), tuple(rows))

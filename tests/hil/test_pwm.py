@@ -71,7 +71,7 @@ def test_a_dry_run_knows_what_turning_motors_generate(arm_file: ArmFile, tmp_pat
     assert seen is not None and is_within(config, seen, foreseen.quantile)
     # Without back-EMF, the predicted speed of the elbow would be several times higher.
     assert (foreseen.median[2] < 2.0 * seen[2]).all()
-    assert quantities_of(config)[3] == ("voltage", "V") and foreseen.limits[3].tolist() == [8.0, 8.0]
+    assert quantities_of(config.joints[0])[3] == ("voltage", "V") and foreseen.limits[3].tolist() == [8.0, 8.0]
 
 
 @pytest.mark.parametrize(

@@ -45,8 +45,8 @@ def filtered_torque(recording: Recording, model: ChainModel, cutoff: float, dela
     keep = max(1, int(1.0 / (PER_CYCLE * cutoff * dt)))
     if cutoff >= 0.45 / dt or position.shape[1] < 3 * trim:
         raise RecordingError(
-            f"{position.shape[1]} samples at {1 / dt:.4g}/s cannot be filtered at {cutoff:g} Hz: record longer "
-            "or faster"
+            f"{position.shape[1]} samples at {1 / dt:.4g}/s cannot be filtered at {cutoff:g} Hz: record for longer, or "
+            "at a higher sample rate"
         )
     from scipy.signal import butter, sosfiltfilt
 

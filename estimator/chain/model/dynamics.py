@@ -82,7 +82,7 @@ def places(joints: int, chosen: Columns) -> Columns:
 def split(chain: Chain, parameters: Array) -> tuple[Array, Array]:
     """Split a vector of all parameters into links (joints, 10) and armatures (joints,)."""
     if parameters.shape != (TERMS * chain.joints,):
-        raise ShapeError(f"parameters are {parameters.shape}, they must be ({TERMS * chain.joints},)")
+        raise ShapeError(f"parameters have shape {parameters.shape}; it must be ({TERMS * chain.joints},)")
     table = np.asarray(parameters, dtype=np.float64).reshape(chain.joints, TERMS)
     return np.ascontiguousarray(table[:, :-1]), np.ascontiguousarray(table[:, -1])
 

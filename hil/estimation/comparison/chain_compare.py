@@ -133,7 +133,9 @@ def _best(fit: Callable[[float], tuple[Array, Array]], judge: Judge, period: Set
         peer = Peer("idim_ls", parameters, _by_name(model.linear_names, std), seconds, words, len(CUTOFFS))
         found.append((np.inf if error is None else error, peer))
     if not found:
-        raise EstimationError("the recording cannot be filtered at any cut-off: record longer or faster")
+        raise EstimationError(
+            "the recording cannot be filtered at any cut-off: record for longer, or at a higher sample rate"
+        )
     return min(found, key=lambda pair: pair[0])[1]
 
 

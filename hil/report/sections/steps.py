@@ -27,11 +27,11 @@ def _table(step: PlayedStep, config: Config) -> Table:
     names = [joint.name for joint in config.joints]
     rows = [
         (
-            f"{name}: {quantity} [{unit}]",
-            *(number(peaks[row][joint], 3) for peaks in (step.predicted_median, step.predicted_quantile_99, step.seen)),
+            f"{joint.name}: {quantity} [{unit}]",
+            *(number(peaks[row][index], 3) for peaks in (step.predicted_median, step.predicted_quantile_99, step.seen)),
         )
-        for joint, name in enumerate(names)
-        for row, (quantity, unit) in enumerate(quantities_of(config))
+        for index, joint in enumerate(config.joints)
+        for row, (quantity, unit) in enumerate(quantities_of(joint))
     ]
     torque = listed([f"{name} {number(peak, 3)} N m" for name, peak in zip(names, step.peak_torque, strict=True)])
     head = ("joint and peak", "typical arm", "99 of 100 arms", "measured")

@@ -14,6 +14,7 @@ from hil.estimator.fit.multiple_shooting import estimate_by_shooting
 from hil.estimator.fit.segmented_least_squares import Segmented
 from hil.estimator.models.model import Model
 from hil.estimator.selection.prediction import prediction_rms
+from hil.estimator.selection.segments import held_out_errors
 from hil.estimator.selection.unsettled import choose_by_shooting
 from hil.fakes.plants.arm import Arm, base_parameters
 from hil.fakes.plants.plant import make_plant
@@ -106,6 +107,9 @@ def test_a_segment_with_a_gap_is_left_out(pendulum: Arm) -> None:
     estimate = estimate_by_shooting([holed], Model(1), start(holed))
     assert estimate.segments == 4
     assert max(map(abs, errors(estimate, pendulum).values())) < 0.01
+    assert held_out_errors([holed], estimate)[1] < 0.02
+    value = np.where([name.startswith("viscous") for name in estimate.names], -1e4, estimate.value)
+    assert held_out_errors([holed], replace(estimate, value=value))[1] > 1.0  # the simulation diverges
 
 
 def test_a_pendulum_with_lost_samples(pendulum: Arm) -> None:
@@ -162,7 +166,7 @@ def test_too_short_is_refused(recording: Recording) -> None:
         replace(
             recording, time=recording.time[few], torque=recording.torque[:, few], position=recording.position[:, few]
         )
-    with pytest.raises(RecordingError, match="record longer or faster"):
+    with pytest.raises(RecordingError, match="record for longer, or at a higher"):
         fit_inverse_dynamics([recording], 0.05, 0.05)
 
 

@@ -93,6 +93,7 @@ def test_a_check_that_fails_says_what(arm_file: ArmFile) -> None:
     assert not report.ready and report.problems
     assert report.to_json()["ready"] is False
     assert "elbow" in repr(report) and "nothing at 1000000 baud" in repr(report)
+    assert report.problems[-1].fix in repr(report) and "Fix the servo problems above" in report._repr_html_()
 
 
 def test_two_runs_within_a_second_have_folders_of_their_own(arm_file: ArmFile, monkeypatch: pytest.MonkeyPatch) -> None:

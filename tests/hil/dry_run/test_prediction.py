@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hil.api.dry_run import dry_run
 from hil.config.schema import Config, load_config, parse_config
 from hil.dry_run import chain_prediction
 from hil.dry_run.amplitude import Amplitude, largest_amplitude
-from hil.dry_run.ensemble import prior_ensemble
-from hil.dry_run.prediction import GUARDED, Prediction, predict
-from hil.errors import ConfigError
+from hil.dry_run.ensemble import earlier_result, prior_ensemble
+from hil.dry_run.prediction import GUARDED, Prediction, predict, quantities_of
+from hil.errors import ConfigError, ResultError
 from hil.plan.plan import make_plan
 from tests.support.command_line import hil
 from tests.support.dry_runs import is_within, prior_study, run_on
@@ -110,6 +111,34 @@ def test_the_verdict_is_the_exit_code(
     elbow = said["asked"]["joints"]["elbow"]
     assert set(elbow) == {"lowest position", "highest position", "velocity", "current", "torque", "power"}
     assert elbow["velocity"]["limit"] == 20.0 and elbow["velocity"]["unit"] == "rad/s"
+
+
+def test_the_earlier_run_must_fit_the_arm(identified: Path, tmp_path: Path) -> None:
+    text = (CONFIGS / "fake_pendulum.toml").read_text(encoding="utf-8")
+    for pendulum in (
+        text,
+        replaced(text, ("peak_torque = [0.35]", "pilot = true"), ("[arm]\n", "[arm]\nlink_lengths = [0.1]\n")),
+    ):
+        with pytest.raises(ConfigError, match=r"describes 1 joint; the earlier run .* identified 2\. Name a run of"):
+            dry_run(parse_config(pendulum, CONFIGS / "fake_pendulum.toml"), result=identified, arms=20)
+    config = load_config(CONFIGS / "fake_two_link.toml")
+    said = json.loads((identified / "result.json").read_text(encoding="utf-8"))
+    eye = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    chain = {"urdf": "a", "rotation": [eye] * 2, "translation": eye[:2], "axis": eye[:2], "gravity": eye[0]}
+    for change, words in (
+        ({"chain": chain}, "describes a planar arm; .* spatial"),
+        ({"parameters": {**said["parameters"], "inertia_1": {"value": None, "std": 0.1, "unit": "kg m^2"}}}, "finite"),
+    ):
+        path = tmp_path / "changed.json"
+        path.write_text(json.dumps({**said, **change}), encoding="utf-8")
+        with pytest.raises(ConfigError if "chain" in change else ResultError, match=words):
+            earlier_result(config, path)
+
+
+def test_every_joint_is_shown_with_the_unit_of_its_own_goal() -> None:
+    config = load_config(CONFIGS / "koch.toml")
+    units = {joint.name: quantities_of(joint)[3] for joint in config.joints}
+    assert units["wrist_roll"] == ("current", "A") and units["shoulder_pan"] == ("voltage", "V")
 
 
 def test_a_table_for_a_person_with_what_the_servos_say(

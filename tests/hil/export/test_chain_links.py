@@ -62,9 +62,20 @@ def test_a_gripper_keeps_its_inertia_and_the_arm_its_dynamics(
     links = ChainLinks(tmp_path / "arm.urdf", arm, bodies, (0.01,) * 3, ())
     monkeypatch.setattr(chain_files, "chain_links", lambda *_: links)
     monkeypatch.setattr(chain_files, "add_actuators", lambda *_: None)
-    values = {f"{name}_{joint}": 0.02 for name in ("viscous", "coulomb") for joint in (1, 2, 3)}
-    model: Any = SimpleNamespace(values=values, stds=values, groups={}, joints=config.joints, base_gravity=np.ones(3))
-    chain_files.export_chain_urdf(cast("Any", None), model, tmp_path / "out.urdf")
+    terms = ("viscous", "coulomb", "offset", "coulomb_width")
+    values = {f"{name}_{joint}": 0.02 for name in terms for joint in (1, 2, 3)} | {"moment_x_1": 0.1, "lag": 0.001}
+    joints = [SimpleNamespace(name=j.name, goal_unit="A", position_limit=j.position_limit) for j in config.joints]
+    model: Any = SimpleNamespace(
+        values=values, stds=values, groups={"moment_x_1": ""}, joints=joints, base_gravity=np.ones(3)
+    )
+    model.torque_per_goal = lambda number: 1.5
+    left = chain_files.export_chain_urdf(cast("Any", None), model, tmp_path / "out.urdf")
+    assert [each.split(" = ")[0] for each in left][-10:] == [
+        *(f"{name}_{joint}" for name in ("offset", "coulomb_width") for joint in (1, 2, 3)),
+        "lag",
+        *(f"torque per goal of {joint.name}" for joint in config.joints),
+    ]
+    assert "offset_1 = 0.02 N m (constant torque)" in left
     again = read_urdf(tmp_path / "out.urdf", [joint.name for joint in config.joints])
     for one, other in zip(again.joints, bodies, strict=True):
         np.testing.assert_allclose(one.body.parameters, other.parameters, rtol=1e-9, atol=1e-12)
@@ -73,7 +84,9 @@ def test_a_gripper_keeps_its_inertia_and_the_arm_its_dynamics(
         assert each.mass > 0.0 and np.trace(each.inertia) > 0.0
         assert (each.mass == pytest.approx(mass if name == "finger" else 0.004)) is whole
     left = chain_files.export_chain_mjcf(cast("Any", None), model, tmp_path / "out.xml")
-    assert any("grip, which were held" in each and tip in each for each in left)
+    assert any("the joint grip, which was held" in each and tip in each for each in left)
+    assert "coulomb_width_2 = 0.02 rad/s (velocity width of the Coulomb friction step)" in left
+    assert not any(each.startswith(("offset", "lag", "torque per goal")) for each in left)
     stands_on = ET.parse(tmp_path / "out.xml").findall("worldbody/geom")
     assert [(each.get("type"), each.get("size")) for each in stands_on][-1] == ("cylinder", "0.05 0.1")
 
