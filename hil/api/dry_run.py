@@ -134,6 +134,10 @@ def dry_run(
             if done % max(1, of // 20) == 0:
                 on_progress(Progress("simulation", f"Simulated {done} of {of} motions"))
 
-        return Rehearsal(shown, checked, rehearse(checked, arms, servos, tell))
+        def designing(done: int, of: int) -> None:
+            if done % max(1, of // 4) == 0:
+                on_progress(Progress("simulation", f"Designing a path: {done} of {of} steps"))
+
+        return Rehearsal(shown, checked, rehearse(checked, arms, servos, tell, designing))
     rehearsed = rehearse_in_steps if checked.experiment.pilot else simulate
     return Rehearsal(shown, checked, rehearsed(checked, former, arms, servos, executor))

@@ -4,6 +4,7 @@ Stops are simulated from times spread over the planned path, on arms of the ense
 command it, and the fall without torque until the first collision.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from hil.clearance.space import LYING_RAD, Nearest, Space
 from hil.config.schema import Config
+from hil.estimator.chain.excitation.path_design import Tell, counted
 from hil.estimator.chain.simulation.rollout import ChainArms, Loop, roll_out
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import PathSegment
@@ -86,8 +88,11 @@ class ChainStops:
         return ""
 
 
-def foreseen_stops(config: Config, plan: Plan, arms: ChainArms) -> ChainStops:
-    """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError."""
+def foreseen_stops(config: Config, plan: Plan, arms: ChainArms, tell: Tell | None = None) -> ChainStops:
+    """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError.
+
+    tell: called with the number of simulations done and their total.
+    """
     segment = plan.segments[0]
     assert isinstance(segment, PathSegment)
     few = arms.first(ARMS)
@@ -95,10 +100,15 @@ def foreseen_stops(config: Config, plan: Plan, arms: ChainArms) -> ChainStops:
     count = path.position.shape[1]
     moments = np.linspace(0, count, MOMENTS, endpoint=False).astype(int)
     starts = [(each / plan.rate, path.position[:, each], path.velocity[:, each]) for each in moments]
-    return ChainStops(_hardest(config, plan.rate, few, starts), _lowered(config, plan, segment, few, starts))
+    told = counted(tell, 2 * len(starts) * few.size)
+    return ChainStops(
+        _hardest(config, plan.rate, few, starts, told), _lowered(config, plan, segment, few, starts, told)
+    )
 
 
-def _hardest(config: Config, rate: float, arms: ChainArms, starts: list[tuple[float, Array, Array]]) -> Fall:
+def _hardest(
+    config: Config, rate: float, arms: ChainArms, starts: list[tuple[float, Array, Array]], told: Callable[[], None]
+) -> Fall:
     space = Space.of(config)
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     n = len(low)
@@ -120,6 +130,7 @@ def _hardest(config: Config, rate: float, arms: ChainArms, starts: list[tuple[fl
             height, speed = _dropped(space, q[:, 0], q[:, max(end - 1, 0)], q[:, end], rate)
             if worst is None or (hit.size > 0, speed) > (worst.hits is not None, worst.speed):
                 worst = Fall(moment, pair, end / rate, height, speed, beyond)
+            told()
     assert worst is not None
     return Fall(worst.moment, worst.hits, worst.seconds, worst.height, worst.speed, np.maximum(beyond, 0.0))
 
@@ -139,7 +150,12 @@ def _slower(config: Config, longest: float) -> str:
 
 
 def _lowered(
-    config: Config, plan: Plan, segment: PathSegment, arms: ChainArms, starts: list[tuple[float, Array, Array]]
+    config: Config,
+    plan: Plan,
+    segment: PathSegment,
+    arms: ChainArms,
+    starts: list[tuple[float, Array, Array]],
+    told: Callable[[], None],
 ) -> LoweringForeseen:
     assert config.stabiliser is not None  # checked with the configuration
     way, space, rest = WayHome(config, plan), Space.of(config), np.array(config.arm.rest_pose)
@@ -160,6 +176,7 @@ def _lowered(
             if kept.any():
                 nearest = space.nearest(q[:, kept], on_the_way=True)
                 worst = nearest if worst is None or nearest.room < worst.room else worst
+            told()
     nothing = Nearest(np.inf, 0.0, ("nothing", "nothing"), 0)
     farthest = int(np.argmax(away))
     return LoweringForeseen(

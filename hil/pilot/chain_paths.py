@@ -10,7 +10,7 @@ from hil.config.chain import DEFAULT_BAND, POSITION_RESERVE
 from hil.config.schema import Config
 from hil.errors import NoSafeTorque
 from hil.estimator.chain.excitation.fourier_path import Path
-from hil.estimator.chain.excitation.path_design import Design, PathDesigner, PathLimits
+from hil.estimator.chain.excitation.path_design import Design, PathDesigner, PathLimits, Tell
 from hil.estimator.errors import ExcitationError
 from hil.plan.chain_model import ChainTorque, known_chain, limit_names, torque_limits
 from hil.plan.chain_plan import check_rest_pose, path_plan
@@ -66,8 +66,11 @@ class Paths:
     reserve: Reserve = RESERVE
 
     @classmethod
-    def of(cls, config: Config, thought: ChainTorque, reserve: Reserve = RESERVE) -> "Paths":
-        """Design the paths. Raises NoSafeTorque if no path is safe, ConfigError, or ArmFileError."""
+    def of(cls, config: Config, thought: ChainTorque, reserve: Reserve = RESERVE, tell: Tell | None = None) -> "Paths":
+        """Design the paths. Raises NoSafeTorque if no path is safe, ConfigError, or ArmFileError.
+
+        tell: called with the number of steps done and their total.
+        """
         check_rest_pose(config)
         known, space = known_chain(config), Space.of(config)
         most, rest = reserve.torque * torque_limits(config), np.array(config.arm.rest_pose)
@@ -97,7 +100,7 @@ class Paths:
                 experiment.band[1],
                 limits,
             )
-            best = designer.design(experiment.seed)
+            best = designer.design(experiment.seed, tell=tell)
             other = designer.widest(best.centre, experiment.seed + 1)
         except ExcitationError as error:
             raise NoSafeTorque(

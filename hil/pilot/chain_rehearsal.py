@@ -20,11 +20,14 @@ from hil.setup.idle_bus import quiet_stream
 SHOWN = 30
 
 
-def rehearse(config: Config, arms: int, servos: bool = False, tell: Tell | None = None) -> ChainDryRun:
+def rehearse(
+    config: Config, arms: int, servos: bool = False, tell: Tell | None = None, designing: Tell | None = None
+) -> ChainDryRun:
     """Simulate the configured path, or the pilot's first step as `hil identify` would choose it.
 
     Whether a pilot is safe is decided by `SafeShares`, as `hil identify` does; more arms only add to the peaks that are
-    shown. Raises ConfigError, NoSafeTorque; with `servos`, DriverError.
+    shown. tell, designing: called with the progress of each simulation, and of each path's design. Raises ConfigError,
+    NoSafeTorque; with `servos`, DriverError.
     """
     check_rest_pose(config)
     said = quiet_stream(config) if servos else ()
@@ -36,7 +39,8 @@ def rehearse(config: Config, arms: int, servos: bool = False, tell: Tell | None 
         return _simulated(config, plan, drawn, 1.0, None, tell, said)
     given = chain_config(config)
     belief = ChainBelief.prior(given)
-    search = SafeShares(given, belief, Paths.of(given, belief.torque), lambda _: None, tell=tell)
+    paths = Paths.of(given, belief.torque, tell=designing)
+    search = SafeShares(given, belief, paths, lambda _: None, tell=tell, designing=designing)
     played, refused = step_config(search.config), ""
     try:
         found = search.safe(played, PILOT_SHARES)
@@ -61,6 +65,6 @@ def _simulated(
     servos: tuple[str, ...],
 ) -> ChainDryRun:
     foreseen = predict_chain(config, plan, arms, tell, SHOWN)
-    stops, space = foreseen_stops(config, plan, arms), Space.of(config)
+    stops, space = foreseen_stops(config, plan, arms, tell), Space.of(config)
     guessed, built = space.shapes.guessed, space.as_built
     return ChainDryRun(config, "prior", arms.size, share, foreseen, stops, guessed, built, servos, refused)

@@ -43,7 +43,7 @@ SILENT_S = 30.0
 
 
 class Said:
-    """Passes messages on, and reports that simulations go on when nothing has been said for a while.
+    """Passes messages on, and reports that work goes on when nothing has been said for a while.
 
     now: the time [s].
     """
@@ -58,9 +58,16 @@ class Said:
         self._say(text)
 
     def tell(self, done: int, total: int) -> None:
-        """Report progress after every SILENT_S of silence."""
+        """Report the progress of simulations after every SILENT_S of silence."""
+        self._after_silence(f"Still looking for a motion safe for all arms: {done} of {total} simulations of this one.")
+
+    def designing(self, done: int, total: int) -> None:
+        """Report the progress of a path's design after every SILENT_S of silence."""
+        self._after_silence(f"Still designing a path: {done} of {total} steps.")
+
+    def _after_silence(self, text: str) -> None:
         if self._now() - self._at >= SILENT_S:
-            self.say(f"Still looking for a motion safe for all arms: {done} of {total} simulations of this one.")
+            self.say(text)
 
 
 @dataclass(kw_only=True)
@@ -77,13 +84,20 @@ class ChainSearch(SafeShares):
         """Design the paths and draw the prior ensemble. Raises NoSafeTorque, ConfigError, ArmFileError."""
         config = chain_config(config)
         belief = ChainBelief.prior(config)
-        paths = Paths.of(config, belief.torque)
-        say(
+        said = Said(say)
+        paths = Paths.of(config, belief.torque, tell=said.designing)
+        said.say(
             f"Designed a path that leaves the worst base parameter {100 * paths.identify.worst:.2g} % of its prior "
             f"standard error (held-out path, with random phases: {100 * paths.held_out.worst:.2g} %)."
         )
-        said = Said(say)
-        return cls(config, belief, paths, said.say, tell=said.tell, run=run, shown_path=shown_path, watch=watch)
+        return cls(
+            *(config, belief, paths, said.say),
+            tell=said.tell,
+            designing=said.designing,
+            run=run,
+            shown_path=shown_path,
+            watch=watch,
+        )
 
     def step(self, name: str, folder: str, shares: tuple[float, ...]) -> Found:
         """Play one step, compare it with the prediction, and update the belief."""

@@ -51,7 +51,8 @@ class SafeShares:
     """The current belief about the arm, and the paths designed for it.
 
     last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are shares of `paths`,
-    and are converted when these are replaced. tell: called with the progress of each simulation of the arms.
+    and are converted when these are replaced. tell: called with the progress of each simulation of the arms, designing:
+    with that of each path's design.
     """
 
     given: Config
@@ -61,6 +62,7 @@ class SafeShares:
     cap: float = 1.0
     last: float = np.inf
     tell: Tell | None = None
+    designing: Tell | None = None
 
     @property
     def config(self) -> Config:
@@ -104,7 +106,7 @@ class SafeShares:
         other = experiment.model_copy(update={"seed": experiment.seed + _NEXT_SEED})
         given, former = self.given.model_copy(update={"experiment": other}), self.paths
         try:
-            self.paths = Paths.of(given, self.belief.torque)
+            self.paths = Paths.of(given, self.belief.torque, tell=self.designing)
         except NoSafeTorque:
             return None
         self.given = given
@@ -127,7 +129,7 @@ class SafeShares:
                 break
             former, reserve = self.paths, reserve.larger(shortage)
             try:
-                self.paths = Paths.of(self.given, self.belief.torque, reserve)
+                self.paths = Paths.of(self.given, self.belief.torque, reserve, self.designing)
             except NoSafeTorque:
                 break
             times = self.paths.amplitude_over(former)
@@ -169,7 +171,9 @@ class SafeShares:
 
     def _unsafe_stop(self, config: Config, plan: Plan) -> str:
         """Explain why a stop would not lower the arm safely; "" if it would."""
-        return "" if config.safety.stop == "cut" else foreseen_stops(config, plan, self.belief.arms.first(ARMS)).unsafe
+        if config.safety.stop == "cut":
+            return ""
+        return foreseen_stops(config, plan, self.belief.arms.first(ARMS), self.tell).unsafe
 
 
 def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:

@@ -66,13 +66,20 @@ def plan_of(config: Config) -> Plan:
     return make_chain_plan(config) if config.is_chain else make_plan(config)
 
 
+def missing_path(config: Config) -> str:
+    """Say that a spatial arm without a pilot lacks its path; "" if it does not."""
+    if config.joint_path is not None:
+        return ""
+    return (
+        "joint_path is missing: give [joint_path] with centre, swing and speed per joint, or set "
+        "experiment.pilot = true, which finds them."
+    )
+
+
 def make_chain_plan(config: Config) -> Plan:
     """Design the paths; the same seed gives the same plan. Raises ConfigError."""
-    if config.joint_path is None or config.experiment.band is None:
-        raise ConfigError(
-            f"{config.path}: joint_path is missing: give [joint_path] with centre, swing and speed per joint, or set "
-            "experiment.pilot = true, which finds them."
-        )
+    if why := missing_path(config):
+        raise ConfigError(f"{config.path}: {why}")
     known = known_chain(config)
     return path_plan(config, described_torque(config, known), partial(_designed, known))
 

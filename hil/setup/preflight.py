@@ -19,7 +19,8 @@ from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode
 from hil.errors import ConfigError
-from hil.plan.chain_plan import check_rest_pose
+from hil.estimator.errors import EstimationError
+from hil.plan.chain_plan import check_clearance, check_rest_pose, make_chain_plan, missing_path
 from hil.plan.find_torque import how_to_find_torque
 from hil.plan.stabiliser import too_slow
 from hil.rest_pose_hint import rest_pose_hint, within_limits
@@ -96,6 +97,23 @@ def _torque_of_pilot(config: Config) -> Iterator[Finding]:
         yield Finding(Level.STOP, "experiment", "torque", "experiment.peak_torque is missing", fix)
 
 
+def _path(config: Config) -> Iterator[Finding]:
+    """Report a path of a spatial arm that a run without a pilot would refuse."""
+    if why := missing_path(config):
+        yield Finding(Level.STOP, "experiment", "path", "joint_path is missing", why)
+        return
+    try:
+        plan = make_chain_plan(config)
+        if not config.is_fake:
+            check_clearance(config, plan)
+    except (ConfigError, EstimationError) as error:
+        yield Finding(Level.STOP, "experiment", "path", "refused", str(error))
+    else:
+        yield Finding(
+            Level.OK, "experiment", "path", "within the limits of torque" + ("" if config.is_fake else ", clear")
+        )
+
+
 def _described(config: Config) -> Iterator[Finding]:
     """Report what is doubtful about the description, and whether the rest pose of a spatial arm is clear."""
     for doubt in doubts(config):
@@ -108,6 +126,8 @@ def _described(config: Config) -> Iterator[Finding]:
         yield Finding(Level.STOP, "arm", "rest pose", "not free", str(error))
         return
     yield Finding(Level.OK, "arm", "rest pose", "clear of itself, the floor and the boxes")
+    if not config.experiment.pilot:
+        yield from _path(config)
 
 
 def _latency_timer(bus: ServoBus) -> Finding:

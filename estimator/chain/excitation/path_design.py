@@ -66,6 +66,23 @@ class Design:
     median: float
 
 
+Tell = Callable[[int, int], None]
+"""Called with the number of steps done and their total."""
+
+
+def counted(tell: Tell | None, total: int) -> Callable[[], None]:
+    """Return a function to be called after each of `total` steps, which reports their number to `tell`."""
+    done = 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if tell is not None:
+            tell(done, total)
+
+    return step
+
+
 class PathDesigner:
     """Designs paths of one period [s] at `rate` with harmonics up to `highest` [Hz]. Raises ExcitationError.
 
@@ -105,10 +122,14 @@ class PathDesigner:
             raise ExcitationError("no path about this centre stays within the torque and clearance limits")
         return found
 
-    def design(self, seed: int, generations: int = GENERATIONS) -> Design:
-        """Return the best path found; raises ExcitationError if none is allowed."""
+    def design(self, seed: int, generations: int = GENERATIONS, tell: Tell | None = None) -> Design:
+        """Return the best path found; raises ExcitationError if none is allowed.
+
+        tell: called with the number of steps done and their total.
+        """
         random = np.random.default_rng(seed)
-        centre, lines = self._start(random)
+        told = counted(tell, CENTRES + generations)
+        centre, lines = self._start(random, told)
         mean = np.concatenate((self._shares_of(centre), lines.real.reshape(-1), lines.imag.reshape(-1)))
         score = self._score(mean)
         best, step = mean, FIRST_STEP
@@ -125,6 +146,7 @@ class PathDesigner:
             chosen = order[: PARENTS - 1]
             finite = chosen[np.isfinite(scores[chosen])]
             mean = np.mean([best, *offspring[finite]], axis=0)
+            told()
         centre, lines = self._split(best)
         found = self._finished(centre, lines)
         if found is None:
@@ -142,11 +164,12 @@ class PathDesigner:
         errors = self._errors(path, max(1, path.position.shape[1] // LOOKED_AT))
         return float(errors.max()), float(np.median(errors))
 
-    def _start(self, random: np.random.Generator) -> tuple[Array, Array]:
+    def _start(self, random: np.random.Generator, told: Callable[[], None]) -> tuple[Array, Array]:
         """Return centre and coefficients of the best random path, about random centres or the middle of the limits."""
         low, high = self._limits.low, self._limits.high
         best: tuple[float, Array, Array] | None = None
         for number in range(CENTRES):
+            told()
             share = np.full(self._joints, 0.5) if number < 4 else random.uniform(0.15, 0.85, self._joints)
             centre, lines = low + share * (high - low), self._random_lines(random)
             path = self._fitted(centre, lines, self._few)

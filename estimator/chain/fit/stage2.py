@@ -204,9 +204,10 @@ def _at_bound(problem: ChainProblem, minimum: Minimum, value: Array, std: Array)
     slopes = np.diag(problem.coordinates.slopes(minimum.x[: value.size]))
     step, white = step_beyond(minimum.at.normal, minimum.at.gradient, slopes)
     used = np.array([index < base.count or kind_of(name) in ("viscous", "coulomb") for index, name in enumerate(names)])
-    if np.any(np.abs(step[used]) > MOVED * finite_std(std, white)[used]):
-        lower = np.where(problem.coordinates.positive, 0.0, -np.inf)
-        beyond = beyond_range(value, step, white, lower, np.full(value.size, np.inf))
+    lower = np.where(problem.coordinates.positive, 0.0, -np.inf)
+    beyond = beyond_range(value, step, white, lower, np.full(value.size, np.inf))
+    # The bound itself may cause a misfit that makes the parameter's standard error larger than the step beyond it.
+    if beyond[used].any() or np.any(np.abs(step[used]) > MOVED * finite_std(std, white)[used]):
         found += [name for name, over in zip(names, beyond, strict=True) if over]
     return tuple(found)
 

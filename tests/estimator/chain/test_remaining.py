@@ -1,6 +1,8 @@
 """How far a fit has stopped from its minimum, and what follows from it."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from benchmarks import chain as bench
 from hil.estimator.chain import identify
 from hil.estimator.chain.fit import stage2
 from hil.estimator.chain.fit.coordinates import ChainCoordinates
+from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.fit.options import ChainOptions
 from hil.estimator.chain.fit.remaining import remaining
 from hil.estimator.chain.identify import ChainEstimate, identify_chain
@@ -122,6 +125,19 @@ def test_a_positive_parameter_that_has_run_to_zero_does_not_count() -> None:
     step, decrease = remaining(Minimum(np.log(slopes), Quadratic(1.0, normal, -normal @ missing), 1), names)
     np.testing.assert_allclose(step, [-1.0, 0.02], atol=1e-6)
     assert decrease == pytest.approx(1e8 * 0.001**2, rel=1e-2)
+
+
+@pytest.mark.parametrize("misfit", [1.0, 1e4])
+def test_a_bound_counts_whatever_misfit_it_causes(misfit: float) -> None:
+    slopes, best = np.array([1e-9, 0.05]), np.array([-0.01, 0.051])
+    normal = np.diag(1e8 * slopes**2)
+    minimum = Minimum(np.log(slopes), Quadratic(1.0, normal, -normal @ ((best - slopes) / slopes)), 1)
+    problem = SimpleNamespace(
+        coordinates=ChainCoordinates(("viscous_1", "coulomb_1"), np.ones(2), np.zeros(0)),
+        model=SimpleNamespace(base=SimpleNamespace(count=0, chain=SimpleNamespace(joints=1))),
+    )
+    std = misfit * 1e-4 * np.ones(2)
+    assert stage2._at_bound(cast("ChainProblem", problem), minimum, slopes, std) == ("viscous_1",)
 
 
 @pytest.mark.parametrize("taken", [1.02, 1.2])

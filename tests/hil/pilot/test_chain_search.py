@@ -13,6 +13,8 @@ from hil.config.schema import Config, load_config, parse_config
 from hil.dry_run import chain_summary
 from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
+from hil.dry_run.chain_stop import ARMS as STOPPED
+from hil.dry_run.chain_stop import MOMENTS
 from hil.dry_run.chain_summary import chain_dry_run_lines, unsafe
 from hil.errors import Cause, ConfigError, DidNotMove, NoSafeTorque, NotSettled, SafetyStop
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
@@ -244,7 +246,7 @@ def test_paths_that_are_rejected_do_not_make_later_ones_smaller(monkeypatch: pyt
     search = search_of(config, ChainBelief.prior(config), [])
     designed, tried = search.paths, []
 
-    def of(_: object, __: object, reserve: Reserve) -> Paths:
+    def of(_: object, __: object, reserve: Reserve, ___: object) -> Paths:
         tried.append(reserve)
         return replace(designed, reserve=reserve)
 
@@ -291,7 +293,7 @@ def test_another_path_starts_with_no_more_amplitude_than_the_one_it_replaces(mon
         share = 0.0 if search.paths is designed else shares[0]
         return Found(share, cast("Any", None), cast("Any", None)) if share else None, "too much torque", 0.0
 
-    monkeypatch.setattr(Paths, "of", lambda *_: other)
+    monkeypatch.setattr(Paths, "of", lambda *_, **__: other)
     monkeypatch.setattr(search, "_largest", largest)
     found = search.safe(search.config, (1.0, 0.5), 2.5 * search.last)
     assert tried == [(0.5, 0.25), (pytest.approx(0.125), pytest.approx(0.0625))]
@@ -304,8 +306,11 @@ def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.setattr(f"hil.pilot.{place}", 4 if "SEARCH" in place else 12)
     text = LEG.read_text(encoding="utf-8").replace("period = 10.0", "period = 5.0")
     config, told = parse_config(text, LEG), list[int]()
-    first = rehearse(config, 4, tell=lambda _, of: told.append(of))
+    designed = list[tuple[int, int]]()
+    first = rehearse(config, 4, tell=lambda _, of: told.append(of), designing=lambda *each: designed.append(each))
     assert (told.count(4), told.count(12)) == (4, 2 * 12)  # also while it searches
+    assert told.count(2 * MOMENTS * STOPPED) == 2 * 2 * MOMENTS * STOPPED, "its stops as well"
+    assert designed[0] == (1, designed[-1][1]) and designed[-1][0] == len(designed) == designed[-1][1]
     pilot = ChainSearch.of(config, cast("Any", None), LEG, cast("Any", None), lambda _: None)
     found = pilot.safe(step_config(pilot.config), PILOT_SHARES)
     assert (first.share, first.is_safe(first.config)) == (found.share, True)
@@ -322,7 +327,7 @@ def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("hil.pilot.chain_shares.REDESIGNS", 0)
     with pytest.raises(NoSafeTorque) as refused:
         pilot.safe(step_config(pilot.config), PILOT_SHARES)
-    monkeypatch.setattr(Paths, "of", lambda *_: pilot.paths)
+    monkeypatch.setattr(Paths, "of", lambda *_, **__: pilot.paths)
     again = rehearse(config, 4)
     assert again.why_not(again.config) == str(refused.value)
     assert not again.is_safe(again.config)
@@ -365,3 +370,11 @@ def test_a_long_search_is_not_silent() -> None:
     for done in (1, 2, 3, 4):
         said.tell(done, 9)
     assert ["2 of 9" in lines[0], "4 of 9" in lines[1], len(lines)] == [True, True, 2]
+
+
+def test_a_long_design_is_not_silent() -> None:
+    times, lines = iter([0.0, 10.0, 31.0, 31.0]), list[str]()
+    said = Said(lines.append, lambda: next(times))
+    said.designing(1, 9)
+    said.designing(2, 9)
+    assert lines == ["Still designing a path: 2 of 9 steps."]

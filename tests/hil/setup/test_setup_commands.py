@@ -17,6 +17,7 @@ from hil.drivers.errors import NoReply, WrongSetting
 from hil.drivers.port import Port, open_port
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.faults import Fault
+from hil.setup import preflight
 from hil.setup.preflight import Finding, Level, check_arm
 from hil.setup.scan import Asking, scan
 from hil.setup.servo_settings import open_servo, set_up
@@ -119,7 +120,7 @@ def test_a_rest_pose_inside_the_floor_is_found_by_the_check(tmp_path: Path) -> N
     text = (CONFIGS / "fake_open_manipulator_x.toml").read_text(encoding="utf-8")
     (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
     found = look(load_config(tmp_path / "arm.toml"))
-    assert found["arm", "rest pose"].level is Level.OK
+    assert found["arm", "rest pose"].level is found["experiment", "path"].level is Level.OK
     high = re.sub(r'(?m)^floor = "none".*$', "floor = 0.2", text)
     assert high != text
     (tmp_path / "arm.toml").write_text(high, encoding="utf-8")
@@ -129,6 +130,15 @@ def test_a_rest_pose_inside_the_floor_is_found_by_the_check(tmp_path: Path) -> N
     (tmp_path / urdf).write_text(re.sub(r"<box size=", "<mesh filename=", described, count=1), encoding="utf-8")
     doubted = look(load_config(tmp_path / "arm.toml"))["arm", "description"]
     assert doubted.level is Level.WARNING and "is not used: there is no such file" in doubted.fix
+
+
+def test_check_reports_a_path_that_a_run_would_refuse() -> None:
+    spatial = load_config(CONFIGS / "fake_open_manipulator_x.toml")
+    (missing,) = preflight._path(spatial.model_copy(update={"joint_path": None}))
+    assert missing.level is Level.STOP and "experiment.pilot = true, which finds" in missing.fix
+    weak = [joint.model_copy(update={"current_limit": 0.1}) for joint in spatial.joints]
+    (heavy,) = preflight._path(spatial.model_copy(update={"joints": weak}))
+    assert heavy.level is Level.STOP and "lower joint_path.speed or swing" in heavy.fix
 
 
 @pytest.mark.parametrize(
