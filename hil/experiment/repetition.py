@@ -6,7 +6,9 @@ only a few divisions remain at its end. The previous period is kept in one buffe
 The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same
 sample of the previous period. If they differ by more than `TIMES` the RMS difference between the two previous periods,
 plus `FLOOR_RAD`, for `LASTING_S`, the joint does not repeat its motion (`unlike`). In the second half of the second
-period, the RMS difference in its first half is used instead, since transients only decay.
+period, the RMS difference in its first half is used instead, since transients only decay. For the same reason the
+accepted deviation grows by at most `GROWTH` from one period to the next: a disturbance that begins near the end of a
+period would otherwise enlarge what is accepted in the next one.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,6 +26,7 @@ TIMES = 10.0
 FLOOR_RAD = 0.05
 """Deviation from the previous period that is always accepted, because stiction may end slightly earlier or later."""
 
+GROWTH = 1.25
 LASTING_S = 0.03
 _FEWEST = 2  # samples, however low the rate
 
@@ -58,6 +61,7 @@ class Repetition:
         self._latest = np.full(joints, np.nan)
         self._pack = Struct(f"{joints}d").pack_into
         self._bytes = memoryview(self._latest.data).cast("B")
+        self._allowed = np.full(joints, inf)
         self.begin(samples)
         _add(self._former, self._sums, self._allowed, self._unlike_for, self._latest, 0, False, True)  # compile
         self._compare = only_version(_add)
@@ -69,7 +73,8 @@ class Repetition:
         """
         self._anew = anew
         self._half = samples // 2
-        self._allowed = np.array([inf if anew else TIMES * _rms_change(sums) + FLOOR_RAD for sums in self._sums])
+        change = np.array([inf if anew else TIMES * _rms_change(sums) + FLOOR_RAD for sums in self._sums])
+        self._allowed = change if anew else np.minimum(change, GROWTH * self._allowed)
         self._unlike_for = np.zeros(len(self._sums), np.int64)
         self._sums = np.zeros(len(self._sums), _SUMS)
         self._sums["lowest"], self._sums["highest"] = inf, -inf

@@ -128,6 +128,15 @@ def test_in_the_second_half_of_the_second_period_differences_no_longer_grow(rms:
     assert unlike_at(earlier[:2]) is None, "it may be a transient"
 
 
+@pytest.mark.parametrize("size", [0.05, 0.06])
+def test_a_disturbance_that_begins_before_the_end_of_a_period_is_not_accepted_in_the_next(size: float) -> None:
+    periods = drifting(7, 0.001)
+    periods[2, 0, -40:] += np.linspace(0.0, size, 40)
+    assert unlike_at(periods[:3]) is None
+    periods[3, 0] += size + 0.03
+    assert unlike_at(periods) == (3, 2, 0)
+
+
 def test_other_torques_may_give_another_motion() -> None:
     """A held-out segment follows the one that is fitted."""
     first, second = drifting(4, 1e-3), drifting(5, 1e-3) * 0.3 + 0.5
