@@ -97,6 +97,11 @@ def test_repeated_readings_count_as_a_few(setup: bench.Setup) -> None:
     np.testing.assert_allclose(counted, [1600, 1600, 1600 * REPEATED / 16, 1600 * REPEATED / 50])
 
 
+def test_the_lag_starts_between_the_delay_of_stage_1_and_the_typical_lag() -> None:
+    assert starts.initial_lag(4e-3, DEFAULTS) == pytest.approx(2e-3)
+    assert starts.initial_lag(-1e-3, DEFAULTS) >= DEFAULTS.min_initial_lag
+
+
 @dataclass(frozen=True)
 class Softer:
     """A problem whose minimum has a known cost under each observer, from the data and from the prior.
