@@ -6,9 +6,8 @@ only a few divisions remain at its end. The previous period is kept in one buffe
 The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same
 sample of the previous period. If they differ by more than `TIMES` the RMS difference between the two previous periods,
 plus `FLOOR_RAD`, for `LASTING_S`, the joint does not repeat its motion (`unlike`). In the second half of the second
-period, the RMS difference in its first half is used instead, since transients only decay. For the same reason the
-accepted deviation grows by at most `GROWTH` from one period to the next: a disturbance that begins near the end of a
-period would otherwise enlarge what is accepted in the next one.
+period, the RMS difference in its first half is used instead, since transients only decay. The last `UNJUDGED_S` of
+a period do not count for what is accepted in the next: a disturbance that has just begun there would enlarge it.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,8 +25,10 @@ TIMES = 10.0
 FLOOR_RAD = 0.05
 """Deviation from the previous period that is always accepted, because stiction may end slightly earlier or later."""
 
-GROWTH = 1.25
 LASTING_S = 0.03
+UNJUDGED_S, _MOST_UNJUDGED = 0.2, 0.25
+"""Time at the end of a period that does not count for what is accepted in the next [s], and its largest share."""
+
 _FEWEST = 2  # samples, however low the rate
 
 
@@ -35,7 +36,11 @@ _EARLY = "early_squared", "early_pairs"
 _SUMS = np.dtype(
     [
         (name, "f8")
-        for names in (("lowest", "highest", "first", "squared", "sum", "sum_of_squares", "pairs", "seen"), _EARLY)
+        for names in (
+            ("lowest", "highest", "first", "squared", "sum", "sum_of_squares", "pairs", "seen"),
+            _EARLY,
+            ("sure_squared", "sure_pairs"),
+        )
         for name in names
     ]
 )
@@ -44,6 +49,7 @@ _SUMS = np.dtype(
 lowest, highest: range of its positions [rad]. first: first one compared, which is subtracted from the others to avoid
 cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of squares
 and number of changes from the period before. early_squared, early_pairs: the same for the first half of the period.
+sure_squared, sure_pairs: the same for the second half without its end.
 """
 
 
@@ -54,16 +60,16 @@ class Repetition:
     """
 
     def __init__(self, samples: int, joints: int, interval: float) -> None:
-        self._half = 0
+        self._half = self._sure = 0
+        self._unjudged = round(UNJUDGED_S / interval)
         self._lasting = max(_FEWEST, round(LASTING_S / interval))
         self._sums = np.zeros(joints, _SUMS)
         self._former = np.full((joints, samples), np.nan)
         self._latest = np.full(joints, np.nan)
         self._pack = Struct(f"{joints}d").pack_into
         self._bytes = memoryview(self._latest.data).cast("B")
-        self._allowed = np.full(joints, inf)
         self.begin(samples)
-        _add(self._former, self._sums, self._allowed, self._unlike_for, self._latest, 0, False, True)  # compile
+        _add(self._former, self._sums, self._allowed, self._unlike_for, self._latest, 0, False, False, True)  # compile
         self._compare = only_version(_add)
 
     def begin(self, samples: int, *, anew: bool = False) -> None:
@@ -73,8 +79,8 @@ class Repetition:
         """
         self._anew = anew
         self._half = samples // 2
-        change = np.array([inf if anew else TIMES * _rms_change(sums) + FLOOR_RAD for sums in self._sums])
-        self._allowed = change if anew else np.minimum(change, GROWTH * self._allowed)
+        self._sure = samples - min(self._unjudged, int(_MOST_UNJUDGED * samples))
+        self._allowed = np.array([inf if anew else TIMES * _rms_change(sums) + FLOOR_RAD for sums in self._sums])
         self._unlike_for = np.zeros(len(self._sums), np.int64)
         self._sums = np.zeros(len(self._sums), _SUMS)
         self._sums["lowest"], self._sums["highest"] = inf, -inf
@@ -84,9 +90,9 @@ class Repetition:
     def add(self, index: int, position: Sequence[float]) -> None:
         """Add sample `index` of the period: positions of all joints [rad], NaN where missing."""
         self._pack(self._bytes, 0, *position)
-        compared = index >= self._half
+        compared, sure = index >= self._half, index < self._sure
         joint = self._compare(
-            self._former, self._sums, self._allowed, self._unlike_for, self._latest, index, compared, self._anew
+            self._former, self._sums, self._allowed, self._unlike_for, self._latest, index, compared, sure, self._anew
         )
         self.unlike = joint if self._unlike_for[joint] >= self._lasting else None
 
@@ -107,8 +113,8 @@ class Repetition:
 
 
 def _rms_change(sums: Any) -> float:
-    """RMS difference from the period before [rad]; infinite if there was none to compare with."""
-    return sqrt(sums["squared"] / sums["pairs"]) if sums["pairs"] else inf
+    """RMS difference from the period before, except at the end [rad]; infinite if there was none to compare with."""
+    return sqrt(sums["sure_squared"] / sums["sure_pairs"]) if sums["sure_pairs"] else inf
 
 
 def _relative(sums: Any) -> float:
@@ -124,7 +130,15 @@ def _relative(sums: Any) -> float:
 
 
 def _add_loop(
-    former: Any, all_sums: Any, allowed: Any, unlike_for: Any, position: Any, index: int, compared: bool, anew: bool
+    former: Any,
+    all_sums: Any,
+    allowed: Any,
+    unlike_for: Any,
+    position: Any,
+    index: int,
+    compared: bool,
+    sure: bool,
+    anew: bool,
 ) -> int:
     """Add one sample; return the joint that has differed from the previous period for longest."""
     longest = 0
@@ -151,6 +165,9 @@ def _add_loop(
                     change = latest - before
                     sums.pairs += 1.0
                     sums.squared += change * change
+                    if sure:
+                        sums.sure_pairs += 1.0
+                        sums.sure_squared += change * change
         former[joint, index] = latest
         if unlike_for[joint] > unlike_for[longest]:
             longest = joint

@@ -131,7 +131,7 @@ def test_in_the_second_half_of_the_second_period_differences_no_longer_grow(rms:
 @pytest.mark.parametrize("size", [0.05, 0.06])
 def test_a_disturbance_that_begins_before_the_end_of_a_period_is_not_accepted_in_the_next(size: float) -> None:
     periods = drifting(7, 0.001)
-    periods[2, 0, -40:] += np.linspace(0.0, size, 40)
+    periods[2, 0, -20:] += np.linspace(0.0, size, 20)
     assert unlike_at(periods[:3]) is None
     periods[3, 0] += size + 0.03
     assert unlike_at(periods) == (3, 2, 0)
