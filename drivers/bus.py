@@ -23,7 +23,7 @@ from hil.drivers.preparation.prepare import (
     shuts_down,
 )
 from hil.drivers.servo import Servo, describe_error
-from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode
+from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode, with_article
 from hil.drivers.state import NAN, Converter, State, fold, read_back_spans, spans
 from hil.drivers.sync_read import Answer
 from hil.drivers.torque_off import TorqueOff, cut_again, cut_torque, disarm_watchdogs, signals_held_back, was_rebooted
@@ -159,10 +159,12 @@ class ServoBus:
         for joint, servo in self._servos.items():
             number = servo.ping()
             if number != servo.table.number:
-                found = model_names().get(number, f"model number {number}")
+                known = model_names().get(number)
+                found = with_article(known) if known else f"a servo with model number {number}"
                 raise WrongModel(
-                    f"{joint.title}: a {found} answers at ID {joint.id}, but the configuration has a "
-                    f"{joint.servo.name}. Correct `model` or `id` in the configuration, or change the servo's ID."
+                    f"{joint.title}: {found} answers at ID {joint.id}, but the configuration has "
+                    f"{with_article(joint.servo.name)}. Correct `model` or `id` in the configuration, or change the "
+                    "servo's ID."
                 )
             firmware = servo.read("Firmware Version")
             if firmware < joint.servo.watchdog_firmware:

@@ -271,12 +271,20 @@ SERVO_MODELS: Mapping[str, ServoModel] = MappingProxyType({model.name: model for
 """The supported servo models, by name."""
 
 
+_READ_WITH_A_VOWEL = tuple("AEFHILMNORSXu")  # "ex", "em"; and "unknown"
+
+
 def servo_model(name: str) -> ServoModel:
     """Return the model with this name; raises UnknownModel, listing the supported names."""
     try:
         return SERVO_MODELS[name]
     except KeyError:
         raise UnknownModel(f"{name!r} is not a supported servo model. Supported: {', '.join(SERVO_MODELS)}.") from None
+
+
+def with_article(name: str) -> str:
+    """Precede the name of a servo model by "a" or "an", as it is read aloud: "an XM430-W350", "a PH42"."""
+    return f"{'an' if name[:1] in _READ_WITH_A_VOWEL else 'a'} {name}"
 
 
 def fastest_no_load() -> float:

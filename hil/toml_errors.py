@@ -114,8 +114,26 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
         # The message about a whole table already names its keys.
         about = key if isinstance(detail["input"], dict | BaseModel) else f"{key} = {_shown(detail['input'])}"
         return f"{about}: {context['error']}" if key else str(context["error"])
-    message = _EXPECTED.get(kind) or _constraint(kind, context, detail["input"]) or str(detail["msg"])
+    message = _exact_length(detail, root) or _EXPECTED.get(kind) or _constraint(kind, context, detail["input"])
+    message = message or str(detail["msg"])
     return f"{key} = {_shown(detail['input'])}: {message}{_unit_hint(detail, root)}{_brackets_hint(key, detail)}"
+
+
+def _exact_length(detail: Any, root: type[BaseModel]) -> str:
+    """For a list that is too short or too long: how many entries it must have, if there is only one such number."""
+    if detail["type"] not in {"too_short", "too_long"}:
+        return ""
+    field = _field_of(detail, root)
+    lengths = {} if field is None else {type(each).__name__: each for each in field.metadata}
+    if "MinLen" not in lengths or "MaxLen" not in lengths:
+        return ""
+    least, most = lengths["MinLen"].min_length, lengths["MaxLen"].max_length
+    return f"must have exactly {least} entries" if least == most else ""
+
+
+def _field_of(detail: Any, root: type[BaseModel]) -> Any:
+    keys = [part for part in detail["loc"] if isinstance(part, str) and not part.startswith(UNSAID)]
+    return fields_of(_table(detail["loc"], root)).get(keys[-1]) if keys else None
 
 
 def _brackets_hint(key: str, detail: Any) -> str:
@@ -138,8 +156,7 @@ def _unit_hint(detail: Any, root: type[BaseModel]) -> str:
     value = detail["input"]
     if detail["type"] not in _BOUNDS or isinstance(value, bool) or not isinstance(value, int | float):
         return ""
-    keys = [part for part in detail["loc"] if isinstance(part, str) and not part.startswith(UNSAID)]
-    field = fields_of(_table(detail["loc"], root)).get(keys[-1]) if keys else None
+    field = _field_of(detail, root)
     if field is None:
         return ""
     hint = in_other_units(value, unit_of(field.description), allowed_by(field))

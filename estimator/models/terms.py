@@ -328,7 +328,7 @@ def joint_of(name: str) -> int | None:
 def base_names(joints: int) -> tuple[str, ...]:
     """Return the names of the base parameters, in the order of every vector of them; raises ModelError."""
     if joints not in RIGID_BODY:
-        raise ModelError(f"an arm of {joints} joints: the arm model has one or two joints")
+        raise ModelError(f"an arm of {joints} joints: the planar arm model supports one or two")
     friction = (f"{term}_{joint + 1}" for term in BASE_FRICTION for joint in range(joints))
     return (*RIGID_BODY[joints], *friction)
 

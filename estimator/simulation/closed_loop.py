@@ -1,9 +1,8 @@
 """The arm's motion under commands that depend on its state: a software spring and damper, a brake.
 
-The equations are those of `hil.estimator.simulation.arm`, including the torque scale; so is the default integration
-step. A command is computed once per sample from the state at the previous sample, as on the bus, limited, and held;
-the motor follows it with a first-order lag. A pure delay of the drive is added to that lag, which is equivalent to
-first order.
+The equations, including the torque scale, and the default integration step are those of `hil.estimator.simulation.arm`.
+A command is computed once per sample from the state at the previous sample, as on the bus, limited, and held; the motor
+follows it with a first-order lag. A pure delay of the drive is added to that lag, which is equivalent to first order.
 """
 
 import math

@@ -86,6 +86,8 @@ def estimate(
 
 def are_recordings(paths: Sequence[Path]) -> bool:
     """Whether these are recordings of other tools and not one run folder; raises ValueError for a mixture."""
+    if not paths:
+        raise ValueError("no recording is given: name a run folder, or recordings (CSV, Parquet, MCAP).")
     files = [is_recording(path) for path in paths]
     if any(files) and not all(files):
         raise ValueError("give either one run folder or recordings (CSV, Parquet, MCAP), not both.")

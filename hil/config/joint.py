@@ -6,7 +6,7 @@ from pydantic import Field, PositiveFloat, field_validator, model_validator
 
 from hil.config.table import BusId, OneOrList, Range, Table
 from hil.drivers.joint import Joint, SecondServo
-from hil.drivers.servo_model import SERVO_MODELS, Mode, servo_model
+from hil.drivers.servo_model import SERVO_MODELS, Mode, servo_model, with_article
 
 USUAL_TORQUE_SPREAD = 0.1
 """Relative standard deviation of the torque constant among servos of one model."""
@@ -21,7 +21,11 @@ class JointConfig(Table):
     turns: OneOrList[Literal[-1, 1]] = Field(
         1, alias="direction", description="-1 where the servo turns opposite to the joint; one entry per servo"
     )
-    zero_ticks: int = Field(ge=-1_048_575, le=1_048_575, description="Present Position where the angle is zero")
+    zero_ticks: int = Field(
+        ge=-1_048_575,
+        le=1_048_575,
+        description="Present Position where the angle is zero",
+    )
     mode: Literal["current", "pwm"] | None = Field(None, description="default: current if the servo model supports it")
     torque_constant: PositiveFloat | None = Field(None, le=100, description="N m/A at the output shaft")
     torque_constant_std: float = Field(0.0, ge=0, le=100, description="N m/A")
@@ -39,6 +43,13 @@ class JointConfig(Table):
         if bad := [each for each in name if not each.isprintable()]:
             raise ValueError(f"{name!a}: {bad[0]!a} is not a printable character")
         return name
+
+    @field_validator("zero_ticks", mode="before")
+    @classmethod
+    def _of_the_first_servo(cls, ticks: object) -> object:
+        if isinstance(ticks, list):
+            raise ValueError("it must be one whole number: of two servos, that of the first")  # noqa: TRY004  pydantic's
+        return ticks
 
     @field_validator("turns", mode="before")
     @classmethod
@@ -88,7 +99,7 @@ class JointConfig(Table):
     def _driven(self) -> Self:
         pwm = self.drive_mode is Mode.PWM
         if not pwm and servo_model(self.model).current_unit is None:
-            raise ValueError(f'mode = "current": an {self.model} has no current mode; use "pwm"')
+            raise ValueError(f'mode = "current": {with_article(self.model)} has no current mode; use "pwm"')
         values = (self.torque_constant, self.current_limit), (self.torque_per_volt, self.voltage_limit)
         names = ("torque_constant", "current_limit"), ("torque_per_volt", "voltage_limit")
         mode = self.drive_mode.name.lower()

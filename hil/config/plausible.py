@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from hil.drivers.servo_model import Mode, servo_model
+from hil.drivers.servo_model import Mode, servo_model, with_article
 from hil.unit_hints import in_other_units
 
 if TYPE_CHECKING:
@@ -62,8 +62,8 @@ def _joint(joint: "JointConfig") -> Iterator[str]:
     if not 1 / _GEAR < ratio < _GEAR:
         yield (
             f"{name} of {where} = {joint.torque_per_goal:g} {unit} is {ratio:.3g} times the published {published:.3g} "
-            f"{unit} of an {joint.model}. Use N m at the output shaft, not mN m, kgf cm or the torque of the bare motor"
-            + _meant(joint.torque_per_goal, unit, _GEAR * published, published / _GEAR)
+            f"{unit} of {with_article(joint.model)}. Use N m at the output shaft, not mN m, kgf cm or the torque of "
+            "the bare motor" + _meant(joint.torque_per_goal, unit, _GEAR * published, published / _GEAR)
         )
     std = joint.torque_per_goal_std
     if std > joint.torque_per_goal:
@@ -86,8 +86,8 @@ def _joint(joint: "JointConfig") -> Iterator[str]:
     if joint.goal_limit > _CURRENT * stall:
         name, unit, kind = ("voltage_limit", "V", "supply") if pwm else ("current_limit", "A", "stall current")
         yield (
-            f"{name} of {where} = {joint.goal_limit:g} {unit}: the {kind} of an {joint.model} is {stall:g} {unit}"
-            + _meant(joint.goal_limit, unit, _CURRENT * stall)
+            f"{name} of {where} = {joint.goal_limit:g} {unit}: the {kind} of {with_article(joint.model)} is "
+            f"{stall:g} {unit}" + _meant(joint.goal_limit, unit, _CURRENT * stall)
         )
 
 
@@ -174,7 +174,7 @@ def _heaviest(stall_torque: float) -> float:
 def _too_much(key: str, value: float, most: float, unit: str, joint: "JointConfig") -> Iterator[str]:
     if value > most:
         yield (
-            f"{key} = {value:g} {unit}: far more than an {joint.model} can move ({most:.3g} {unit})"
+            f"{key} = {value:g} {unit}: far more than {with_article(joint.model)} can move ({most:.3g} {unit})"
             + (_meant(value, unit, most) or ". Use SI units for all quantities: kg, m, N m, rad, s")
         )
 

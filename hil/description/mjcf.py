@@ -180,7 +180,9 @@ class _Tree:
             )
         kind = int(self.model.jnt_type[found[0]])
         if kind != HINGE:
-            raise ArmFileError(f'{self.path}: joint "{name}" is {PIVOTS[kind]}: only rotating joints can be identified')
+            raise ArmFileError(
+                f'{self.path}: joint "{name}" is of type {PIVOTS[kind]}: only hinge joints can be identified'
+            )
         body = int(self.model.jnt_bodyid[found[0]])
         if self.model.body_jntnum[body] != 1:
             raise ArmFileError(

@@ -83,8 +83,10 @@ def parse_urdf(path: Path) -> ET.Element:
     """Parse the file and return its root element, keeping comments. Raises ArmFileError."""
     try:
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ArmFileError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    except UnicodeDecodeError as error:
+        raise ArmFileError(f"{path} cannot be read: it is not UTF-8 text; save it with the encoding UTF-8") from error
+    except OSError as error:
+        raise ArmFileError(f"{path} cannot be read: {error.strerror or error}") from error
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ArmFileError(f"{path} contains a document type or entities, which a URDF does not need: remove them")
     try:
@@ -259,7 +261,10 @@ def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) ->
             raise ArmFileError(f'{path} has no joint "{name}"; the rotating joints are {", ".join(turning) or "none"}')
         joint = tree[name]
         if joint.kind not in TURNING:
-            raise ArmFileError(f'{path}: joint "{name}" is {joint.kind}: only rotating joints can be identified')
+            raise ArmFileError(
+                f'{path}: joint "{name}" is of type {joint.kind}: only rotating joints (revolute, '
+                "continuous) can be identified"
+            )
         if joint.mimics is not None:
             raise ArmFileError(
                 f'{path}: joint "{name}" mimics "{joint.mimics}", so it has no motor of its own: leave it out'

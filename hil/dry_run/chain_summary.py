@@ -153,7 +153,8 @@ def _table(run: ChainDryRun) -> Table:
 def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
     """Explain the result in sentences, the verdict last."""
     fall, lowering, why = run.stops.fall, run.stops.lowering, run.why_not(run.config)
-    hit = "nothing within 1.5 s" if fall.hits is None else f"{fall.hits[0]} hits {fall.hits[1]}"
+    hit = "it hits nothing" if fall.hits is None else f"{fall.hits[0]} hits {fall.hits[1]}"
+    when = "within" if fall.hits is None else "after"
     lines = [
         "99 %: in 99 of 100 arms, all peaks stay within these values.",
         f"Least clearance: {run.foreseen}.",
@@ -161,7 +162,7 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         f"stops reach the rest pose (at least {100 * LAID_DOWN:.0f} % are required); least clearance on the way: "
         f"{lowering.nearest}.",
         f"Without commands (cable unplugged, program killed, servo failed) the arm falls. Hardest fall, from "
-        f"{fall.moment:.1f} s into the path: {hit} after {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, "
+        f"{fall.moment:.1f} s into the path: {hit} {when} {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, "
         f"at {fall.speed:.1f} m/s.",
     ]
     if run.as_built:

@@ -244,8 +244,8 @@ def _verdict(
     sentences += conflict_sentences(estimate.conflicts, explained)
     if estimate.unseen:
         sentences.append(
-            f"In this motion gravity does not reveal {', '.join(estimate.unseen)}: they are not identifiable, and are "
-            f"assumed to be zero within their standard errors."
+            f"In this motion gravity does not reveal {', '.join(estimate.unseen)}: not identifiable, and assumed to be "
+            "zero within the standard error."
         )
     return Verdict(trust, weakest, tuple(sentences))
 
@@ -292,7 +292,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     measured = (
         f"the noise of its angle ({noise:.2g} encoder steps RMS; rounding alone is 0.29)"
         if noise > NOISY * QUANTISATION_FLOOR_TICKS
-        else "encoder rounding"
+        else "its noise, which is that of encoder rounding"
     )
     said = f"The residual of {config.joints[joint].name} is the largest: {over:.2f} times {measured};"
     if is_explained(estimate):

@@ -19,6 +19,11 @@ _NULL_IS_INFINITE = "null is infinite"
 Spread = Annotated[float, _NULL_IS_INFINITE]
 """A standard error or variance; infinite if the recording contains no information about the parameter."""
 
+_NOT_NEGATIVE = "not negative"
+
+StandardError = Annotated[float, _NULL_IS_INFINITE, _NOT_NEGATIVE]
+"""As `Spread`, but never negative."""
+
 T = TypeVar("T")
 
 
@@ -52,7 +57,12 @@ def from_json(kind: type[T], value: Any) -> T:
 def _read(kind: Any, value: Any, where: str) -> Any:
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        return math.inf if value is None and _NULL_IS_INFINITE in arguments else _read(arguments[0], value, where)
+        if value is None and _NULL_IS_INFINITE in arguments:
+            return math.inf
+        found = _read(arguments[0], value, where)
+        if _NOT_NEGATIVE in arguments and found < 0.0:
+            raise FormError(f"has {_shown(value)} as {where!r}, which cannot be negative")
+        return found
     if origin in (Union, types.UnionType):
         (wanted,) = (each for each in arguments if each is not type(None))
         return None if value is None else _read(wanted, value, where)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.arm_model import JointFacts
-from hil.results.json_form import Spread
+from hil.results.json_form import Spread, StandardError
 
 __all__ = [
     "ArmFacts",
@@ -45,7 +45,7 @@ class Quantity:
     """A value with its standard error, both in `unit` (SI; "1" for a ratio)."""
 
     value: float
-    std: Spread
+    std: StandardError
     unit: str
 
     def __str__(self) -> str:
@@ -352,6 +352,6 @@ class Zeros:
     """Encoder zeros of one recording: true minus measured angle of each joint, with standard errors [rad]."""
 
     zero: PerJoint
-    std: tuple[Spread, ...]
+    std: tuple[StandardError, ...]
     unit: str = "rad"
     recording: str | None = None

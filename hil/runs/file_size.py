@@ -39,6 +39,8 @@ def check_array(path: Path) -> None:
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read(file)
         start = file.tell()
+    if dtype.hasobject:
+        raise RunFolderError(f"{path} cannot be read as a recording: it holds Python objects, not numbers.")
     promised = dtype.itemsize * int(np.prod([int(each) for each in shape], dtype=object))
     held = path.stat().st_size - start
     if promised > held:

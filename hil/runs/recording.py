@@ -247,9 +247,15 @@ def load_samples(path: Path, joints: int) -> NDArray[np.void]:
         check_array(path)
         samples = np.load(path, allow_pickle=False, mmap_mode="r")
     except (OSError, ValueError, EOFError) as error:
-        raise RunFolderError(f"{path} cannot be read as a recording: {error}.") from error
+        raise RunFolderError(f"{path} cannot be read as a recording: {str(error).rstrip('.')}.") from error
     expected = sample_type(joints)
     if samples.dtype != expected:
-        raise RunFolderError(f"{path} does not have the row type of a recording of {joints} joints.")
+        count = samples.dtype["position"].shape if "position" in (samples.dtype.names or ()) else ()
+        if count and count != (joints,):
+            raise RunFolderError(
+                f"{path} and config.toml beside it are from different runs: number of joints {count[0]} in the "
+                f"recording, {joints} in the configuration."
+            )
+        raise RunFolderError(f"{path} is not a recording by this version of hil: its columns differ.")
     recorded: NDArray[np.void] = samples[samples["phase"] != Phase.NOT_RECORDED]
     return recorded

@@ -53,7 +53,7 @@ def taken(path: Path) -> RunFolderError:
     """Return the error for a folder that is not empty; it names a folder that is free."""
     free = next(found for number in count(2) if not (found := path.with_name(f"{path.name}-{number}")).exists())
     return RunFolderError(
-        f"Run folder {path} is not empty; choose another with --out, for example --out {free}, or remove it."
+        f"Run folder {path} is not empty; choose another (--out, or out= in Python), for example {free}, or remove it."
     )
 
 

@@ -17,7 +17,7 @@ from hil.drivers.packet import MAX_ID, HardwareError
 from hil.drivers.preparation.prepare import TIME_BASED_PROFILE, check_quiet, shuts_down
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself
 from hil.drivers.servo import Servo, describe_error
-from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode
+from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
 from hil.errors import ConfigError
 from hil.estimator.errors import EstimationError
 from hil.plan.chain_plan import check_clearance, check_rest_pose, make_chain_plan, missing_path
@@ -346,7 +346,10 @@ def _voltage(config: Config, _joint_config: JointConfig, joint: Joint, servo: Se
     )
     found = f"{voltage:.1f} V ({low:.1f} to {high:.1f})"
     if voltage < config.safety.min_voltage:
-        fix = f"A {joint.servo.name} needs {config.safety.min_voltage:g} V (safety.min_voltage): switch the supply on."
+        fix = (
+            f"Switch the supply on: {with_article(joint.servo.name)} needs {config.safety.min_voltage:g} V "
+            "(safety.min_voltage)."
+        )
         return Level.STOP, "voltage", found, fix
     return _graded(low <= voltage <= high, "voltage", found, "Fix the supply: the servo shuts down outside its limits.")
 

@@ -152,7 +152,7 @@ class ServoSession:
         return [
             *self._changed_delays(failed),
             *(
-                f"The settings of {and_list(map(str, joints))} could not be restored ({why}) The next hil identify, "
+                f"The settings of {and_list(map(str, joints))} could not be restored. {why} The next hil identify, "
                 f"record, check or setup on this port restores them from {self._where(joints)}."
                 for why, joints in by_reason((joint, str(error)) for joint, error in failed.items()).items()
             ),

@@ -123,7 +123,7 @@ def test_what_is_said_of_one_servo_of_two_and_of_those_without_a_watchdog() -> N
     assert str(TorqueOff((first, second), ())) == "Torque is off on both servos, read back."
     watched = str(TorqueOff((first,), ((second, "It is silent."),), frozenset((first,))))
     assert (
-        "NOT CONFIRMED for JOINT 'B' (ID 2, XM430-W350): It is silent." in watched and "Bus Watchdog stops" in watched
+        "NOT CONFIRMED for JOINT 'B' (ID 2, XM430-W350). It is silent." in watched and "Bus Watchdog stops" in watched
     )
     unwatched = str(TorqueOff((first,), ((second, "It is silent."),), frozenset((second,))))
     assert "NOTHING STOPS JOINT 'B' (ID 2, XM430-W350), which has no Bus Watchdog" in unwatched
@@ -133,8 +133,10 @@ def test_a_reason_that_concerns_several_servos_is_given_once() -> None:
     first, second = JOINTS
     reasons = [(joint, f"{joint.title} does not answer. Check {joint}.") for joint in JOINTS]
     said = str(TorqueOff((), tuple(reasons)))
-    both = f"{str(first).upper()} and {str(second).upper()}: Each does not answer. Check it."
+    both = f"{str(first).upper()} and {str(second).upper()}. Each does not answer. Check it."
     assert both in said and said.count("does not answer") == 1
+    said = str(TorqueOff((), ((first, "It is hot."), (second, "It is silent."))))
+    assert f"for {str(first).upper()}. It is hot. Nor for {str(second).upper()}. It is silent. The" in said
     assert by_reason(reasons[1:]) == {"It does not answer. Check it.": [second]}
     assert by_reason([(first, "It is hot."), (second, "It is silent.")]) == {
         "It is hot.": [first],

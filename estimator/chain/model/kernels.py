@@ -197,8 +197,8 @@ def accelerate(armature: Any, gravity: Any, v: Any, a: Any, room: Any) -> None:
 
 
 def differentiate(gravity: Any, room: Any) -> None:
-    """Compute the torques' derivatives with respect to angles and velocities, at the last accelerations of
-    `accelerate`.
+    """Compute the torques' derivatives with respect to angles and velocities, at the accelerations that `accelerate`
+    computed last.
     """
     _, motion, body, seized, _, _, by_q, by_v, spare = room
     n = motion.shape[0]

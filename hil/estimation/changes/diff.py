@@ -15,6 +15,7 @@ from statistics import NormalDist
 from typing import Any
 
 from hil.arm_model import ArmModel
+from hil.drivers.servo_model import with_article
 from hil.errors import ResultError
 from hil.estimation.changes.friction_change import FrictionChange, friction_changes
 from hil.model_file import read_model, read_result
@@ -64,7 +65,7 @@ class Difference:
     detectable: Mapping[str, float] = field(default_factory=dict)
     trust: tuple[str | None, str | None] = (None, None)
     other_joints: tuple[str, ...] = ()
-    """Joints that are described differently in the two, as sentences: they may not be the same arm."""
+    """Sentences: joints that are described differently, so that they may not be the same arm; or that it is one run."""
 
     @property
     def changed(self) -> tuple[Change, ...]:
@@ -97,13 +98,15 @@ def diff_runs(
         raise ResultError(f"{before} has {counts[0]} joints and {after} {counts[1]}: they are not the same arm.")
     rows = friction_changes(models, (_covariance(before), _covariance(after)))
     difference = diff_models(*models, str(before), str(after), false_alarms, least_share, rows)
-    return replace(difference, trust=(_trust(before), _trust(after)))
+    same = (f"{before} is compared with itself.",) if before.resolve() == after.resolve() else ()
+    trust = (_trust(before), _trust(after))
+    return replace(difference, trust=trust, other_joints=(*same, *difference.other_joints))
 
 
 def _other_joints(before: ArmModel, after: ArmModel) -> tuple[str, ...]:
     return tuple(
-        f"Joint {number} was {old.name!r} with an {old.servo} and is {new.name!r} with an {new.servo}: if these are "
-        "two arms, the changes are the difference between them."
+        f"Joint {number} was {old.name!r} with {with_article(old.servo)} and is {new.name!r} with "
+        f"{with_article(new.servo)}: if these are two arms, the changes are the difference between them."
         for number, (old, new) in enumerate(zip(before.joints, after.joints, strict=True), 1)
         if (old.name, old.servo) != (new.name, new.servo)
     )

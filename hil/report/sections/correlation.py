@@ -11,7 +11,7 @@ STRONG = 0.9
 
 
 def correlation(data: RunData) -> Section | None:
-    """Present if the result has parameters."""
+    """Return the section; None if the result has no parameters."""
     return correlation_of(data.result)
 
 

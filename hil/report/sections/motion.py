@@ -13,7 +13,7 @@ _SHOWN = "The arm in the fitted period, as measured"
 
 
 def motion(data: RunData) -> Section | None:
-    """Present if the run has its settled period. Raises ConfigError, ArmFileError."""
+    """Return the section; None if the run has no settled period. Raises ConfigError, ArmFileError."""
     if data.fitted is None:
         return None
     period = data.fitted

@@ -74,6 +74,8 @@ def test_all_samples_and_csv_files_are_estimated_too(identified: Path, tmp_path:
     assert gravity == pytest.approx(whole.parameters["gravity_1"].value, rel=0.05)
     with pytest.raises(CsvError, match=r"a\.csv cannot be read"):
         hil.estimate("a.csv")
+    with pytest.raises(ValueError, match="no recording is given"):
+        hil.estimate([])
     with pytest.raises(ValueError, match="not both"):
         hil.estimate(["a.csv", identified])
     with pytest.raises(ValueError, match="one run folder"):

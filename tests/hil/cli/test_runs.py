@@ -40,7 +40,7 @@ def test_no_such_folder(what: str, tmp_path: Path, capsys: pytest.CaptureFixture
 def test_a_run_differs_from_itself_in_nothing(identified: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert hil("diff", identified, identified) == 0
     said = capsys.readouterr().out
-    assert "No significant changes" in said
+    assert "No significant changes" in said and "is compared with itself" in said
     _, smallest, named = said.partition("Smallest changes of single terms")
     assert smallest and "coulomb_1 " in named
 

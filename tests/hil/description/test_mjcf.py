@@ -110,7 +110,7 @@ def test_pivots_references_and_a_held_gripper_are_those_of_mujoco(tmp_path: Path
     ("more", "joints", "message"),
     [
         ("", ["one", "three"], 'has no joint "three"; the rotating joints are one, two'),
-        ("", ["one", "two", "gripper"], 'joint "gripper" is slide'),
+        ("", ["one", "two", "gripper"], 'joint "gripper" is of type slide: only hinge joints'),
         ("", ["two"], 'a joint before "two"'),
         ("", ["two", "one"], 'joint "two" does not lie'),
         ('<equality><connect body1="jaw" body2="upper" anchor="0 0 0"/></equality>', ["one", "two"], "closes a loop"),

@@ -243,7 +243,7 @@ def test_an_upright_arm_is_balanced_before_torque_is_cut(
     [
         (("id = 2", "id = 7"), NoReply, r"'elbow' \(ID 7, XM430-W350\) does not answer at 1000000 baud"),
         (("baud = 1_000_000", "baud = 57600"), NoReply, r"'shoulder' \(ID 1.*at 57600 baud"),
-        (('model = "XM430-W350"', 'model = "XM540-W270"'), WrongModel, r"a XM430-W350 answers at ID 1"),
+        (('model = "XM430-W350"', 'model = "XM540-W270"'), WrongModel, r"an XM430-W350 answers at ID 1"),
         (("rest_pose = [-1.5707963, 0.0]", "rest_pose = [-1.5707963, 0.7]"), ExperimentError, r"set zero_ticks = 1592"),
         ((SERVO_1, SERVO_1 + 'registers = { "Drive Mode" = 8 }\n'), WrongSetting, r"'shoulder'.*Drive Mode is 8"),
         ((SERVO_1, SERVO_1 + "input_voltage_v = 5.0\n"), ServoFault, r"'shoulder' \(ID 1.*input voltage"),

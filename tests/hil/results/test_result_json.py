@@ -77,6 +77,8 @@ def test_keys_of_a_newer_hil_are_ignored_and_later_ones_may_be_missing(identifie
         (("fit",), None, "it has no 'fit'"),
         (("parameters", "inertia_1", "value"), None, "has no 'parameters.inertia_1.value'"),
         (("parameters", "inertia_1", "value"), "much", "has 'much' as 'parameters.inertia_1.value'"),
+        (("parameters", "inertia_1", "std"), -0.1, "has -0.1 as 'parameters.inertia_1.std', which cannot be negative"),
+        (("covariance", "matrix"), [[-1e-6]], "has a negative variance of 'inertia_1' in its covariance"),
         (("joints",), True, "has True as 'joints'"),
         (("arm", "rest_pose"), {"a": 1}, "as 'arm.rest_pose'"),
         (("arm", "joints"), [{"name": "one"}], "has no 'arm.joints[0].model'"),

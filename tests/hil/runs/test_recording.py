@@ -128,9 +128,14 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(RunFolderError, match="cannot be read as a recording"):
             load_samples(path, 2)
-    np.save(path, np.zeros(3))
-    with pytest.raises(RunFolderError, match="does not have the row type of a recording of 2 joints"):
-        load_samples(path, 2)
+    for content, said in (
+        (np.zeros(3), "is not a recording by this version"),
+        (np.zeros(3, dtype=sample_type(1)), "config.toml beside it are from different runs: number of joints 1 in"),
+        (np.array([{}, None]), "it holds Python objects, not numbers"),
+    ):
+        np.save(path, content)
+        with pytest.raises(RunFolderError, match=said):
+            load_samples(path, 2)
 
 
 def test_phases_are_numbered_as_in_recordings_made_before() -> None:
