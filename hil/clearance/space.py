@@ -17,13 +17,11 @@ from hil.description.urdf import rotation_of
 
 Array = NDArray[np.float64]
 
-ALWAYS_SHARE = 0.75
-"""Two capsules with one link in between that are closer than BUILT_NEAR in at least this fraction of poses are assumed
-to touch by design.
-"""
+ALWAYS_SHARE = 0.9
+"""Two capsules that are closer than the margin in at least this fraction of poses are assumed to touch by design."""
 
-ALWAYS_SHARE_OF_OTHERS = 0.98
-BUILT_NEAR = 0.02  # m beyond the margin
+TOUCHED = 0.02
+"""Capsules closer than this in the rest pose may carry the arm there [m]."""
 
 RANDOM_POSES = 400
 AT_REST_SLACK = 0.008
@@ -63,7 +61,8 @@ class Nearest:
 class Space:
     """Pairs of capsules that must keep apart, and by how much.
 
-    as_built: pairs of links with capsules that are not checked, because they touch in nearly every pose.
+    as_built: pairs of links with capsules that are not checked, because they are closer than the margin in nearly every
+    pose.
     """
 
     shapes: Shapes
@@ -74,6 +73,8 @@ class Space:
     """The rest pose (joints,) [rad]."""
     at_rest: Array
     """Distance of each pair in the rest pose (pairs,) [m]."""
+    is_touched: NDArray[np.bool_]
+    """Whether in the rest pose anything may touch the part of the arm that a joint moves (joints,)."""
     _pairs: NDArray[np.int64]
     _chain: tuple[Array, Array, Array]
     _arrays: tuple[NDArray[np.int64], Array, Array, Array, Array]
@@ -214,14 +215,19 @@ def _space(key: _Key) -> Space:
     ignored = {frozenset(pair) for pair in wanted.ignore}
     pairs = np.array(_pairs(shapes, link, len(obstacles), np.isfinite(floor[3])), dtype=np.int64).reshape(-1, 2)
     rest = np.array(config.arm.rest_pose)
-    space = Space(shapes, obstacles, wanted.margin, (), rest, np.zeros(len(pairs)), pairs, chain, arrays)  # type: ignore[arg-type]
+    at_rest = np.empty((1, len(pairs)))
+    all_distances(chain, arrays, pairs, rest[None], at_rest)
+    none = np.zeros(len(rest), dtype=bool)
+    space = Space(shapes, obstacles, wanted.margin, (), rest, at_rest[0], none, pairs, chain, arrays)  # type: ignore[arg-type]
     kept = np.array([frozenset(space.names_of(pair)) not in ignored for pair in range(len(pairs))], dtype=bool)
     touching = _touch_as_built(config, chain, arrays, pairs, wanted.margin)
     as_built = sorted({space.names_of(int(pair)) for pair in np.flatnonzero(touching & kept)})
-    pairs = pairs[kept & ~touching]
-    at_rest = np.empty((1, len(pairs)))
-    all_distances(chain, arrays, pairs, rest[None], at_rest)
-    return Space(shapes, obstacles, wanted.margin, tuple(as_built), rest, at_rest[0], pairs, chain, arrays)  # type: ignore[arg-type]
+    is_touched = _touched(len(rest), link, pairs[~touching & (at_rest[0] < TOUCHED)])
+    left = kept & ~touching
+    return Space(
+        *(shapes, obstacles, wanted.margin, tuple(as_built), rest, at_rest[0, left], is_touched, pairs[left]),
+        *(chain, arrays),  # type: ignore[arg-type]
+    )
 
 
 def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool) -> list[tuple[int, int]]:
@@ -238,18 +244,23 @@ def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool)
 def _touch_as_built(
     config: Config, chain: object, arrays: tuple[Any, ...], pairs: NDArray[np.int64], margin: float
 ) -> NDArray[np.bool_]:
-    """Whether the capsules of each pair (pairs,) are close to each other in nearly every pose within the limits."""
-    link = arrays[0]
+    """Whether the capsules of each pair (pairs,) are closer than the margin in nearly every pose within the limits."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     poses = np.random.default_rng(1).uniform(low, high, (RANDOM_POSES, len(low)))
     distance = np.empty((RANDOM_POSES, len(pairs)))
     all_distances(chain, arrays, pairs, poses, distance)
-    second = np.maximum(pairs[:, 1], 0)
-    are_close = np.abs(link[pairs[:, 0]] - link[second]) == 2  # one link in between
-    needed = np.where(are_close, ALWAYS_SHARE, ALWAYS_SHARE_OF_OTHERS)
-    near = (distance < margin + BUILT_NEAR).mean(axis=0) >= needed
+    near = (distance < margin).mean(axis=0) >= ALWAYS_SHARE
     touching: NDArray[np.bool_] = near & (pairs[:, 1] >= 0)
     return touching
+
+
+def _touched(joints: int, link: NDArray[np.int64], contacts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether any of the contacts (contacts, 2) is between what a joint moves and what it does not (joints,)."""
+    touched = np.zeros(joints, dtype=bool)
+    for first, second in contacts:
+        ends = sorted((int(link[first]), int(link[second]) if second >= 0 else 0))
+        touched[ends[0] : ends[1]] = True
+    return touched
 
 
 def _about(axis: Array, angle: float) -> Array:

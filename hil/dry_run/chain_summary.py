@@ -23,7 +23,7 @@ class ChainDryRun:
 
     config: with the path and stabiliser that would be used. share: fraction of the designed path's amplitude; 1 if
     [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of links with parts
-    that touch by design and are not checked. refused: why the pilot has no safe first step; "" if it has one, None
+    that are closer than the margin in nearly every pose and are not checked. refused: why the pilot has no safe first step; "" if it has one, None
     without a pilot, whose decision counts.
     """
 
@@ -164,12 +164,6 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         f"{fall.moment:.1f} s into the path: {hit} after {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, "
         f"at {fall.speed:.1f} m/s.",
     ]
-    if run.as_built:
-        pairs = ", ".join(f"{a} and {b}" for a, b in run.as_built)
-        lines.append(
-            "Parts of these links touch by design in nearly every pose and are not checked; their other parts are: "
-            f"{pairs}."
-        )
     lines += [f"Warning: {doubt}" for doubt in doubts(run.config)]
     if run.share < 1.0:
         lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which is shown here.")
