@@ -15,7 +15,7 @@ from hil.plan.chain_model import torque_limits
 
 Array = NDArray[np.float64]
 
-NEAR_STOP_RAD = 0.15
+NEAR_STOP_RAD = 0.14
 """A joint that lies on its stop is at most this far from the end of its range, as configured or described [rad]."""
 
 

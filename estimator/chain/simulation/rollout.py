@@ -76,8 +76,8 @@ class Loop:
     pose: rest pose (joints,) [rad], on a surface that stops joints from being moved further down by gravity.
     limit: largest commanded torque (joints,) [N m].
     stops: side on which a joint lies on its own stop in the rest pose (joints,), -1, 1, or 0 if it does not; None if
-    none does. Unlike the surface, a stop supports its joint wherever the other joints are. Neither does if the joint's
-    largest torque is 0.
+    none does. A stop supports its joint instead of the surface, and wherever the other joints are. Nothing supports a
+    joint whose largest torque is 0.
     """
 
     rate: float
@@ -112,9 +112,10 @@ def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = No
     shape = arms.size, samples, n
     position, velocity, torque = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
     steps = max(1, math.ceil(1.0 / (loop.rate * LONGEST_STEP)))
-    pressed = weights(arms, loop.pose)
-    pressed = np.where(np.abs(pressed) > PRESSED_SHARE * loop.limit, -np.sign(pressed), 0.0)
     stops = np.zeros(n) if loop.stops is None else loop.stops
+    pressed = weights(arms, loop.pose)
+    is_carried = (np.abs(pressed) > PRESSED_SHARE * loop.limit) & (stops == 0.0)
+    pressed = np.where(is_carried, -np.sign(pressed), 0.0)
     software = tuple(
         np.ascontiguousarray(each, dtype=np.float64)
         for each in (loop.goal, loop.stiffness, loop.damping, loop.pose, loop.limit, stops)
