@@ -20,7 +20,7 @@ NEAR_STOP_RAD = 0.14
 
 
 def resting_stops(config: Config, arms: ChainArms) -> Array:
-    """Side on which each joint lies on its stop (joints,): -1 at its smallest angle, 1 at its largest, 0 if it does not.
+    """Side on which each joint lies on its stop (joints,): -1 at its smallest angle, 1 at its largest, 0 if on neither.
 
     It does if its rest pose is near the end of its range, nothing else touches the part of the arm that it moves, and
     gravity does not pull it away from there. Raises ArmFileError.

@@ -87,6 +87,37 @@ def test_where_it_lies_it_may_be_near_but_not_nearer(tmp_path: Path) -> None:
     assert space.room(folded, on_the_way=True)[0] < 0.0
 
 
+def test_parts_near_each_other_by_design_must_not_touch() -> None:
+    config = load_config(CONFIGS / "fake_viperx_300.toml")
+    space = Space.of(config)
+    pair = ("base", "upper_arm_link")
+    assert pair in space.near and not space.as_built
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    poses = np.random.default_rng(1).uniform(low, high, (400, len(low)))
+    found = [space.nearest(pose[:, None]) for pose in poses]
+    touching = [each for each in found if each.pair == pair and each.room < 0.0]
+    assert touching and all(each.needed == 0.0 and each.distance < 0.0 for each in touching)
+
+
+def test_only_parts_nearly_always_within_the_margin_are_left_out_and_named() -> None:
+    config = load_config(CONFIGS / "koch.toml")
+    assert not Space.of(config).as_built
+    wide = config.model_copy(update={"clearance": config.clearance.model_copy(update={"margin": 0.015})})
+    assert Space.of(wide).as_built == (("base", "upper_arm"),)
+    said = "Some parts of 'base' and 'upper_arm' are closer than clearance.margin in nearly every pose"
+    assert any(said in doubt for doubt in doubts(wide))
+    assert not any("nearly every pose" in doubt for doubt in doubts(config))
+
+
+def test_the_reserve_of_parts_near_each_other_by_design_is_one_they_can_keep() -> None:
+    config = load_config(CONFIGS / "koch.toml")
+    space = Space.of(config)
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    poses = np.random.default_rng(1).uniform(low, high, (200, len(low)))
+    assert any(space.has_reserve(pose[:, None], 0.01) for pose in poses)
+    assert not any(space.has_reserve(pose[:, None], 0.5) for pose in poses)
+
+
 def test_capsules_enclose_boxes_and_meshes(tmp_path: Path) -> None:
     corners = np.array([[x, y, z] for x in (0.0, 0.2) for y in (-0.03, 0.03) for z in (-0.01, 0.01)])
     triangles = corners[[[0, 1, 2], [3, 4, 5], [5, 6, 7]]]
