@@ -41,13 +41,13 @@ def test_distances_are_those_of_many_points() -> None:
         ends, radius = space.ends(pose)
         cloud = points(ends, radius)
         least = np.inf
-        for a, b in space._pairs:
+        for (a, b), needed in zip(space._pairs, space._needed(False), strict=True):
             if b >= 0:
                 apart = np.linalg.norm(cloud[a][:, None] - cloud[b][None], axis=-1).min() - radius[a] - radius[b]
             else:
                 apart = ends[a, :, 2].min() - radius[a]
-            least = min(least, apart)
-        assert space.nearest(pose[:, None]).distance == pytest.approx(least, abs=2e-3)
+            least = min(least, apart - needed)
+        assert space.nearest(pose[:, None]).room == pytest.approx(least, abs=2e-3)
 
 
 def test_a_box_in_the_way_is_named(tmp_path: Path) -> None:
@@ -95,8 +95,8 @@ def test_parts_near_each_other_by_design_must_not_touch() -> None:
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     poses = np.random.default_rng(1).uniform(low, high, (400, len(low)))
     found = [space.nearest(pose[:, None]) for pose in poses]
-    touching = [each for each in found if each.pair == pair and each.room < 0.0]
-    assert touching and all(each.needed == 0.0 and each.distance < 0.0 for each in touching)
+    touching = [each for each in found if each.pair == pair and each.needed == 0.0 and each.room < 0.0]
+    assert touching and all(each.distance < 0.0 for each in touching)
 
 
 def test_only_parts_nearly_always_within_the_margin_are_left_out_and_named() -> None:
