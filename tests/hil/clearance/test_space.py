@@ -90,13 +90,10 @@ def test_where_it_lies_it_may_be_near_but_not_nearer(tmp_path: Path) -> None:
 def test_parts_near_each_other_by_design_must_not_touch() -> None:
     config = load_config(CONFIGS / "fake_viperx_300.toml")
     space = Space.of(config)
-    pair = ("base", "upper_arm_link")
-    assert pair in space.near and not space.as_built
-    low, high = np.array([joint.position_limit for joint in config.joints]).T
-    poses = np.random.default_rng(1).uniform(low, high, (400, len(low)))
-    found = [space.nearest(pose[:, None]) for pose in poses]
-    touching = [each for each in found if each.pair == pair and each.needed == 0.0 and each.room < 0.0]
-    assert touching and all(each.distance < 0.0 for each in touching)
+    assert ("base", "upper_arm_link") in space.near and not space.as_built
+    needed = space._needed(False)
+    assert {space.names_of(int(pair)) for pair in np.flatnonzero(needed == 0.0)} == set(space.near)
+    assert set(needed) == {0.0, space.margin}
 
 
 def test_only_parts_nearly_always_within_the_margin_are_left_out_and_named() -> None:
