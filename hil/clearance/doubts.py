@@ -23,8 +23,14 @@ def doubts(config: Config) -> Iterator[str]:
     yield from doubted_inertias(arm)
     yield from doubted_gravity(config)
     yield from doubted_limits(config)
-    for doubt in Space.of(config).shapes.doubts:
+    space = Space.of(config)
+    for doubt in space.shapes.doubts:
         yield f"{arm.path.name}: {doubt}"
+    for first, second in space.as_built:
+        yield (
+            f"Some parts of {first!r} and {second!r} are closer than clearance.margin in nearly every pose, as if by "
+            "design. The distance between these parts is not checked; that between all other parts is."
+        )
 
 
 def _same_direction(config: Config, joint: JointConfig) -> str:

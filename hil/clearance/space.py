@@ -17,13 +17,17 @@ from hil.description.urdf import rotation_of
 
 Array = NDArray[np.float64]
 
-ALWAYS_SHARE = 0.75
-"""Two capsules with one link in between that are closer than BUILT_NEAR in at least this fraction of poses are assumed
-to touch by design.
+ALWAYS_SHARE = 0.9
+"""Two capsules that are closer than the margin in at least this fraction of poses are assumed to touch by design."""
+
+NEAR_SHARE, NEAR_SHARE_OF_OTHERS = 0.75, 0.98
+"""Two capsules with one link in between, or with more, that are closer than BUILT_NEAR in at least this fraction of
+poses are near each other by design: they must not touch, but need no margin.
 """
 
-ALWAYS_SHARE_OF_OTHERS = 0.98
 BUILT_NEAR = 0.02  # m beyond the margin
+TOUCHED = 0.02
+"""Capsules closer than this in the rest pose may carry the arm there [m]."""
 
 RANDOM_POSES = 400
 AT_REST_SLACK = 0.008
@@ -63,17 +67,24 @@ class Nearest:
 class Space:
     """Pairs of capsules that must keep apart, and by how much.
 
-    as_built: pairs of links with capsules that are not checked, because they touch in nearly every pose.
+    as_built: pairs of links with capsules that are not checked, because they are closer than the margin in nearly every
+    pose. near: pairs of links with capsules that must not touch, but need no margin, because they are near each other
+    in most poses.
     """
 
     shapes: Shapes
     obstacles: tuple[str, ...]
     margin: float
     as_built: tuple[tuple[str, str], ...]
+    near: tuple[tuple[str, str], ...]
     rest: Array
     """The rest pose (joints,) [rad]."""
     at_rest: Array
     """Distance of each pair in the rest pose (pairs,) [m]."""
+    is_touched: NDArray[np.bool_]
+    """Whether in the rest pose anything may touch the part of the arm that a joint moves (joints,)."""
+    _built: Array
+    """Median distance of pairs that are near each other by design, otherwise infinite (pairs,) [m]."""
     _pairs: NDArray[np.int64]
     _chain: tuple[Array, Array, Array]
     _arrays: tuple[NDArray[np.int64], Array, Array, Array, Array]
@@ -89,7 +100,16 @@ class Space:
 
         on_the_way: whether the motion leads from or to the rest pose, in which distances may be less than the margin.
         """
-        return self._least(position, on_the_way)[0]
+        return self._least(position, self._needed(on_the_way), on_the_way)[0]
+
+    def has_reserve(self, position: Array, reserve: float) -> bool:
+        """Whether a motion (joints, samples) [rad] keeps `reserve` [m] more than the required distance.
+
+        Pairs that are near each other by design keep at least half of their median distance instead, if that is less.
+        """
+        needed = self._needed(False)
+        needed = np.minimum(needed + reserve, np.maximum(needed, 0.5 * self._built))
+        return bool(self._least(position, needed, False)[0].min() >= 0.0)
 
     def lies(self, position: Array) -> NDArray[np.bool_]:
         """Whether the arm is at rest in each pose (samples,) of a motion (joints, samples) [rad]."""
@@ -98,11 +118,12 @@ class Space:
 
     def nearest(self, position: Array, on_the_way: bool = False) -> Nearest:
         """Find the sample of a motion (joints, samples) [rad] with the least clearance."""
-        room, worst = self._least(position, on_the_way)
+        required = self._needed(on_the_way)
+        room, worst = self._least(position, required, on_the_way)
         sample = int(np.argmin(room))
         if worst[sample] < 0:
             return Nearest(np.inf, 0.0, ("nothing", "nothing"), sample)
-        needed = float(self._needed(on_the_way)[worst[sample]])
+        needed = float(required[worst[sample]])
         return Nearest(float(room[sample]) + needed, needed, self.names_of(int(worst[sample])), sample)
 
     def wrong_rest_pose(self) -> str:
@@ -163,13 +184,13 @@ class Space:
         return "floor" if second == FLOOR else self.obstacles[BOXES - second]
 
     def _needed(self, on_the_way: bool) -> Array:
-        full = np.full(len(self._pairs), self.margin)
+        full = np.where(np.isfinite(self._built), 0.0, self.margin)
         return np.minimum(full, self.at_rest - AT_REST_SLACK) if on_the_way else full
 
-    def _least(self, position: Array, on_the_way: bool) -> tuple[Array, NDArray[np.int64]]:
+    def _least(self, position: Array, needed: Array, on_the_way: bool) -> tuple[Array, NDArray[np.int64]]:
         q = np.ascontiguousarray(position.T, dtype=np.float64)
         room, worst = np.empty(len(q)), np.empty(len(q), dtype=np.int64)
-        least_room(self._chain, self._arrays, self._pairs, self._needed(on_the_way), q, room, worst)
+        least_room(self._chain, self._arrays, self._pairs, needed, q, room, worst)
         if on_the_way:
             lies = self.lies(position)
             room[lies] = np.maximum(room[lies], 0.0)
@@ -214,14 +235,22 @@ def _space(key: _Key) -> Space:
     ignored = {frozenset(pair) for pair in wanted.ignore}
     pairs = np.array(_pairs(shapes, link, len(obstacles), np.isfinite(floor[3])), dtype=np.int64).reshape(-1, 2)
     rest = np.array(config.arm.rest_pose)
-    space = Space(shapes, obstacles, wanted.margin, (), rest, np.zeros(len(pairs)), pairs, chain, arrays)  # type: ignore[arg-type]
-    kept = np.array([frozenset(space.names_of(pair)) not in ignored for pair in range(len(pairs))], dtype=bool)
-    touching = _touch_as_built(config, chain, arrays, pairs, wanted.margin)
-    as_built = sorted({space.names_of(int(pair)) for pair in np.flatnonzero(touching & kept)})
-    pairs = pairs[kept & ~touching]
     at_rest = np.empty((1, len(pairs)))
     all_distances(chain, arrays, pairs, rest[None], at_rest)
-    return Space(shapes, obstacles, wanted.margin, tuple(as_built), rest, at_rest[0], pairs, chain, arrays)  # type: ignore[arg-type]
+    none = np.zeros(len(rest), dtype=bool)
+    touching, built = _by_design(config, chain, arrays, pairs, wanted.margin)
+    space = Space(*(shapes, obstacles, wanted.margin, (), (), rest, at_rest[0], none, built, pairs), chain, arrays)  # type: ignore[arg-type]
+    kept = np.array([frozenset(space.names_of(pair)) not in ignored for pair in range(len(pairs))], dtype=bool)
+    left = kept & ~touching
+    as_built, near = (
+        tuple(sorted({space.names_of(int(pair)) for pair in np.flatnonzero(some)}))
+        for some in (touching & kept, np.isfinite(built) & left)
+    )
+    is_touched = _touched(len(rest), link, pairs[~touching & (at_rest[0] < TOUCHED)])
+    return Space(
+        *(shapes, obstacles, wanted.margin, as_built, near, rest, at_rest[0, left], is_touched, built[left]),
+        *(pairs[left], chain, arrays),  # type: ignore[arg-type]
+    )
 
 
 def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool) -> list[tuple[int, int]]:
@@ -235,21 +264,34 @@ def _pairs(shapes: Shapes, link: NDArray[np.int64], boxes: int, has_floor: bool)
     return found + [(a, BOXES - box) for a in range(count) if link[a] > 0 for box in range(boxes)]
 
 
-def _touch_as_built(
+def _by_design(
     config: Config, chain: object, arrays: tuple[Any, ...], pairs: NDArray[np.int64], margin: float
-) -> NDArray[np.bool_]:
-    """Whether the capsules of each pair (pairs,) are close to each other in nearly every pose within the limits."""
+) -> tuple[NDArray[np.bool_], Array]:
+    """Whether the capsules of each pair (pairs,) are closer than the margin in nearly every pose within the limits.
+
+    Also the median distance of pairs that are near each other in most poses (pairs,) [m], infinite for all others.
+    """
     link = arrays[0]
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     poses = np.random.default_rng(1).uniform(low, high, (RANDOM_POSES, len(low)))
     distance = np.empty((RANDOM_POSES, len(pairs)))
     all_distances(chain, arrays, pairs, poses, distance)
-    second = np.maximum(pairs[:, 1], 0)
-    are_close = np.abs(link[pairs[:, 0]] - link[second]) == 2  # one link in between
-    needed = np.where(are_close, ALWAYS_SHARE, ALWAYS_SHARE_OF_OTHERS)
-    near = (distance < margin + BUILT_NEAR).mean(axis=0) >= needed
-    touching: NDArray[np.bool_] = near & (pairs[:, 1] >= 0)
-    return touching
+    are_links = pairs[:, 1] >= 0
+    touching: NDArray[np.bool_] = are_links & ((distance < margin).mean(axis=0) >= ALWAYS_SHARE)
+    apart = np.abs(link[pairs[:, 0]] - link[np.maximum(pairs[:, 1], 0)])
+    share = np.where(apart == 2, NEAR_SHARE, NEAR_SHARE_OF_OTHERS)
+    is_near = are_links & ((distance < margin + BUILT_NEAR).mean(axis=0) >= share)
+    median = np.maximum(np.median(distance, axis=0), 0.0)
+    return touching, np.where(is_near, median, np.inf)
+
+
+def _touched(joints: int, link: NDArray[np.int64], contacts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether any of the contacts (contacts, 2) is between what a joint moves and what it does not (joints,)."""
+    touched = np.zeros(joints, dtype=bool)
+    for first, second in contacts:
+        ends = sorted((int(link[first]), int(link[second]) if second >= 0 else 0))
+        touched[ends[0] : ends[1]] = True
+    return touched
 
 
 def _about(axis: Array, angle: float) -> Array:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hil.clearance.space import Nearest, Space
 from hil.config.schema import Config
 from hil.dry_run.prediction import Prediction, limits_of, peaks_of
+from hil.dry_run.resting_stops import resting_stops
 from hil.estimator.chain.simulation.rollout import ChainArms, Loop, Motions, roll_out
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import PathSegment
@@ -65,6 +66,7 @@ def predict_chain(
     """
     space = Space.of(config)
     limits, rest = limits_of(config), np.array(config.arm.rest_pose)
+    stops = resting_stops(config, arms)
     values = np.zeros((arms.size, *limits.shape))
     rooms = np.full(arms.size, np.inf)
     worst: tuple[float, Nearest, str, float] | None = None
@@ -73,7 +75,7 @@ def predict_chain(
     done = 0
     for number, segment in enumerate(plan.segments):
         assert isinstance(segment, PathSegment)
-        loop = loop_of(config, segment, plan.rate)
+        loop = loop_of(config, segment, plan.rate, stops)
         ways = segment.ramp_samples
         reference = np.concatenate(
             [segment.paths[0].position, *[segment.paths[1].position] * PERIODS, segment.paths[2].position], axis=1
@@ -108,8 +110,8 @@ def predict_chain(
     return ChainPrediction(prediction, *worst[1:], rooms, np.median(tracking, axis=0), plan.segments[0].ramp_samples)
 
 
-def loop_of(config: Config, segment: PathSegment, rate: float) -> Loop:
-    """Commands and feedback of the control loop during a segment."""
+def loop_of(config: Config, segment: PathSegment, rate: float, stops: Array | None = None) -> Loop:
+    """Commands and feedback of the control loop during a segment. stops: as in `Loop`."""
     assert config.stabiliser is not None  # checked with the configuration
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     goals = np.concatenate((segment.ramp_in, *[segment.period_current] * PERIODS, segment.ramp_out))
@@ -120,6 +122,7 @@ def loop_of(config: Config, segment: PathSegment, rate: float) -> Loop:
         np.array(config.stabiliser.damping),
         np.array(config.arm.rest_pose),
         torque_limits(config),
+        stops,
     )
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hil.clearance.space import LYING_RAD, Nearest, Space
 from hil.config.schema import Config
+from hil.dry_run.resting_stops import resting_stops
 from hil.estimator.chain.excitation.path_design import Tell, counted
 from hil.estimator.chain.simulation.rollout import ChainArms, Loop, roll_out
 from hil.plan.chain_model import torque_limits
@@ -160,11 +161,12 @@ def _lowered(
     assert config.stabiliser is not None  # checked with the configuration
     way, space, rest = WayHome(config, plan), Space.of(config), np.array(config.arm.rest_pose)
     stiffness, damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
+    stops = resting_stops(config, arms)
     longest, lies, worst, away = 0.0, [], None, np.zeros(len(rest))
     for _, position, velocity in starts:
         home = way.path(position, velocity)
         goal = segment.thought.of(home).T + stiffness * (home.position.T - rest) + damping * home.velocity.T
-        loop = Loop(plan.rate, goal, stiffness, damping, rest, torque_limits(config))
+        loop = Loop(plan.rate, goal, stiffness, damping, rest, torque_limits(config), stops)
         motions = roll_out(arms, loop, position, velocity)
         longest = max(longest, len(goal) / plan.rate)
         for arm in range(arms.size):

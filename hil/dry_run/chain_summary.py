@@ -9,6 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from hil.clearance.doubts import doubts
+from hil.clearance.space import Space
 from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction
 from hil.dry_run.chain_stop import LAID_DOWN, ChainStops
@@ -23,8 +24,8 @@ class ChainDryRun:
 
     config: with the path and stabiliser that would be used. share: fraction of the designed path's amplitude; 1 if
     [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of links with parts
-    that touch by design and are not checked. refused: why the pilot has no safe first step; "" if it has one, None
-    without a pilot, whose decision counts.
+    that are closer than the margin in nearly every pose and are not checked. refused: why the pilot has no safe first
+    step; "" if it has one, None without a pilot, whose decision counts.
     """
 
     config: Config
@@ -165,11 +166,10 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         f"{fall.moment:.1f} s into the path: {hit} {when} {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, "
         f"at {fall.speed:.1f} m/s.",
     ]
-    if run.as_built:
-        pairs = ", ".join(f"{a} and {b}" for a, b in run.as_built)
+    if near := Space.of(run.config).near:
+        pairs = ", ".join(f"{a} and {b}" for a, b in near)
         lines.append(
-            "Parts of these links touch by design in nearly every pose and are not checked; their other parts are: "
-            f"{pairs}."
+            f"Parts of these links are near each other by design: they must not touch, but need no margin: {pairs}."
         )
     lines += [f"Warning: {doubt}" for doubt in doubts(run.config)]
     if run.share < 1.0:

@@ -83,7 +83,7 @@ class Paths:
         def allowed(path: Path) -> bool:
             if (np.abs(thought.of(path)).max(axis=1) > most).any():
                 return False
-            if space.room(path.position).min() < reserve.clearance:
+            if not space.has_reserve(path.position, reserve.clearance):
                 return False
             return bool(
                 space.room(_ways(path, rest, experiment.ramp / experiment.period), on_the_way=True).min() >= 0.0

@@ -23,6 +23,7 @@ LONGEST_STEP = 1.3e-3  # s
 RAN_AWAY = 1e3  # rad/s
 NEAR_REST = 0.2  # rad: distance from the rest pose within which the surface under it may support the arm
 YIELDS = 0.03  # rad: how far that surface gives way under a joint's largest torque
+STOP_YIELDS = 0.01  # rad: how far a joint's own stop gives way under its largest torque
 PRESSED_SHARE = 0.03  # of a joint's largest torque: a smaller gravity torque does not press a joint against the surface
 VISCOUS, COULOMB, OFFSET, WIDTH, SCALE, LAG = range(6)
 DRIVE_TERMS = ("viscous", "coulomb", "offset", "coulomb_width", "torque_scale", "lag")
@@ -74,6 +75,9 @@ class Loop:
     stiffness, damping: of the spring [N m/rad] and damper [N m s/rad] towards `pose` (joints,).
     pose: rest pose (joints,) [rad], on a surface that stops joints from being moved further down by gravity.
     limit: largest commanded torque (joints,) [N m].
+    stops: side on which a joint lies on its own stop in the rest pose (joints,), -1, 1, or 0 if it does not; None if
+    none does. A stop supports its joint instead of the surface, and wherever the other joints are. Nothing supports a
+    joint whose largest torque is 0.
     """
 
     rate: float
@@ -82,6 +86,7 @@ class Loop:
     damping: Array
     pose: Array
     limit: Array
+    stops: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -107,11 +112,13 @@ def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = No
     shape = arms.size, samples, n
     position, velocity, torque = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
     steps = max(1, math.ceil(1.0 / (loop.rate * LONGEST_STEP)))
+    stops = np.zeros(n) if loop.stops is None else loop.stops
     pressed = weights(arms, loop.pose)
-    pressed = np.where(np.abs(pressed) > PRESSED_SHARE * loop.limit, -np.sign(pressed), 0.0)
+    is_carried = (np.abs(pressed) > PRESSED_SHARE * loop.limit) & (stops == 0.0)
+    pressed = np.where(is_carried, -np.sign(pressed), 0.0)
     software = tuple(
         np.ascontiguousarray(each, dtype=np.float64)
-        for each in (loop.goal, loop.stiffness, loop.damping, loop.pose, loop.limit)
+        for each in (loop.goal, loop.stiffness, loop.damping, loop.pose, loop.limit, stops)
     )
     for arm in range(arms.size):
         link, armature = _split(arms, arm)
@@ -198,7 +205,7 @@ def _roll_loop(  # noqa: PLR0912
     torque: Any,
 ) -> None:
     rotation, translation, axis, gravity = chain
-    goal, stiffness, damping, pose, limit = software
+    goal, stiffness, damping, pose, limit, stops = software
     n = q.size
     still, real = np.zeros(n), np.zeros(n)
     seen_q, seen_v = q.copy(), v.copy()
@@ -228,8 +235,12 @@ def _roll_loop(  # noqa: PLR0912
                 for i in range(n):
                     A[j, i] = work[4][j, i]
                 A[j, j] += h * slope
-                if carried > 0.0 and pressed[j] * (q[j] - pose[j]) > 0.0:
+                stiff = 0.0
+                if stops[j] * (q[j] - pose[j]) > 0.0:
+                    stiff = limit[j] / STOP_YIELDS
+                elif carried > 0.0 and pressed[j] * (q[j] - pose[j]) > 0.0:
                     stiff = carried * limit[j] / YIELDS
+                if stiff > 0.0:
                     firm = math.sqrt(stiff * work[4][j, j])
                     b[j] -= stiff * (q[j] - pose[j] + h * v[j]) + firm * v[j]
                     A[j, j] += h * (firm + h * stiff)

@@ -41,13 +41,13 @@ def test_distances_are_those_of_many_points() -> None:
         ends, radius = space.ends(pose)
         cloud = points(ends, radius)
         least = np.inf
-        for a, b in space._pairs:
+        for (a, b), needed in zip(space._pairs, space._needed(False), strict=True):
             if b >= 0:
                 apart = np.linalg.norm(cloud[a][:, None] - cloud[b][None], axis=-1).min() - radius[a] - radius[b]
             else:
                 apart = ends[a, :, 2].min() - radius[a]
-            least = min(least, apart)
-        assert space.nearest(pose[:, None]).distance == pytest.approx(least, abs=2e-3)
+            least = min(least, apart - needed)
+        assert space.nearest(pose[:, None]).room == pytest.approx(least, abs=2e-3)
 
 
 def test_a_box_in_the_way_is_named(tmp_path: Path) -> None:
@@ -85,6 +85,34 @@ def test_where_it_lies_it_may_be_near_but_not_nearer(tmp_path: Path) -> None:
     assert space.room(rest, on_the_way=True)[0] >= 0.0
     folded = rest + np.array([[0.0], [-0.05], [0.05], [0.6]])
     assert space.room(folded, on_the_way=True)[0] < 0.0
+
+
+def test_parts_near_each_other_by_design_must_not_touch() -> None:
+    config = load_config(CONFIGS / "fake_viperx_300.toml")
+    space = Space.of(config)
+    assert ("base", "upper_arm_link") in space.near and not space.as_built
+    needed = space._needed(False)
+    assert {space.names_of(int(pair)) for pair in np.flatnonzero(needed == 0.0)} == set(space.near)
+    assert set(needed) == {0.0, space.margin}
+
+
+def test_only_parts_nearly_always_within_the_margin_are_left_out_and_named() -> None:
+    config = load_config(CONFIGS / "koch.toml")
+    assert not Space.of(config).as_built
+    wide = config.model_copy(update={"clearance": config.clearance.model_copy(update={"margin": 0.015})})
+    assert Space.of(wide).as_built == (("base", "upper_arm"),)
+    said = "Some parts of 'base' and 'upper_arm' are closer than clearance.margin in nearly every pose"
+    assert any(said in doubt for doubt in doubts(wide))
+    assert not any("nearly every pose" in doubt for doubt in doubts(config))
+
+
+def test_the_reserve_of_parts_near_each_other_by_design_is_one_they_can_keep() -> None:
+    config = load_config(CONFIGS / "koch.toml")
+    space = Space.of(config)
+    low, high = np.array([joint.position_limit for joint in config.joints]).T
+    poses = np.random.default_rng(1).uniform(low, high, (200, len(low)))
+    assert any(space.has_reserve(pose[:, None], 0.01) for pose in poses)
+    assert not any(space.has_reserve(pose[:, None], 0.5) for pose in poses)
 
 
 def test_capsules_enclose_boxes_and_meshes(tmp_path: Path) -> None:

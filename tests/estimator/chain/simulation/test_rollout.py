@@ -48,6 +48,22 @@ def test_held_up_it_stays_and_let_go_it_lies() -> None:
     assert np.abs(lying.position[0, -1] - pose).max() < 0.05
 
 
+def test_a_joint_on_its_stop_stays_on_it_while_another_moves_away() -> None:
+    arms, _ = arms_of(3, 5, viscous=0.1)
+    pose = np.array([0.2, 0.1, -0.3])
+    held = weights(arms, pose)[0]
+    goal = np.zeros((200, 3))
+    stiffness, damping = np.array([0.0, 0.0, 50.0]), np.array([0.0, 0.0, 3.0])
+    goal[:, 2] = 50.0 * 0.8  # the last joint leaves what carries the arm in its rest pose
+    side = np.array([0.0, -np.sign(held[1]), 0.0])
+    sagged = []
+    for stops in (None, side):
+        loop = Loop(RATE, goal, stiffness, damping, pose, np.full(3, 50.0), stops)
+        sagged.append((side[1] * (roll_out(arms, loop, pose).position[0, :, 1] - pose[1])).max())
+    assert sagged[0] > 0.2
+    assert sagged[1] < 0.02
+
+
 def test_an_arm_of_no_mass_distribution_is_told() -> None:
     arms, _ = arms_of(3, 6)
     poses = np.random.default_rng(1).uniform(-1, 1, (5, 3))

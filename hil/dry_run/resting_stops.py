@@ -1,0 +1,45 @@
+"""Joints of a spatial arm that lie on their own mechanical stop in the rest pose, which no configuration states.
+
+In the rest pose an arm lies without torque. What carries it is a surface (floor, cradle, another link) or the joints'
+own stops. A surface is left behind as the arm moves; a stop holds its joint wherever the others are.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.clearance.space import Space
+from hil.config.chain import described_arm
+from hil.config.schema import Config
+from hil.estimator.chain.simulation.rollout import PRESSED_SHARE, ChainArms, weights
+from hil.plan.chain_model import torque_limits
+
+Array = NDArray[np.float64]
+
+NEAR_STOP_RAD = 0.14
+"""A joint that lies on its stop is at most this far from the end of its range, as configured or described [rad]."""
+
+
+def resting_stops(config: Config, arms: ChainArms) -> Array:
+    """Side on which each joint lies on its stop (joints,): -1 at its smallest angle, 1 at its largest, 0 if on neither.
+
+    It does if its rest pose is near the end of its range, nothing else touches the part of the arm that it moves, and
+    gravity does not pull it away from there. Raises ArmFileError.
+    """
+    rest = np.array(config.arm.rest_pose)
+    low, high = _ends(config, rest)
+    side = np.where(high < low, 1.0, -1.0)
+    side[np.minimum(low, high) > NEAR_STOP_RAD] = 0.0
+    side[Space.of(config).is_touched] = 0.0
+    pulled = side * weights(arms, rest).mean(axis=0)
+    side[pulled > PRESSED_SHARE * torque_limits(config)] = 0.0
+    return side
+
+
+def _ends(config: Config, rest: Array) -> tuple[Array, Array]:
+    """Distance of the rest pose from the nearer of the configured and the described end, on each side (joints,)."""
+    limits = np.array([joint.position_limit for joint in config.joints])
+    ends = np.abs(limits - rest[:, None])
+    for row, joint, at in zip(ends, described_arm(config).joints, rest, strict=True):
+        if joint.limits is not None and joint.limits[0] < joint.limits[1]:
+            row[:] = np.minimum(row, np.abs(np.array(joint.limits) - at))
+    return ends[:, 0], ends[:, 1]
