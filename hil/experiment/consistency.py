@@ -29,12 +29,15 @@ It runs for each joint in each exchange, as part of a compiled loop (`hil.experi
 keeps for a joint is a record of the type `MEMORY`.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 import numba
 import numpy as np
 
-__all__ = ["MEMORY", "begin", "look", "lost"]
+from hil.drivers.state import State
+
+__all__ = ["MEMORY", "begin", "look", "lost", "moved_at_standstill"]
 
 SHORT_S, LONG_S = 0.3, 1.2
 """Time constants of the memories [s]."""
@@ -180,6 +183,23 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
 def lost(memory: Any) -> None:
     """Restart with the next reply: too many are missing."""
     memory.position = np.nan
+
+
+def moved_at_standstill(states: Iterable[State], joint: int, still: float) -> str:
+    """Describe how far a joint moved while its velocity was reported to be below `still` [rad/s]; "" if it did not.
+
+    states: the latest states, the last one first.
+    """
+    said, last = "", None
+    for state in states:
+        if not abs(state.velocity[joint]) < still:
+            break
+        last = state if last is None else last
+        seconds = last.time_before_write - state.time_before_write
+        moved = last.position[joint] - state.position[joint]
+        if abs(moved) > STEP_RAD + still * seconds:
+            said = f"its position has changed by {moved:+.3f} rad in the last {1e3 * seconds:.0f} ms"
+    return said
 
 
 def _looks_long(memory: Any, velocity: float) -> bool:
