@@ -165,13 +165,16 @@ def received(config: Config, story: Story) -> Heard:
 def since_again(driven: NDArray[np.float64], since: float, again: list[float]) -> float:
     """When the current had to end [s] if another program switched torque on again, at the times `again`.
 
-    driven: times at which current flowed [s]. Where it had ended after `since`, a new reason begins.
+    driven: times at which current flowed [s]. A new reason begins where it had ended in time after `since`, had stayed
+    off for `LASTING_MS`, longer than while goals pass through zero, and flows again from that moment on.
     """
     for when in sorted(again):
-        before = driven[driven < when - 1e-3 * GAP_MS]
-        was_off = not ((driven >= when - 1e-3 * GAP_MS) & (driven < when - 1e-3 * UNSURE_MS)).any()
-        if since < when and was_off and _flowed_ms(before, since) <= BOUND_MS:
-            since = when - 1e-3 * UNSURE_MS
+        begins = when - 1e-3 * UNSURE_MS
+        before, after = driven[driven < begins], driven[driven >= begins]
+        was_off = not before.size or when - before[-1] >= 1e-3 * LASTING_MS
+        is_on = after.size > 0 and after[0] <= when + 1e-3 * GAP_MS
+        if since < when and was_off and is_on and _flowed_ms(before, since) <= BOUND_MS:
+            since = begins
     return since
 
 

@@ -32,7 +32,7 @@ WIDENED = 1.5
 
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
-_FRICTIONS, _FRICTIONS_UNDESCRIBED = 8.0, 4.0
+_FRICTIONS, _FRICTIONS_UNDESCRIBED = 8.0, 3.0
 """Lower bounds on the torque scale, in multiples of the mean dry friction: up to twice that friction must not raise an
 alarm. Without a description, friction is that of typical servos; the bound then only concerns arms whose planned torque
 hardly exceeds it.

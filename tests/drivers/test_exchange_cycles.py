@@ -4,9 +4,10 @@ import pytest
 
 from hil.drivers.exchange import Exchange
 from hil.drivers.packet import encode_status
+from hil.drivers.read_back import TRY_AGAIN_S
 from hil.drivers.servo_model import Mode
-from hil.drivers.state import spans
-from tests.drivers.test_exchange import XM430, Wire, answer, exchange
+from hil.drivers.state import spans, status_span
+from tests.drivers.test_exchange import XM430, Wire, answer, exchange, read_back_of
 
 FINE = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
 
@@ -22,6 +23,27 @@ def test_between_two_samples_the_slow_registers_are_never_read() -> None:
         assert cycles.cycle([0, 0]).span == 0
     assert [cycles.cycle([0, 0], between=True).span for _ in range(30)] == [0] * 30
     assert cycles.cycle([0, 0]).span == 1, "which were due all the time"
+
+
+def test_the_status_is_read_when_it_is_due_and_the_slow_registers_when_they_are() -> None:
+    tables = [XM430, XM430]
+    usual, status = spans(Mode.CURRENT, tables), status_span(Mode.CURRENT, tables, whole=True)
+    cycles = Exchange(Wire(), (1, 2), XM430["Goal Current"], usual, 0.0, slow_every=7, status=status, status_every=3)
+    read = []
+    for _ in range(8):
+        read.append(cycles.cycle([0, 0]).span)
+        cycles._late_possible = False
+    assert read == [0, 0, len(usual), 0, 0, len(usual), 1, 0]
+
+
+def test_a_read_back_for_which_this_program_wakes_up_too_late_is_tried_again_after_a_pause() -> None:
+    wire = Wire([FINE])
+    cycles = read_back_of(wire)
+    cycles.cycle([0, 0])
+    due = wire.now() + 0.1
+    wire.wait_until = lambda _: setattr(wire, "time", due)  # type: ignore[method-assign]
+    assert cycles.overruled(due) is None and len(wire.written) == 1
+    assert cycles.read_back_at == pytest.approx(due + TRY_AGAIN_S, abs=1e-9)
 
 
 def test_a_reply_behind_one_that_came_too_soon_is_awaited_until_the_usual_timeout() -> None:

@@ -196,6 +196,10 @@ def test_the_stop_of_a_joint_lies_where_it_has_not_been(config: Config, watch: C
     assert sees(config, watch, 0.4, **home).support.tolist() == [0.0, 1.0, 0.0], "the first has been on both sides"
 
 
+def test_a_joint_that_gravity_does_not_pull_rests_on_no_stop(config: Config, watch: ChainWatch) -> None:
+    assert sees(config, watch, 0.0, away=(0.0, 0.0, 0.3)).support.tolist() == [0.0, 0.0, 0.0]
+
+
 def test_what_is_said_of_a_joint_at_rest_and_of_one_that_moves(config: Config, watch: ChainWatch) -> None:
     constant = config.joints[0].torque_per_goal
     interval = 1 / config.experiment.rate

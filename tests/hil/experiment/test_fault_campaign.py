@@ -118,10 +118,18 @@ def test_a_healthy_twin_is_found_for_a_healthy_arm_and_a_stuck_one_but_not_for_o
 
 
 @pytest.mark.parametrize(
-    ("ended", "again", "since"),
-    [(1.08, 1.2, 1.18), (1.08, 0.9, 1.0), (1.17, 1.2, 1.0), (1.12, 1.2, 1.0), (1.08, 1.1, 1.0)],
-    ids=["ended in time", "before the reason", "has not ended", "ended too late", "ended just before"],
+    ("ended", "again", "since", "later"),
+    [
+        *((1.08, 1.2, 1.18, 0.0), (1.08, 0.9, 1.0, 0.0), (1.17, 1.2, 1.0, 0.0), (1.12, 1.3, 1.0, 0.0)),
+        *((1.08, 1.1, 1.0, 0.0), (1.08, 1.16, 1.0, 0.0), (1.08, 1.2, 1.0, 0.2)),
+    ],
+    ids=[
+        *("ended in time", "before the reason", "has not ended", "ended too late", "ended just before"),
+        *("off as long as a goal of zero", "on again for another reason"),
+    ],
 )
-def test_torque_that_another_program_switches_on_is_a_new_reason(ended: float, again: float, since: float) -> None:
-    driven = np.concatenate((np.arange(0.5, ended, 1e-3), np.arange(again, again + 0.05, 1e-3)))
+def test_torque_that_another_program_switches_on_is_a_new_reason(
+    ended: float, again: float, since: float, later: float
+) -> None:
+    driven = np.concatenate((np.arange(0.5, ended, 1e-3), np.arange(again + later, again + later + 0.05, 1e-3)))
     assert since_again(driven, 1.0, [again]) == pytest.approx(since)
