@@ -78,6 +78,9 @@ reach back by `LAG_S`.
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
 """Velocity below which it may well stay the same while a joint sticks and slips, and its resolution [rad/s]."""
 
+LONGEST_GAP_S = 0.06
+"""Time between two exchanges beyond which the velocity in between is unknown [s]: more than 20 Hz on a slow bus needs."""
+
 SCALE, MORE_SCALE = 0.06, 0.02
 CURVED = 0.35
 """Allowance for the velocity between samples, as a fraction of its change times the interval. A wave with only four
@@ -190,11 +193,13 @@ def moved_at_standstill(states: Iterable[State], joint: int, still: float) -> st
 
     states: the latest states, the last one first.
     """
-    said, last = "", None
+    said, last, later = "", None, None
     for state in states:
-        if not abs(state.velocity[joint]) < still:
+        # Over a gap, the joint may have moved at any velocity.
+        is_gap = later is not None and later.time_before_write - state.time_before_write > LONGEST_GAP_S
+        if is_gap or not abs(state.velocity[joint]) < still:
             break
-        last = state if last is None else last
+        last, later = state if last is None else last, state
         seconds = last.time_before_write - state.time_before_write
         moved = last.position[joint] - state.position[joint]
         if abs(moved) > STEP_RAD + still * seconds:
