@@ -79,7 +79,7 @@ SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
 """Velocity below which it may well stay the same while a joint sticks and slips, and its resolution [rad/s]."""
 
 LONGEST_GAP_S = 0.06
-"""Time between two exchanges beyond which the velocity in between is unknown [s]: more than 20 Hz on a slow bus needs."""
+"""Time between two exchanges beyond which the velocity in between is unknown [s]; 20 Hz on a slow bus needs less."""
 
 SCALE, MORE_SCALE = 0.06, 0.02
 CURVED = 0.35

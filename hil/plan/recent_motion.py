@@ -79,12 +79,13 @@ class RecentMotion:
         return found
 
     def contradicts(self, joint: int, velocity: float) -> bool:
-        """Whether a velocity is not that of the joint: none of its changes of position allows it, or no servo turns
-        that fast.
+        """Whether a velocity is not that of the joint: none of its changes of position allows it, or none is known
+        and no servo turns that fast.
         """
         travels = self.travels(joint)
-        is_other = all(not CONTRADICTS * each.low <= velocity <= CONTRADICTS * each.high for each in travels)
-        return self.is_unreachable(joint, velocity) or (bool(travels) and is_other)
+        if not travels:
+            return self.is_unreachable(joint, velocity)
+        return all(not CONTRADICTS * each.low <= velocity <= CONTRADICTS * each.high for each in travels)
 
     def is_unreachable(self, joint: int, velocity: float) -> bool:
         """Whether no servo of this model turns that fast."""
