@@ -148,14 +148,18 @@ class ServoModel:
         """Whether a current stays behind its goal because the supply cannot drive more through the turning motor.
 
         It is taken for the cause if the motor turns in the direction of its goal and the voltage across its terminals,
-        that of its winding and its back-EMF, is about the supply's. A servo without torque has the back-EMF alone.
+        that of its winding and its back-EMF, is about the supply's. A servo without torque has the back-EMF alone. A
+        current against its goal has another cause.
 
         goal, carried: commanded and measured current [A]. velocity: of the output shaft [rad/s]. supply: lowest
         measured voltage of the supply [V]; NaN if unknown, in which case it may be as low as supplies ever are.
         """
         if goal == 0.0 or velocity * goal <= 0.0 or not abs(carried) < abs(goal):
             return False
-        along = max(0.0, math.copysign(1.0, goal) * carried)
+        along = math.copysign(1.0, goal) * carried
+        if along < -HARDLY_ANY * abs(goal):
+            return False  # for lack of voltage a current falls short of its goal, but never turns round
+        along = max(0.0, along)
         back_emf = self.back_emf * abs(velocity)
         has_current = along > HARDLY_ANY * abs(goal)
         if supply > 0.0:

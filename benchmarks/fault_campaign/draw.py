@@ -37,7 +37,7 @@ WORDS = {
     VOLTAGE: r"voltage|\d V\b",
     STUCK: r"stuck|\bheld\b|jammed|not move(?! like)|stands? still|blocked|not moving|something holds",
     ENCODER: r"encoder|magnet|seems to have moved|implausible|frozen|velocity and position"
-    r"|position.{0,40}(disagree|contradict)",
+    r"|position.{0,40}(disagree|contradict)|contradicts its position",
     LIMIT: r"(outside|more than|beyond|exceeded) (its|the) (position|velocity)[ _]limit",
     SIGN: r"sign of|against its command|wrong way|turned? round",
     PROGRAM: r"deadlines?\b|(the|this) computer|program (was|stood|stopped)|stalled|suspended|did not run|kept waiting",
@@ -285,7 +285,7 @@ def _amount(kind: Kind, field: str, random: Random) -> float:
         Kind.LAG: 10 ** random.uniform(-2.0, -0.3),
         Kind.JITTER: 0.1 * ticks,
         Kind.STUCK_BIT: float(random.randrange(13 if field == "position" else 9)),
-        Kind.CONSTANT: random.choice((0.0, -1.0, 1023.0, 4095.0)),
+        Kind.CONSTANT: sign * random.choice((0.0, 1.0, 1023.0, 4095.0)),
         Kind.STALL: 10 ** random.uniform(-2, 0.5),
         Kind.STRANGE_GOAL: sign * random.uniform(0.05, 1.0),
         Kind.LOWERED_LIMIT: random.uniform(0.02, 0.9),

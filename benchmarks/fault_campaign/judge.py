@@ -45,6 +45,14 @@ OBEYED = 0.1
 ASTRAY_RAD, ASTRAY_SHARE = 0.1, 0.35
 """Tolerance for the deviation from the undisturbed motion, absolute and relative to the range of that motion."""
 
+DRIVES_MS = 15
+"""Longest time for which a program may command more than ever in the undisturbed run along a visible motion [ms]."""
+
+DRIVES_SHARE, DRIVES_TICKS, DRIVES_S = 1.2, 5, 0.01
+"""Ratio to the largest goal of the undisturbed run, and smallest change of a position that counts as a visible motion
+[ticks], within this time [s].
+"""
+
 TO_BE_SEEN = (
     "is not where the program was told",
     "is not as fast as told",
@@ -77,6 +85,8 @@ class Verdict:
     overshoot of each joint beyond its limit (joints,) [rad]. named: whether the output names the cause; None if nothing
     stopped the run. misleading: the output names only wrong causes. unseen: current flowed for longer, but until the
     bound before its end a healthy arm might have sent the same replies (`fault_campaign.twin`), so it is not unsafe.
+    drives_ms: how long the program drove a joint harder than planned, in the direction in which the positions that it
+    received moved, as a brake must not.
     """
 
     owed: str
@@ -86,6 +96,7 @@ class Verdict:
     named: bool | None
     misleading: bool
     unseen: bool = False
+    drives_ms: float = 0.0
 
 
 def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Verdict:
@@ -108,8 +119,41 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     limits = np.array([joint.position_limit for joint in config.joints])
     position = story.record["position"]
     beyond = np.maximum(limits[:, 0] - position.min(axis=0), position.max(axis=0) - limits[:, 1])
-    unsafe = (late_ms > bound and not unseen) or left_on
-    return Verdict(owed, late_ms, unsafe, beyond, named, misleading, unseen)
+    drives_ms = driving_ms(config, drawn, story, undisturbed)
+    unsafe = (late_ms > bound and not unseen) or left_on or drives_ms > DRIVES_MS
+    return Verdict(owed, late_ms, unsafe, beyond, named, misleading, unseen, drives_ms)
+
+
+def driving_ms(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> float:
+    """Longest time for which the program commanded a joint more than ever in the undisturbed run, in the direction in
+    which the positions that it received were moving [ms]; 0 for an arm that a stabiliser may hold with any torque.
+    """
+    if config.stabiliser is not None:
+        return 0.0
+    told = _Told(config, story.traffic, drawn.start)
+    longest = 0.0
+    for joint, (sent, heard) in enumerate(zip(told.sent, told.heard, strict=True)):
+        record = undisturbed.record[:, joint]
+        most = DRIVES_SHARE * np.abs(record["goal"][record["driven"]]).max(initial=1)
+        moved = _visible_motion(np.array([each[0] for each in sent]), np.array(heard).reshape(-1, 4))
+        along = config.joints[joint].direction * np.array([each[1] for each in sent]) * np.sign(moved)
+        begun = None
+        for (when, _), drives in zip(sent, along > most, strict=True):
+            if begun is not None:
+                longest = max(longest, 1e3 * (when - begun))
+            begun = (when if begun is None else begun) if drives else None
+    return longest
+
+
+def _visible_motion(when: NDArray[np.float64], heard: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Change of the received positions within `DRIVES_S` before each moment [rad]; 0 if it is not visible."""
+    moved = np.zeros(when.size)
+    latest = np.searchsorted(heard[:, 0], when, "right") - 1
+    for index, last in enumerate(latest):
+        first = int(np.searchsorted(heard[:, 0], heard[last, 0] - DRIVES_S, "right")) - 1 if last > 0 else -1
+        if first >= 0 and when[index] - heard[first, 0] < 5 * DRIVES_S:
+            moved[index] = heard[last, 1] - heard[first, 1]
+    return np.where(np.abs(moved) * _TICKS_PER_RAD > DRIVES_TICKS, moved, 0.0)
 
 
 def received(config: Config, story: Story) -> Heard:
@@ -356,5 +400,6 @@ def describe(verdict: Verdict) -> str:
     """The verdict on one line."""
     said = [f"{verdict.owed or 'nothing owed'}, current for {verdict.late_ms:.0f} ms"]
     said += ["UNSAFE"] * verdict.unsafe + ["a healthy arm might have done the same"] * verdict.unseen
+    said += [f"DRIVES a joint for {verdict.drives_ms:.0f} ms"] * (verdict.drives_ms > DRIVES_MS)
     said += ["MISLEADING"] * verdict.misleading + ["UNNAMED"] * (verdict.named is False)
     return ", ".join(said)

@@ -22,6 +22,7 @@ from hil.errors import Cause, SafetyStop
 from hil.estimator.chain.simulation.motion_observer import ChainObserver
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.experiment.apart import causes_of_standstill
+from hil.experiment.consistency import moved_at_standstill
 from hil.plan.chain_model import known_chain
 
 Array = NDArray[np.float64]
@@ -67,7 +68,7 @@ class ChainWatch:
         self._friction = mean[count + n : count + 2 * n]
         self._falls_to = np.where(np.abs(gravity) > self._friction, -np.sign(gravity), 0.0)
         self._was_below, self._was_above = np.zeros((2, n), dtype=np.bool_)
-        self._commanded: deque[tuple[float, Array]] = deque(maxlen=math.ceil(WINDOW_S / interval))
+        self._commanded: deque[tuple[State, Array]] = deque(maxlen=math.ceil(WINDOW_S / interval))
         self._goal: Sequence[float] | None = None
         self._seen_at = 0.0
 
@@ -88,7 +89,7 @@ class ChainWatch:
             self._was_below |= away < -LYING_RAD
         torque = self._constants * goal
         support = self._support(is_away, velocity, torque) if is_free and not is_away.all() else None
-        self._commanded.append((self._seen_at, torque))
+        self._commanded.append((state, torque))
         joint = self._observer.observe(position, velocity, torque, seconds, is_free, support)
         if joint >= 0:
             self._raise(joint, state)
@@ -106,8 +107,17 @@ class ChainWatch:
     def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]
         name = self._names[joint]
+        states = (state for state, _ in reversed(self._commanded))
+        if moved := moved_at_standstill(states, joint, _STILL_RAD_S):
+            raise SafetyStop(
+                f"{name} reports a velocity of {state.velocity[joint]:+.2f} rad/s that contradicts its position: "
+                f"{moved}. One of the two readings is wrong. Check the encoder and its magnet; replace the servo if "
+                "necessary.",
+                Cause.FROZEN,
+            )
         if abs(state.velocity[joint]) < _STILL_RAD_S:
-            recent = [torque[joint] for at, torque in self._commanded if self._seen_at - at <= WINDOW_S]
+            since = self._seen_at - WINDOW_S
+            recent = [torque[joint] for at, torque in self._commanded if at.time_before_write >= since]
             said = (
                 f"{name} stands still, with {min(recent):+.3f} to {max(recent):+.3f} N m commanded in the last "
                 f"{WINDOW_S:g} s: any arm consistent with the prior and the data so far would move. "

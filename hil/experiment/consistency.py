@@ -29,12 +29,15 @@ It runs for each joint in each exchange, as part of a compiled loop (`hil.experi
 keeps for a joint is a record of the type `MEMORY`.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 import numba
 import numpy as np
 
-__all__ = ["MEMORY", "begin", "look", "lost"]
+from hil.drivers.state import State
+
+__all__ = ["MEMORY", "begin", "look", "lost", "moved_at_standstill"]
 
 SHORT_S, LONG_S = 0.3, 1.2
 """Time constants of the memories [s]."""
@@ -74,6 +77,9 @@ reach back by `LAG_S`.
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
 """Velocity below which it may well stay the same while a joint sticks and slips, and its resolution [rad/s]."""
+
+LONGEST_GAP_S = 0.06
+"""Time between two exchanges beyond which the velocity in between is unknown [s]; 20 Hz on a slow bus needs less."""
 
 SCALE, MORE_SCALE = 0.06, 0.02
 CURVED = 0.35
@@ -180,6 +186,25 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
 def lost(memory: Any) -> None:
     """Restart with the next reply: too many are missing."""
     memory.position = np.nan
+
+
+def moved_at_standstill(states: Iterable[State], joint: int, still: float) -> str:
+    """Describe how far a joint moved while its velocity was reported to be below `still` [rad/s]; "" if it did not.
+
+    states: the latest states, the last one first.
+    """
+    said, last, later = "", None, None
+    for state in states:
+        # Over a gap, the joint may have moved at any velocity.
+        is_gap = later is not None and later.time_before_write - state.time_before_write > LONGEST_GAP_S
+        if is_gap or not abs(state.velocity[joint]) < still:
+            break
+        last, later = state if last is None else last, state
+        seconds = last.time_before_write - state.time_before_write
+        moved = last.position[joint] - state.position[joint]
+        if abs(moved) > STEP_RAD + still * seconds:
+            said = f"its position has changed by {moved:+.3f} rad in the last {1e3 * seconds:.0f} ms"
+    return said
 
 
 def _looks_long(memory: Any, velocity: float) -> bool:

@@ -28,6 +28,7 @@ from hil.experiment.joint_checks import JOINT, MOST_OUTSIDE_RAD, JointChecks
 from hil.experiment.silence import Silence
 from hil.experiment.status_check import StatusCheck
 from hil.plan.find_torque import how_to_find_torque
+from hil.plan.recent_motion import RecentMotion
 
 __all__ = ["MOST_OUTSIDE_RAD", "Guard"]
 
@@ -59,6 +60,8 @@ class Guard:
 
     left_by_a_run: whether the arm is where an immediately preceding run left it. One that was stopped at a limit may
     have come to rest slightly beyond it: such a joint may move back in, but no farther out.
+
+    recent: the exchanges so far, if another guard has checked them.
     """
 
     def __init__(
@@ -70,6 +73,7 @@ class Guard:
         patience: float = 0.0,
         heard_instead: Callable[[], str] = str,
         left_by_a_run: bool = False,
+        recent: RecentMotion | None = None,
     ) -> None:
         rate = config.experiment.rate
         safety = config.safety
@@ -87,6 +91,8 @@ class Guard:
         self._commands = CommandLimits(config)
         planned = planned or _planned(config)
         interval = 1.0 / rate if interval is None else interval
+        self.recent = RecentMotion(config, interval) if recent is None else recent
+        """The latest exchanges, those of a stop included."""
         self._silence = Silence(config, interval, patience)
         self._patience = patience or float("inf")
         self._heard_instead = heard_instead
@@ -125,6 +131,7 @@ class Guard:
 
         watchdog_gap: time since the previous exchange [s]. between: it took place between two samples.
         """
+        self.recent.add(state)
         now = state.time_before_write
         took = state.time_after_read - now
         gap = watchdog_gap if watchdog_gap > took else took
@@ -270,7 +277,8 @@ class Guard:
             Cause.JUMP,
             f"reports an angle that changed by {joint['moved']:+.3f} rad within {1e3 * joint['seconds']:.0f} ms; its "
             f"velocity limit allows at most {joint['most']:.3f} rad. Check the encoder, its magnet and the supply, "
-            "and whether its horn slips.",
+            "whether its horn slips, and whether a device between adapter and servos delivers old replies or another "
+            "servo's.",
         )
 
     def _outside(self, index: int, state: State) -> NoReturn:
@@ -283,11 +291,28 @@ class Guard:
         )
 
     def _too_fast(self, index: int, state: State) -> NoReturn:
+        velocity = state.velocity[index]
+        if self.recent.contradicts(index, velocity):
+            self._stop(index, Cause.FROZEN, self._not_its_velocity(index, velocity))
         self._stop(
             index,
             Cause.VELOCITY,
             f"moves at {state.velocity[index]:.2f} rad/s, more than its velocity limit of "
             f"{self._joints[index]['fastest']:g} rad/s.{self._lower_torque}",
+        )
+
+    def _not_its_velocity(self, index: int, velocity: float) -> str:
+        said, reach = f"reports a velocity of {velocity:+.2f} rad/s", "that no servo of this model can reach"
+        if travels := self.recent.travels(index):
+            moved, seconds, *_ = travels[0]
+            way = f"which changed by {moved:+.4f} rad in the last {1e3 * seconds:.0f} ms"
+            said += f" that contradicts its position, {way}"
+            said += f", and {reach}" * self.recent.is_unreachable(index, velocity)
+        else:
+            said += f" {reach}"
+        return (
+            f"{said}: this reading is wrong. Check the servo and whether a device between adapter and servo changes "
+            "its replies; replace the servo if it happens again."
         )
 
     def _not_followed(self, index: int, state: State) -> NoReturn:

@@ -2,7 +2,7 @@
 
 The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the path
 home. Lowering is monitored like the experiment: a missing reply, an alert, a current that does not follow its goal or a
-joint that leaves the path ends it, and torque is cut.
+joint that leaves the path ends it, and torque is cut. The damper acts on velocities that the positions confirm.
 """
 
 import numpy as np
@@ -15,6 +15,7 @@ from hil.errors import Cause, ExperimentError, SafetyStop
 from hil.experiment.guard import Guard
 from hil.plan.chain_plan import SETTLE_IN, PathSegment
 from hil.plan.plan import Plan
+from hil.plan.recent_motion import RecentMotion
 from hil.plan.way_home import WayHome
 
 LEAVES_RAD = 0.35
@@ -73,22 +74,27 @@ class Lowering:
         away: NDArray[np.float64] = np.array(state.position) - self._rest
         return away
 
-    def begin(self, state: State, goal: list[float]) -> int:
-        """Start lowering from this sample; return the number of samples it takes. goal: latest goals [A or V]."""
-        position, velocity = np.array(state.position), np.array(state.velocity)
+    def begin(self, state: State, goal: list[float], recent: RecentMotion) -> int:
+        """Start lowering from this sample; return the number of samples it takes.
+
+        goal: latest goals [A or V]. recent: the latest exchanges.
+        """
+        self._recent = recent
+        position, velocity = np.array(state.position), np.array(recent.believed(state))
         self._path = self._way.path(position, velocity)
         torque = self._thought.of(self._path)
         count = torque.shape[1]
         share = np.clip((count - np.arange(count)) / self._fade, 0.0, 1.0)
         self._feed = (share * torque).T
         self._position, self._velocity = self._path.position.T.copy(), self._path.velocity.T.copy()
-        self._guard = _guard_of(self._config, self._planned, self._path.position, velocity, self._interval)
+        self._guard = _guard_of(self._config, self._planned, self._path.position, velocity, self._interval, recent)
         self._guard.holding(goal)
         return int(count)
 
     def goals(self, index: int, state: State) -> list[float]:
         """Goals [A or V] of one sample, from the previous sample's state. Raises SafetyStop."""
-        ahead = self._position[index] - np.array(state.position), self._velocity[index] - np.array(state.velocity)
+        velocity = np.array(self._recent.believed(state))
+        ahead = self._position[index] - np.array(state.position), self._velocity[index] - velocity
         held = np.where(np.array(state.missing), 0.0, self._stiffness * ahead[0] + self._damping * ahead[1])
         return self._guard.clamp(((self._feed[index] + held) / self._constants).tolist())
 
@@ -106,7 +112,12 @@ class Lowering:
 
 
 def _guard_of(
-    config: Config, planned: list[float], position: np.ndarray, velocity: np.ndarray, interval: float | None
+    config: Config,
+    planned: list[float],
+    position: np.ndarray,
+    velocity: np.ndarray,
+    interval: float | None,
+    recent: RecentMotion,
 ) -> Guard:
     """A guard whose limits are widened just enough for the arm's position and velocity when it was stopped.
 
@@ -120,7 +131,8 @@ def _guard_of(
     ]
     # A servo that has only lost its watchdog can still be lowered, which is better than dropping it.
     unwatched = config.safety.model_copy(update={"allow_no_watchdog": True})
-    return Guard(config.model_copy(update={"joints": joints, "safety": unwatched}), planned, interval=interval)
+    widened = config.model_copy(update={"joints": joints, "safety": unwatched})
+    return Guard(widened, planned, interval=interval, recent=recent)
 
 
 def _allowing(joint: JointConfig, low: float, high: float, velocity: float) -> JointConfig:

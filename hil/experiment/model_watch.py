@@ -24,6 +24,7 @@ from hil.estimator.compiled import compiled, only_version
 from hil.estimator.models.momentum_observer import NAMES, MomentumObserver
 from hil.estimator.models.parameters import CONSTANTS
 from hil.experiment.apart import causes_of_standstill
+from hil.experiment.consistency import moved_at_standstill
 
 ARMS = 64
 WIDENED = 1.5
@@ -180,7 +181,7 @@ class ModelWatch:
         held = interval < 0.99 / config.experiment.rate
         self._follows = 1.0 - math.exp(-interval / _LAG_S) if held else 1.0
         self._felt = [0.0] * len(largest)
-        self._commanded: deque[tuple[float, list[float]]] = deque(maxlen=math.ceil(_WINDOW_S / interval))
+        self._commanded: deque[tuple[State, list[float]]] = deque(maxlen=math.ceil(_WINDOW_S / interval))
         self._stands_for = 0.0
         self._long = max(interval, _VAGUE_S)
         self._jolts = Jolts(len(largest), interval)
@@ -204,7 +205,7 @@ class ModelWatch:
             follows = self._follows
             torque = self._felt = [felt + follows * (to - felt) for felt, to in zip(self._felt, torque, strict=True)]
         self._look_for_jolts(state, seconds)
-        self._commanded.append((now, torque))
+        self._commanded.append((state, torque))
         joint = self._observer.observe(state.position, state.velocity, torque, seconds)
         if joint < 0:
             self._stands_for = 0.0
@@ -231,8 +232,17 @@ class ModelWatch:
     def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]
         name, velocity = self._names[joint], state.velocity[joint]
+        states = (state for state, _ in reversed(self._commanded))
+        if moved := moved_at_standstill(states, joint, _STILL_RAD_S):
+            raise SafetyStop(
+                f"{name} reports a velocity of {state.velocity[joint]:+.2f} rad/s that contradicts its position: "
+                f"{moved}. One of the two readings is wrong. Check the encoder and its magnet; replace the servo if "
+                "necessary.",
+                Cause.FROZEN,
+            )
         if abs(velocity) < _STILL_RAD_S:
-            recent = [torque[joint] for at, torque in self._commanded if self._seen_at - at <= _WINDOW_S]
+            since = self._seen_at - _WINDOW_S
+            recent = [torque[joint] for at, torque in self._commanded if at.time_before_write >= since]
             low, high = min(recent), max(recent)
             said = (
                 f"{name} stands still, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "

@@ -374,7 +374,7 @@ class Stream:
 
     def _brake(self) -> None:
         """Brake until the arm is slow, a read fails, time is up, or a second signal arrives. Never raises."""
-        brake = Brake(self._config, self._apart)
+        brake = Brake(self._config, self._apart, self._guard.recent)
         state = self._state
         ticks = FixedRate(self._clock, 1 / self._apart)
         with suppress(DriverError):
@@ -414,7 +414,7 @@ class Stream:
     def _way_down(self, lowering: Lowering, state: State) -> State:
         """Follow the path home; return the last state. Raises SafetyStop, StopRequested, DriverError."""
         asked = max(1, self._stop.count)
-        for index in range(lowering.begin(state, self._goal)):
+        for index in range(lowering.begin(state, self._goal, self._guard.recent)):
             for checked in self._between_samples() if index else ():
                 lowering.look(index - 1, checked, checked.time_before_write - state.time_before_write, between=True)
                 state = checked

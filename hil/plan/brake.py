@@ -1,8 +1,11 @@
 """The first part of a stop, if possible: braking, with a current opposing each joint's velocity.
 
 Braking lasts a bounded time, within the current limits. It ends at once when a reply is missing, a servo raises an
-alert, a deadline is missed, a second signal arrives, or a joint accelerates, as it does if its motor turns the wrong
-way. Torque is cut afterwards in any case.
+alert, a deadline is missed, a second signal arrives, or a joint accelerates, by its velocity or its positions, as it
+does if its motor turns the wrong way. Torque is cut afterwards in any case.
+
+A joint is braked against its reported velocity only as far as the change of its position confirms it
+(`hil.plan.recent_motion`), so that no current acts in the direction in which its position moves.
 """
 
 from hil.config.schema import Config
@@ -10,6 +13,7 @@ from hil.drivers.preparation.cadence import CHECK_S
 from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import ExperimentError, SafetyStop
+from hil.plan.recent_motion import RecentMotion
 
 FULL_AT = 0.5
 """Fraction of the velocity limit at which the brake uses the full current limit.
@@ -60,31 +64,40 @@ def braking_gains(config: Config, interval: float | None = None) -> list[float]:
 
 
 class Brake:
-    """Computes goal currents that oppose the measured velocities."""
+    """Computes goal currents that oppose the joints' velocities.
 
-    def __init__(self, config: Config, interval: float | None = None) -> None:
+    recent: the exchanges before the stop. Without any, a joint is braked only from its second state on.
+    """
+
+    def __init__(self, config: Config, interval: float | None = None, recent: RecentMotion | None = None) -> None:
         self._gains = braking_gains(config, interval)
         self._limits = [joint.goal_limit for joint in config.joints]
         self._allowed = [GETS_FASTER * joint.velocity_limit for joint in config.joints]
         self._enough = config.safety.rest_velocity
-        self._first: list[float] | None = None
+        self._recent = RecentMotion(config, interval) if recent is None else recent
+        self._first: tuple[list[float], list[float]] | None = None
 
     def goals(self, state: State) -> list[float] | None:
         """Goal currents [A] for this sample; None if braking is over: arm at rest, reply missing, or a joint
         accelerates.
         """
+        velocities = self._recent.believed(state)
         speeds = [abs(velocity) for velocity in state.velocity]
         if any(state.missing) or any(state.error) or all(speed < self._enough for speed in speeds):
             return None
-        if self._pushes(speeds):
+        if self._pushes(speeds, self._recent.speeds()):
             return None
         return [
             max(-limit, min(limit, -gain * velocity))
-            for gain, limit, velocity in zip(self._gains, self._limits, state.velocity, strict=True)
+            for gain, limit, velocity in zip(self._gains, self._limits, velocities, strict=True)
         ]
 
-    def _pushes(self, speeds: list[float]) -> bool:
-        """Whether a joint is clearly faster than when braking began."""
+    def _pushes(self, reported: list[float], visible: list[float]) -> bool:
+        """Whether a joint is clearly faster than when braking began, by its reported or its visible speed."""
         if self._first is None:
-            self._first = speeds
-        return any(now > first + more for now, first, more in zip(speeds, self._first, self._allowed, strict=True))
+            self._first = reported, visible
+        return any(
+            now > first + more
+            for speeds, begun in zip((reported, visible), self._first, strict=True)
+            for now, first, more in zip(speeds, begun, self._allowed, strict=True)
+        )

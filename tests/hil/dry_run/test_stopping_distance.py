@@ -14,9 +14,10 @@ from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.closed_loop import Feedback, respond, resting
 from hil.fakes.plants.arm import base_parameters
 from hil.fakes.plants.two_link import TwoLink
-from hil.plan.brake import GETS_FASTER, Brake
+from hil.plan.brake import GETS_FASTER
 from hil.plan.plan import Plan, make_plan, scaled
 from tests.support.edits import replaced
+from tests.support.motion import brake_of
 from tests.support.short_experiment import CONFIG, short_config
 
 NONE = Feedback.none(2)
@@ -133,7 +134,7 @@ def moving(*velocity: float) -> State:
 
 
 def test_a_brake_pulls_against_the_motion_within_the_limits_until_the_arm_is_slow() -> None:
-    brake = Brake(close_config())
+    brake = brake_of(close_config(), moving(14.0, -1.0))
     first, second = brake.goals(moving(14.0, -1.0)) or (0.0, 0.0)
     assert first == pytest.approx(-1.2) and 0.0 < second < 0.8
     assert brake.goals(moving(0.05, -0.05)) is None
@@ -141,7 +142,7 @@ def test_a_brake_pulls_against_the_motion_within_the_limits_until_the_arm_is_slo
 
 @pytest.mark.parametrize("faster", [1, 2])
 def test_a_brake_that_makes_a_joint_faster_is_given_up(faster: int) -> None:
-    brake = Brake(close_config())
+    brake = brake_of(close_config(), moving(5.0, -2.0))
     allowed = GETS_FASTER * 20.0
     assert brake.goals(moving(5.0, -2.0)) is not None
     assert brake.goals(moving(4.0, -2.0 - 0.9 * allowed)) is not None
@@ -151,4 +152,5 @@ def test_a_brake_that_makes_a_joint_faster_is_given_up(faster: int) -> None:
 
 def test_a_brake_that_cannot_feel_a_joint_is_given_up() -> None:
     for blind in ({"missing": (False, True)}, {"error": (0x80, 0)}):
-        assert Brake(close_config()).goals(moving(5.0, 2.0)._replace(**blind)) is None  # type: ignore[arg-type]
+        brake = brake_of(close_config(), moving(5.0, 2.0))
+        assert brake.goals(moving(5.0, 2.0)._replace(**blind)) is None  # type: ignore[arg-type]

@@ -65,3 +65,5 @@ def test_a_braking_motor_has_all_the_voltage_it_needs(given: Config) -> None:
     assert servo.is_out_of_voltage(-0.3, -0.1, -4.6)
     assert not servo.is_out_of_voltage(0.3, 0.1, -4.6)
     assert not servo.is_out_of_voltage(0.3, 0.3, 4.6)
+    assert not servo.is_out_of_voltage(0.3, -0.25, 4.6), "a shortfall of voltage never reverses a current"
+    assert not servo.is_out_of_voltage(-0.3, 0.25, -4.6, 12.0)

@@ -11,6 +11,7 @@ from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import Cause, ExperimentError, NotSettled, SafetyStop, StopRequested
 from hil.plan.brake import Brake, braking_gains, may_brake
+from tests.support.motion import brake_of, seen_moving
 
 Arm = Callable[..., Config]
 MOVING = State(0.0, 0.001, (0.0, 0.0), (0.0, 0.0), (3.0, -4.0), (-1.57, 0.0), (0, 0), (False, False))
@@ -19,7 +20,7 @@ MOVING = State(0.0, 0.001, (0.0, 0.0), (0.0, 0.0), (3.0, -4.0), (-1.57, 0.0), (0
 def test_full_current_at_half_of_the_velocity_limit(arm: Arm) -> None:
     """The limits of the joints are 1.2 A and 15 rad/s, 0.8 A and 20 rad/s."""
     assert braking_gains(arm()) == pytest.approx([1.2 / 7.5, 0.8 / 10.0])
-    assert Brake(arm()).goals(MOVING) == pytest.approx([-1.2 * 3.0 / 7.5, 0.8 * 4.0 / 10.0])
+    assert brake_of(arm(), MOVING).goals(MOVING) == pytest.approx([-1.2 * 3.0 / 7.5, 0.8 * 4.0 / 10.0])
 
 
 @pytest.mark.parametrize(("rate", "interval"), [(100.0, 0.01), (60.0, 1 / 60), (20.0, 0.01), (40.0, 0.025)])
@@ -33,7 +34,8 @@ def test_a_light_joint_is_not_thrown_back(arm: Arm, rate: float, interval: float
     slow = config.experiment.model_copy(update={"rate": rate})
     config = config.model_copy(update={"joints": joints, "experiment": slow})
     known = interval if rate == 40.0 else None
-    goals = Brake(config, known).goals(MOVING._replace(velocity=(0.3, -0.3)))
+    moving = MOVING._replace(velocity=(0.3, -0.3))
+    goals = Brake(config, known, seen_moving(config, moving)).goals(moving)
     assert goals is not None
     for goal, joint, velocity in zip(goals, config.joints, (0.3, -0.3), strict=True):
         rotor = 0.5 * servo_prior(joint.joint.servo).armature.median
@@ -42,8 +44,9 @@ def test_a_light_joint_is_not_thrown_back(arm: Arm, rate: float, interval: float
 
 
 def test_never_more_than_the_current_limit(arm: Arm) -> None:
-    assert Brake(arm()).goals(MOVING._replace(velocity=(-14.0, 19.0))) == pytest.approx([1.2, -0.8])
-    assert Brake(arm()).goals(MOVING._replace(velocity=(14.0, -19.0))) == pytest.approx([-1.2, 0.8])
+    for sign in (1.0, -1.0):
+        moving = MOVING._replace(velocity=(sign * -14.0, sign * 19.0))
+        assert brake_of(arm(), moving).goals(moving) == pytest.approx([sign * 1.2, sign * -0.8])
 
 
 @pytest.mark.parametrize(
@@ -57,11 +60,12 @@ def test_never_more_than_the_current_limit(arm: Arm) -> None:
     ],
 )
 def test_over_at_rest_unseen_or_alarmed(arm: Arm, change: dict[str, object]) -> None:
-    assert Brake(arm()).goals(MOVING._replace(**change)) is None  # type: ignore[arg-type]
+    assert brake_of(arm(), MOVING).goals(MOVING._replace(**change)) is None  # type: ignore[arg-type]
 
 
 def test_one_joint_that_still_moves_is_braked_alone(arm: Arm) -> None:
-    goals = Brake(arm()).goals(MOVING._replace(velocity=(0.0, 0.11)))
+    moving = MOVING._replace(velocity=(0.0, 0.11))
+    goals = brake_of(arm(), moving).goals(moving)
     assert goals is not None and goals[0] == 0.0 and goals[1] == pytest.approx(-0.8 * 0.11 / 10.0)
 
 
@@ -69,13 +73,50 @@ def test_one_joint_that_still_moves_is_braked_alone(arm: Arm) -> None:
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_joint_that_gets_faster_ends_it(arm: Arm, more: float, goes_on: bool, sign: float) -> None:
     """The tolerance is a fifth of the velocity limit, 20 rad/s, above the speed at the start of braking."""
-    brake = Brake(arm())
+    brake = brake_of(arm(), MOVING)
     assert brake.goals(MOVING) is not None
     faster = MOVING._replace(velocity=(0.0, sign * (4.0 + more)))
     assert (brake.goals(faster) is not None) is goes_on
-    slow = Brake(arm())
+    slow = brake_of(arm(), MOVING)
     assert slow.goals(MOVING._replace(velocity=(0.0, 0.2))) is not None
     assert (slow.goals(MOVING._replace(velocity=(0.0, sign * (0.2 + more)))) is not None) is goes_on
+
+
+@pytest.mark.parametrize("interval", [0.001, 0.0025, 0.01, 0.05])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_no_current_in_the_direction_in_which_the_position_moves(arm: Arm, interval: float, sign: float) -> None:
+    """Whatever the velocity says. The other joint is braked as ever."""
+    for claimed in (0.5, 5.0, 20.0, 3000.0):
+        moving = MOVING._replace(velocity=(3.0, -sign * claimed))
+        truly = MOVING._replace(velocity=(3.0, sign * 2.0))
+        brake = Brake(arm(), interval, seen_moving(arm(), truly, interval))
+        assert brake.goals(moving) == pytest.approx([braking_gains(arm(), interval)[0] * -3.0, 0.0])
+
+
+@pytest.mark.parametrize("interval", [0.0025, 0.01])
+def test_hardly_any_current_while_the_position_stands_still(arm: Arm, interval: float) -> None:
+    still = MOVING._replace(velocity=(0.0, 0.0))
+    goals = Brake(arm(), interval, seen_moving(arm(), still, interval)).goals(MOVING._replace(velocity=(-15.0, 20.0)))
+    assert goals is not None and abs(goals[0]) < 0.03 * 1.2 and abs(goals[1]) < 0.03 * 0.8
+
+
+def test_a_joint_seen_only_once_is_not_braked_yet(arm: Arm) -> None:
+    brake = Brake(arm())
+    assert brake.goals(MOVING) == pytest.approx([0.0, 0.0])
+    later = MOVING._replace(time_before_write=0.01, time_after_read=0.011, position=(-1.54, -0.04))
+    assert brake.goals(later) == pytest.approx([-1.2 * 3.0 / 7.5, 0.8 * 4.0 / 10.0])
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_position_that_gets_faster_ends_it_whatever_the_velocity_says(arm: Arm, sign: float) -> None:
+    brake = brake_of(arm(), MOVING)
+    assert brake.goals(MOVING) is not None
+    for number in range(1, 20):
+        time, moved = 0.0025 * number, sign * 9.0 * 0.0025 * number
+        state = MOVING._replace(time_before_write=time, time_after_read=time + 0.001, position=(-1.57, moved))
+        if brake.goals(state) is None:
+            break
+    assert 2 <= number <= 12, "9 rad/s instead of 4, on average over 20 ms"
 
 
 ALLOWED = {

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hil.drivers.state import State
 from hil.experiment.consistency import (
     CURVED,
     LAG_S,
@@ -19,6 +20,7 @@ from hil.experiment.consistency import (
     MORE_SCALE,
     SCALE,
     SHORT_S,
+    moved_at_standstill,
 )
 from tests.support.one_joint import Consistency
 
@@ -344,3 +346,16 @@ def test_an_interval_longer_than_a_memory_leaves_nothing_of_what_was_before() ->
     short = look.memory["short"]
     assert short["far"] == pytest.approx(1.6) and short["apart"] == pytest.approx(1.6 - 2.5 * 2 * SHORT_S)
     assert (short["mean"], short["unknown"]) == (3.0, 0.0)
+
+
+@pytest.mark.parametrize(("speed", "said"), [(0.8, "changed by +0.032 rad in the last 40 ms"), (0.05, "")])
+def test_a_joint_that_moves_while_its_velocity_reads_zero_does_not_stand_still(speed: float, said: str) -> None:
+    """Only the readings since the velocity fell to zero count: before, it moved at 2 rad/s."""
+    states = [
+        State(0.01 * n, 0.01 * n + 0.001, (0.0,), (0.0,), (velocity,), (position,), (0,), (False,))
+        for n in range(9)
+        for velocity, position in [(2.0, 0.02 * n) if n < 4 else (0.0, 0.08 + 0.01 * (n - 4) * speed)]
+    ]
+    assert (said in (found := moved_at_standstill(reversed(states), 0, 0.06))) and bool(found) == bool(said)
+    gap = [State(-0.3, -0.299, (0.0,), (0.0,), (0.0,), (5.0,), (0,), (False,)), *states[4:]]
+    assert moved_at_standstill(reversed(gap), 0, 0.06) == found, "what happened over a gap is unknown"

@@ -37,6 +37,7 @@ def look(guard: Guard, *states: State) -> Cause:
         ({"position": (nan, 0.0)}, Cause.POSITION),
         ({"velocity": (15.1, 0.0)}, Cause.VELOCITY),
         ({"velocity": (nan, 0.0)}, Cause.VELOCITY),
+        ({"velocity": (60.0, 0.0)}, Cause.FROZEN),
         ({"error": (0, 0x80)}, Cause.ALERT),
         ({"error": (0, 0x80), "missing": (False, True)}, Cause.ALERT),
         ({"slow": NOTHING_SLOW._replace(temperature=(71.0, nan))}, Cause.TEMPERATURE),
@@ -51,9 +52,37 @@ def test_an_encoder_jump_stops_and_the_same_way_over_lost_samples_does_not(arm: 
     fast = STILL._replace(velocity=(0.0, 19.0))
     moved = fast._replace(position=(-1.57, 19.0 * 3 / 400))
     assert look(Guard(arm()), fast, at(1, moved)) is Cause.JUMP
+    with pytest.raises(SafetyStop, match=r"encoder, its magnet.*old replies or another servo's\.$"):
+        look_again = Guard(arm())
+        look_again.look(fast)
+        look_again.look(at(1, moved))
     guard = Guard(arm())
     for number, state in enumerate((fast, MISSING, MISSING, moved)):
         guard.look(at(number, state))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(
+    ("claimed", "moves", "cause"),
+    [(15.1, 14.9, Cause.VELOCITY), (15.1, 1.0, Cause.FROZEN), (15.1, -10.0, Cause.FROZEN), (60.0, 10.0, Cause.FROZEN)],
+    ids=["agrees", "hardly moves", "moves back", "no servo reaches it"],
+)
+@pytest.mark.parametrize("rate", [20.0, 100.0, 400.0])
+def test_a_velocity_beyond_its_limit_that_contradicts_the_position(
+    arm: Arm, rate: float, claimed: float, moves: float, cause: Cause, sign: float
+) -> None:
+    interval = min(1 / rate, 0.01)
+    guard = Guard(arm(), interval=interval)
+    for number in range(2):
+        now, way = number * interval, sign * moves * interval * number
+        state = STILL._replace(time_before_write=now, time_after_read=now + 0.001, position=(-1.57 + way, 0.0))
+        if number == 0:
+            guard.look(state._replace(velocity=(sign * min(abs(moves), 14.0), 0.0)))
+    with pytest.raises(SafetyStop) as stop:
+        guard.look(state._replace(velocity=(sign * claimed, 0.0)))
+    assert stop.value.cause is cause
+    assert ("contradicts its position" in str(stop.value)) == (cause is Cause.FROZEN)
+    assert ("can reach" in str(stop.value)) == (claimed == 60.0)
 
 
 def test_a_frozen_encoder_is_seen_between_lost_replies(arm: Arm) -> None:

@@ -20,6 +20,7 @@ from hil.fakes.protocol_fake import FakeSerial
 from hil.plan.chain_plan import make_chain_plan
 from hil.runs.recording import Phase, Recorder, load_samples
 from hil.runs.run_folder import RunFolder
+from tests.support.motion import seen_moving
 from tests.support.paths import CONFIGS
 
 NAME = "fake_open_manipulator_x.toml"
@@ -86,6 +87,23 @@ def test_an_arm_that_does_not_reach_its_rest_pose_is_said_to_lie_elsewhere() -> 
     lowering = Lowering(config, make_chain_plan(config))
     state: Any = SimpleNamespace(position=(*rest[:2], rest[2] - 0.2, rest[3]))
     assert not lowering.lies(state) and lowering.lies_elsewhere(state) == "'joint3' is at 0.800 rad, -0.20 rad from it"
+
+
+def test_a_false_velocity_does_not_drive_the_arm_on_its_way_down() -> None:
+    """Neither the path that starts with it nor the damper: the positions show that the arm stands still."""
+    config = load_config(CONFIGS / NAME)
+    rest, none = tuple(config.arm.rest_pose), (0.0,) * 4
+    still = State(0.0, 0.001, none, none, none, (rest[0] + 0.3, *rest[1:]), (0,) * 4, (False,) * 4)
+    goals = []
+    for claimed in (0.0, 4.0, -4.0):
+        recent = seen_moving(config, still)
+        lowering = Lowering(config, make_chain_plan(config))
+        state = still._replace(velocity=(claimed, 0.0, 0.0, 0.0))
+        lowering.begin(state, list(none), recent)
+        goals.append(lowering.goals(0, state))
+    assert config.stabiliser is not None
+    torque = [goal[0] * config.joints[0].torque_per_goal for goal in goals]
+    assert max(torque) - min(torque) < 0.1 * config.stabiliser.damping[0] * 4.0
 
 
 def test_a_second_signal_cuts_torque_on_the_way_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,6 +71,8 @@ class Bus:
 class Checks:
     """In place of the guard and the model: notes what they are given."""
 
+    recent = None
+
     def __init__(self, *_: Any, **__: Any) -> None:
         self.calls: list[Call] = []
         self.wants_status = False
@@ -324,7 +326,7 @@ class Brakes:
 
     wanted = 99
 
-    def __init__(self, _config: Config, apart: float) -> None:
+    def __init__(self, _config: Config, apart: float, _recent: object) -> None:
         self.apart = apart
 
     def goals(self, _state: State) -> list[float] | None:
@@ -485,7 +487,7 @@ class Lowers(Checks):
     def lies(self, _state: State) -> bool:
         return self.lies_already
 
-    def begin(self, _state: State, _goal: list[float]) -> int:
+    def begin(self, _state: State, _goal: list[float], _recent: object) -> int:
         return 3
 
     def goals(self, index: int, _state: State) -> list[float]:

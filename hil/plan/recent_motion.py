@@ -1,0 +1,135 @@
+"""How fast each joint can be turning, by the change of its position: no brake may rely on a reported velocity alone.
+
+A servo can report a false velocity in an intact reply. A brake that trusted it would drive the joint. Therefore the
+velocity to brake against is the reported one, confined to the range that the change of position allows over two spans
+of time: a short one, which soon shows a reversal, and a long one, in which a slow motion is visible in spite of the
+encoder's steps. Each range includes zero and never the direction opposite to a visible motion.
+"""
+
+from collections import deque
+from math import ceil, isnan
+from typing import NamedTuple
+
+from hil.config.schema import Config
+from hil.drivers.servo_model import ServoModel
+from hil.drivers.state import State
+
+__all__ = ["RecentMotion", "Travel"]
+
+SHORT_S, LONG_S = 0.004, 0.02
+"""The two spans [s], or as many exchanges as it takes."""
+
+_OLDEST_S = 0.05
+_LONGER = 1.5
+"""Largest age of a position that is used [s], or as a multiple of the time between two exchanges."""
+
+_STEPS = 2.0
+"""Uncertainty of a change of position, in encoder steps."""
+
+_MORE = 1.25
+"""Tolerance for a velocity that increases within the span, as a factor on the mean velocity."""
+
+CONTRADICTS = 2.0
+"""Factor on that range beyond which a velocity contradicts the position: at constant acceleration from standstill, the
+last velocity is twice the mean one.
+"""
+
+UNREACHABLE = 3.0
+"""Velocity that no servo reaches, relative to its no-load speed at its highest published voltage."""
+
+
+class Travel(NamedTuple):
+    """Change of a joint's position [rad] in `seconds` [s], and the range of velocities that it allows [rad/s]."""
+
+    moved: float
+    seconds: float
+    low: float
+    high: float
+
+
+class RecentMotion:
+    """The latest exchanges. interval: time between two of them [s]; by default, that between two samples."""
+
+    def __init__(self, config: Config, interval: float | None = None) -> None:
+        interval = 1.0 / config.experiment.rate if interval is None else interval
+        self._oldest = max(_OLDEST_S, _LONGER * interval)
+        self._states: deque[State] = deque(maxlen=ceil(LONG_S / interval) + 3)
+        self._steps = [_STEPS * abs(joint.joint.position_unit) for joint in config.joints]
+        self._fastest = [_fastest(joint.joint.servo) for joint in config.joints]
+
+    def add(self, state: State) -> None:
+        """Keep an exchange; one that is already the latest is not kept twice."""
+        if not self._states or self._states[-1] is not state:
+            self._states.append(state)
+
+    def believed(self, state: State) -> list[float]:
+        """The reported velocities, confined to what the positions allow [rad/s]; 0 where no change of them is known.
+
+        state: the latest exchange.
+        """
+        self.add(state)
+        return [self._confined(joint, velocity) for joint, velocity in enumerate(state.velocity)]
+
+    def speeds(self) -> list[float]:
+        """Speed at which each joint has visibly moved over the longer span [rad/s]; 0 if unknown."""
+        found = []
+        for joint, step in enumerate(self._steps):
+            travels = self.travels(joint)
+            found.append(max(0.0, abs(travels[-1].moved) - step) / travels[-1].seconds if travels else 0.0)
+        return found
+
+    def contradicts(self, joint: int, velocity: float) -> bool:
+        """Whether a velocity is not that of the joint: none of its changes of position allows it, or none is known
+        and no servo turns that fast.
+        """
+        travels = self.travels(joint)
+        if not travels:
+            return self.is_unreachable(joint, velocity)
+        return all(not CONTRADICTS * each.low <= velocity <= CONTRADICTS * each.high for each in travels)
+
+    def is_unreachable(self, joint: int, velocity: float) -> bool:
+        """Whether no servo of this model turns that fast."""
+        return abs(velocity) > self._fastest[joint]
+
+    def travels(self, joint: int) -> list[Travel]:
+        """The changes of a joint's position over the short and the long span; none if it has been seen only once."""
+        states = [state for state in self._states if not isnan(state.position[joint])]
+        if len(states) < 2 or isnan(self._states[-1].position[joint]):
+            return []
+        last = states.pop()
+        known = [state for state in states if 0.0 < last.time_before_write - state.time_before_write <= self._oldest]
+        if not known:
+            return []
+        return [self._travel(joint, _since(known, last, span), last) for span in (SHORT_S, LONG_S)]
+
+    def _travel(self, joint: int, first: State, last: State) -> Travel:
+        moved, step = last.position[joint] - first.position[joint], self._steps[joint]
+        seconds = last.time_before_write - first.time_before_write
+        # A servo may measure at any time during its exchange.
+        unsure = abs(_took(last) - _took(first))
+        least = max(seconds - unsure, 0.5 * seconds)
+        low, high = min(0.0, moved - step), max(0.0, moved + step)
+        return Travel(moved, seconds, _MORE * low / least, _MORE * high / least)
+
+    def _confined(self, joint: int, velocity: float) -> float:
+        if isnan(velocity):
+            return velocity
+        travels = self.travels(joint)
+        low = max((each.low for each in travels), default=0.0)
+        high = min((each.high for each in travels), default=0.0)
+        return min(max(velocity, low), high)
+
+
+def _since(known: list[State], last: State, span: float) -> State:
+    """The latest state that is at least `span` [s] older than the last one, or the oldest."""
+    now = last.time_before_write
+    return next((state for state in reversed(known) if now - state.time_before_write >= span), known[0])
+
+
+def _took(state: State) -> float:
+    return state.time_after_read - state.time_before_write
+
+
+def _fastest(model: ServoModel) -> float:
+    voltage = max(stall.voltage for stall in model.stalls)
+    return UNREACHABLE * model.no_load.speed * voltage / model.no_load.voltage
