@@ -1,9 +1,12 @@
 """Recordings of one arm whose load was changed in between are said to disagree."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hil.estimation.unsettled.agreement import disagreement
+from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.idim import fit_inverse_dynamics
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import estimate_by_shooting
@@ -27,6 +30,19 @@ def swing(heavier: float, seed: int) -> Recording:
         plant.advance(now, [torque[k - 1] / SERVO["torque_constant"] if k else 0.0])
         (position[k],) = plant.position
     return Recording(time, torque[None], np.round(position / STEP)[None] * STEP, np.array([STEP]), between="held")
+
+
+def test_a_torque_that_is_logged_after_it_acted_is_named() -> None:
+    """Each torque is stored two samples late."""
+    recording = swing(1.0, 1)
+    late = replace(recording, torque=np.roll(recording.torque, 2, axis=1))
+    said = []
+    for each in (recording, late):
+        start = fit_inverse_dynamics([each], 8.0, 0.05).value
+        estimate = estimate_by_shooting([each], Model(1), start)
+        said.append([one for one in doubts_of([each], estimate).warnings if "delay" in one])
+    assert said[0] == []
+    assert said[1][0].startswith("The delay is negative, -5") and "(2 samples)" in said[1][0]
 
 
 @pytest.mark.parametrize("heavier", [1.0, 1.2])
