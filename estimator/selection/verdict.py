@@ -191,8 +191,8 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
     if trust == "yes":
         return f"The standard errors include it: {listed}{more}; the others are known to 2 % or better."
     return (
-        f"It may bias all of them: the standard errors include it ({listed}{more}; the others at most 2 %), but while its "
-        "cause is unknown, errors of several standard errors are possible."
+        f"It may bias all of them: the standard errors include it ({listed}{more}; the others at most 2 %), but while "
+        "its cause is unknown, errors of several standard errors are possible."
     )
 
 
