@@ -31,6 +31,9 @@ RAM = (
     "Profile Velocity",
 )
 
+_BOUNDS = {"Goal PWM": "PWM Limit", "Goal Velocity": "Velocity Limit", "Profile Velocity": "Velocity Limit"}
+"""The EEPROM limit of each goal that an experiment does not set: a servo refuses larger goals."""
+
 STARTUP_CONFIGURATION = Register("Startup Configuration", 60, 1)
 """Not in the SDK's tables. Bit 0: torque on after power-up or reboot; bit 1: RAM registers restored then."""
 
@@ -59,16 +62,30 @@ def read_settings(servo: Servo) -> dict[str, int]:
     return settings
 
 
+def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
+    """The settings with goals cut to the servo's present limits, which another program may have lowered since.
+
+    Raises as `Servo.read`.
+    """
+    cut = dict(settings)
+    for goal, limit in _BOUNDS.items():
+        if goal in settings and goal in servo.table and limit in servo.table:
+            most = servo.read_despite_error(limit)
+            cut[goal] = max(-most, min(settings[goal], most))
+    return cut
+
+
 def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, int]]:
     """Restore the registers that differ from `settings`; return (old, new) for those that were written.
 
-    Each is read back. Raises WrongSetting while torque is on, otherwise as `Servo.write`, but only after all other
-    registers were tried.
+    Goals are restored as far as the servo's limits allow (`attainable`). Each register is read back. Raises
+    WrongSetting while torque is on, otherwise as `Servo.write`, but only after all other registers were tried.
     """
     if servo.read_despite_error("Torque Enable"):
         raise WrongSetting(f"{servo.title}: its settings cannot be restored while its torque is on.")
     if servo.read_despite_error("Bus Watchdog") != 0:
         servo.write_despite_error("Bus Watchdog", 0)  # goals are read-only while it is tripped
+    settings = attainable(servo, settings)
     written: dict[str, tuple[int, int]] = {}
     failures: list[DriverError] = []
     for name in (*EEPROM, *RAM, "Bus Watchdog"):

@@ -100,6 +100,23 @@ def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | N
     return (residual, left) if residual < LESS_RESIDUAL * left else None
 
 
+def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | None:
+    """Return evidence that the torques of two joints are swapped.
+
+    This is the relative RMS of the torque residual, worst joint, with the torques swapped and as given; None if that
+    does not explain the recordings much better.
+    """
+    if recordings[0].joints != 2:
+        return None
+    as_given = Signs((1, 1), (1, 1))
+    given = _fit(recordings, as_given)
+    fitted = _fit([replace(each, torque=each.torque[::-1].copy()) for each in recordings], as_given)
+    if given is None or fitted is None or _impossible(fitted):
+        return None
+    residual, left = float(fitted.relative_residual.max()), float(given.relative_residual.max())
+    return (residual, left) if residual < LESS_RESIDUAL * left else None
+
+
 def _combinations(joints: int) -> Iterator[Signs]:
     """Yield all reversals, fewest columns first. A mirrored arm is equivalent, so joint 1's position keeps its sign."""
     every = (

@@ -49,6 +49,8 @@ class SegmentEvidence:
     """Whether a warning casts doubt on the estimate."""
     conflicts: tuple[Conflict, ...] = ()
     """Values far from those known beforehand."""
+    spoiled: bool = False
+    """Whether the recordings themselves are at fault, so that neither terms nor other motion would help."""
 
 
 def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate) -> dict[str, float]:
@@ -80,7 +82,7 @@ def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, 
         _predicted(held_out, estimate.segment_length),
         *conflict_sentences(evidence.conflicts, explained),
         *evidence.doubts,
-        _weakest(weakest, relative[weakest]),
+        _weakest(weakest, relative[weakest], evidence.spoiled),
     )
     return Verdict(trust, weakest, sentences)
 
@@ -123,8 +125,8 @@ def _predicted(held_out: Array | None, length: float) -> str:
     )
 
 
-def _weakest(name: str, part: float) -> str:
-    if part <= WELL_KNOWN:
+def _weakest(name: str, part: float, spoiled: bool) -> str:
+    if part <= WELL_KNOWN or spoiled:
         return f"The least well known parameter is {name}, to {100 * part:.2g} %."
     if not np.isfinite(part):
         return f"This motion provides no information on {name}. To identify it: {IMPROVEMENT[kind_of(name)]}."

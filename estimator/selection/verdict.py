@@ -190,7 +190,10 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
         return f"It may bias everything, most of all {listed}{more}."
     if trust == "yes":
         return f"The standard errors include it: {listed}{more}; the others are known to 2 % or better."
-    return f"It may bias {listed}{more}; the others stay within 2 %."
+    return (
+        f"It may bias all of them: the standard errors include it ({listed}{more}; the others at most 2 %), but while "
+        "its cause is unknown, errors of several standard errors are possible."
+    )
 
 
 def _distorted(validation: Validation) -> tuple[str, ...]:

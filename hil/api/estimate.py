@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from datetime import datetime
 from os import PathLike
 from pathlib import Path
@@ -110,10 +110,12 @@ def _from_files(paths: list[Path], config: Path | None, out: PathLikeStr | None)
 
 
 def _discard(folder: Path) -> None:
+    """Remove a folder without a result. If it has been deleted meanwhile, the error that led here says so."""
     if not (folder / "result.json").is_file():
-        for path in folder.iterdir():
-            path.unlink()
-        folder.rmdir()
+        with suppress(FileNotFoundError):
+            for path in folder.iterdir():
+                path.unlink()
+            folder.rmdir()
 
 
 def _again(folder: Path) -> Estimation:

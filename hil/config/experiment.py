@@ -48,7 +48,11 @@ class ExperimentConfig(Table):
     def _consistent(self) -> Self:
         samples = self.rate * self.period
         if abs(samples - round(samples)) > 1e-9 * samples:
-            raise ValueError(f"rate * period = {samples:g}: must be a whole number of samples")
+            nearest = max(1, round(samples))
+            raise ValueError(
+                f"rate * period = {samples:g}: must be a whole number of samples; the nearest: "
+                f"period = {nearest / self.rate:.12g}"
+            )
         if (self.band is None) == (self.lines is None):
             raise ValueError("give either band or lines")
         if self.detection and self.band is None:

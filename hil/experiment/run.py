@@ -8,7 +8,7 @@ from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.clock import Clock, WallClock
-from hil.drivers.errors import DriverError, ServoFault, TorqueNotOff, WrongSetting
+from hil.drivers.errors import DriverError, PortLost, ServoFault, TorqueNotOff, WrongSetting
 from hil.drivers.latency import command_to_set, latency_timer
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
@@ -87,9 +87,12 @@ def run_experiment(
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
             # Signals are deferred from before torque comes on until the servos' settings are restored.
             with stop.only_noted(), servo_limits(config, bus, note):
-                _play(config, plan, bus, recorder, stop, shown, note, arms)
+                changed = _play(config, plan, bus, recorder, stop, shown, note, arms)
             torque = str(bus.torque_off_report)
             note(torque)
+            if changed:
+                torque = f"{torque} {changed}"
+                note(changed)
             with _with_torque(torque):
                 recorder.close()
             try:
@@ -120,8 +123,11 @@ def _play(
     watch: Watch,
     note: Note,
     arms: Ensemble | ChainArms | None,
-) -> None:
-    """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event."""
+) -> str:
+    """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event.
+
+    Returns a sentence about settings that another program changed meanwhile; "" if there are none.
+    """
     stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
     settings: Settings = {}
     try:
@@ -150,6 +156,7 @@ def _play(
             cause.args = (str(cause).partition(NONE_HEARD)[0] + who,)
             note(who)
         raise
+    return changed_settings(settings, settings_now(bus))
 
 
 def _try_again(bus: ServoBus, note: Note) -> None:
@@ -199,13 +206,20 @@ def _check_unchanged(bus: ServoBus) -> Settings:
 
 
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException) -> None:
-    """Name settings that another program changed; read only once torque is off, because reading takes time."""
-    stop = error if isinstance(error, SafetyStop) else error.__context__
-    if not isinstance(stop, SafetyStop) or stop.cause not in EXPLAINED:
+    """Name settings that another program changed; read only once torque is off, because reading takes time.
+
+    A change that can explain a stop is named before it, any other one after it.
+    """
+    if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return
-    if changed := changed_settings(before, settings_now(bus), stop.cause):
+    stop = error if isinstance(error, SafetyStop) else error.__context__
+    now = settings_now(bus)
+    cause = stop.cause if isinstance(stop, SafetyStop) and stop.cause in EXPLAINED else None
+    if cause is not None and isinstance(stop, SafetyStop) and (changed := changed_settings(before, now, cause)):
         stop.args = (f"{changed} Symptom: {stop}",)
         stop.overruled = True
+    elif changed := changed_settings(before, now):
+        error.add_note(changed)
 
 
 @contextmanager

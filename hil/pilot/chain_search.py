@@ -187,7 +187,7 @@ def identify_chain_in_steps(
             search.step(f"Step {number}", f"step-{number}", tuple(share * each for each in (1.0, 0.8, 0.6)))
         torque = _full(search)
         result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))
-    run.write_result(result)
+        run.write_result(result)
     return torque, result
 
 

@@ -45,7 +45,7 @@ def identify_in_steps(
         played = _full(search, *search.find())
         run.write_starts([search.belief.middle])
         result = replace(estimate_run(run), steps=tuple(step.played() for step in search.steps))
-    run.write_result(result)
+        run.write_result(result)
     return played.torque, result
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hil.errors import CsvError
 from hil.estimator.data.recording import LONGEST_GAP, MOST_GAP
+from hil.recordings.encoder import encoder_step
 
 Values = NDArray[np.float64]
 
@@ -84,9 +85,16 @@ def _unrepeated(source: str, rows: Rows) -> Rows:
     if not count:
         return rows
     if count > FEW * rows.time.size:
+        percent = f"{100 * count / rows.time.size:.0f} %"
+        share = f"{source}: {percent} of the times are the same as the one before, with other data"
+        if encoder_step(rows.time) is None:
+            raise CsvError(
+                f"{share}, although they have many digits: the rows were stamped when they arrived, in bursts, not "
+                "when they were measured. Use the device's own time stamps, or, if the samples are equally spaced, set "
+                "columns.rate (samples per second) in place of columns.time."
+            )
         raise CsvError(
-            f"{source}: {100 * count / rows.time.size:.0f} % of the times are the same as the one before, with other "
-            "data: they are too coarse. Write them with more digits, or, if the samples are equally spaced, set "
+            f"{share}: they are too coarse. Write them with more digits, or, if the samples are equally spaced, set "
             "columns.rate (samples per second) in place of columns.time."
         )
     return rows.kept(~again, f"{source}: {count} rows with the same time as the row before were left out.")

@@ -14,7 +14,7 @@ from hil.recordings.encoder import encoder_step
 from hil.recordings.guess import guessed, said
 from hil.recordings.plausible import refuse_degrees
 from hil.recordings.table import Table
-from hil.recordings.units import UNITS, unit_of
+from hil.recordings.units import UNITS, unit_of, wrapped
 
 Values = NDArray[np.float64]
 
@@ -47,12 +47,14 @@ def convert(table: Table, columns: Columns) -> Converted:
     assert whole.position is not None and whole.drive is not None  # or guessed would have raised
     time = _time(table, whole)
     ticks = 0.0 if whole.ticks_per_turn is None else 2.0 * np.pi / whole.ticks_per_turn
-    position = np.stack([_quantity(table, name, "position", whole.position_unit, ticks) for name in whole.position])
+    position = np.stack(
+        [_quantity(table, name, "position", whole.position_unit, ticks, notes) for name in whole.position]
+    )
     if columns.position_unit is None:  # that of `whole` may be guessed
         refuse_degrees(table.source, whole.position, time, position)
     if whole.angles == "absolute":
         position = np.diff(position, axis=0, prepend=0.0)
-    torque = np.stack([_torque(table, whole, joint) for joint in range(len(whole.position))])
+    torque = np.stack([_torque(table, whole, joint, notes) for joint in range(len(whole.position))])
     zero = np.array(whole.zero or [0.0] * len(position))[:, None]
     steps = [whole.position_step or encoder_step(row) for row in position]
     step = np.array([each or SMALLEST_STEP for each in steps])
@@ -93,11 +95,11 @@ def _time(table: Table, columns: Columns) -> Values:
     return np.asarray((values - first) * UNITS["time"][unit])
 
 
-def _torque(table: Table, columns: Columns, joint: int) -> Values:
+def _torque(table: Table, columns: Columns, joint: int, notes: list[str]) -> Values:
     kind = columns.drive
     assert kind is not None
     name = getattr(columns, kind)[joint]
-    values = _quantity(table, name, kind, getattr(columns, f"{kind}_unit"))
+    values = _quantity(table, name, kind, getattr(columns, f"{kind}_unit"), notes=notes)
     if kind == "pwm":
         assert columns.supply_voltage is not None
         if float(np.nanmax(np.abs(values), initial=0.0)) > 1.5:
@@ -110,9 +112,19 @@ def _torque(table: Table, columns: Columns, joint: int) -> Values:
     return values if gains is None else values * gains[joint]
 
 
-def _quantity(table: Table, name: str, kind: str, given: str | None, ticks: float = 0.0) -> Values:
+def _quantity(
+    table: Table, name: str, kind: str, given: str | None, ticks: float = 0.0, notes: list[str] | None = None
+) -> Values:
+    """A column in SI units; notes: receives a sentence if it was corrected."""
     full, values, stated = table.find(name)
     unit = _unit(table, full, kind, stated, given)
+    bits = wrapped(values, (32,) if kind == "position" else (16, 32))
+    if bits is not None and notes is not None:
+        values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
+        notes.append(
+            f"{table.source}: column {full!r} wraps at 2^{bits}: its registers were read as unsigned numbers, and are "
+            "taken as signed ones here."
+        )
     if unit == TICKS and not ticks:
         raise CsvError(
             f"{table.source}: column {full!r} is in ticks: set columns.ticks_per_turn (4096 for X-series servos)."

@@ -1,6 +1,10 @@
 """Units as written in column headers, and their values in SI."""
 
 import re
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
 
 from hil.config.csv_columns import CURRENT_UNITS, POSITION_UNITS, PWM_UNITS, TIME_UNITS, TORQUE_UNITS, VOLTAGE_UNITS
 
@@ -61,3 +65,19 @@ def split_head(head: str) -> tuple[str, str | None]:
         if found and unit_of(found[2]) is not None:
             return found[1].strip(), found[2]
     return head.strip(), None
+
+
+def wrapped(values: NDArray[np.float64], sizes: Sequence[int]) -> int | None:
+    """The size [bits] of the signed register that was read as an unsigned number; None if there is no sign of that.
+
+    Negative numbers then lie in the uppermost quarter of the range, and none in the two middle ones.
+    """
+    known = values[np.isfinite(values)]
+    if not known.size or known.min() < 0.0 or (known != np.round(known)).any():
+        return None
+    for bits in sizes:
+        quarter = 2.0 ** (bits - 2)
+        high = known >= 3.0 * quarter
+        if known.max() < 4.0 * quarter and high.any() and (high | (known < quarter)).all():
+            return bits
+    return None

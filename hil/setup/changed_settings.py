@@ -12,9 +12,9 @@ from hil.errors import Cause
 __all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "settings_now"]
 
 _DELAY = "Return Delay Time"
-_REGISTERS = ("Operating Mode", "Drive Mode", "Homing Offset", _DELAY)
+_REGISTERS = ("Operating Mode", "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _DELAY)
 
-WRITTEN = frozenset({"Operating Mode"})
+WRITTEN = frozenset({"Operating Mode", "Current Limit"})
 """Those that this program writes itself."""
 
 _LATE = frozenset({Cause.LATE, Cause.MISSING})
@@ -28,6 +28,7 @@ _MOVED = frozenset(
         Cause.NOT_FOLLOWING,
         Cause.OUT_OF_VOLTAGE,
         Cause.GOALS_CHANGED,
+        Cause.GOALS_LOST,
         Cause.FROZEN,
         Cause.UNEXPECTED,
         Cause.UNLIKE_BEFORE,

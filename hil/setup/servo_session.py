@@ -17,11 +17,11 @@ from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, TorqueNotOff
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import put_back, read_settings
+from hil.drivers.preparation.settings import attainable, put_back, read_settings
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
 from hil.drivers.torque_off import and_list, by_reason, signals_held_back
-from hil.errors import RunFolderError, StopRequested
+from hil.errors import ExperimentError, RunFolderError, StopRequested
 from hil.setup import settings_file
 from hil.setup.changed_settings import Settings, settings_now
 from hil.setup.current_limit import current_limit_ticks
@@ -43,6 +43,7 @@ __all__ = [
 Say = Callable[[str], None]
 
 _DELAY = "Return Delay Time"
+_PWM_LIMIT = "PWM Limit"
 
 SETTINGS_NAME = "servo_settings.json"
 """Name of the copy of the saved settings in the run folder."""
@@ -151,6 +152,7 @@ class ServoSession:
             failed = self._put_back(failed)
         return [
             *self._changed_delays(failed),
+            *self._lowered_limits(failed),
             *(
                 f"The settings of {and_list(map(str, joints))} could not be restored. {why} The next hil identify, "
                 f"record, check or setup on this port restores them from {self._where(joints)}."
@@ -170,6 +172,24 @@ class ServoSession:
                     f"{joint.title}: {_DELAY} was changed meanwhile from {2 * before} to {2 * now} us, by another "
                     "program or a factory reset, which changes other settings too. To set it: "
                     f"hil setup {self.bus.port.url} --id {joint.id} --return-delay-us {2 * before}"
+                )
+
+    def _lowered_limits(self, silent: Collection[Joint]) -> Iterator[str]:
+        """Say which PWM Limits were lowered meanwhile, and which goals they keep from being restored."""
+        for joint, servo in self.bus.drives.items():
+            before = self.settings.get((joint, _PWM_LIMIT))
+            if before is None or joint in silent:
+                continue
+            with suppress(DriverError):
+                now, wanted = servo.read(_PWM_LIMIT), self._kept[joint].settings
+                if now == before:
+                    continue
+                possible = attainable(servo, wanted).items()
+                cut = [f"{name} is {value}, not {wanted[name]}" for name, value in possible if value != wanted[name]]
+                yield (
+                    f"{joint.title}: {_PWM_LIMIT} was changed meanwhile from {before} to {now}, by another program "
+                    f"or a factory reset, and is left as it is{': ' if cut else ''}{', '.join(cut)}. "
+                    "To change it back, use DYNAMIXEL Wizard 2.0."
                 )
 
     def _where(self, joints: Sequence[Joint]) -> str:
@@ -197,6 +217,8 @@ _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=N
 @contextmanager
 def servo_session(config: Config, folder: Path | None = None, say: Say = to_stderr) -> Iterator[ServoBus]:
     """Open the bus with every servo in its mode and torque off, prepared for exchanges; restore settings at the end.
+
+    Raises ExperimentError at the end if a setting is not as it was and nothing else has ended the block.
 
     A TorqueNotOff that leaves the block reports the final state: servos that answer again are read back.
 
@@ -234,7 +256,10 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             if isinstance(stopped, TorqueNotOff):  # a servo may have started to answer again
                 stopped.args = (str(bus.torque_off_report),)
             for line in left:  # after what stopped the arm and the state of its torque, which matter more
-                stopped.add_note(line) if stopped is not None else say(line)
+                if stopped is not None:
+                    stopped.add_note(line)
+            if left and stopped is None:
+                raise ExperimentError(" ".join(left))
 
 
 @contextmanager

@@ -15,6 +15,8 @@ from hil.estimation.drive.currents import current_findings
 from hil.estimation.model_from_config import wanted_model
 from hil.estimation.plausibility import torque_scale_std
 from hil.estimation.result_checks import describe_segment_choice, describe_verdict
+from hil.estimation.slips.position_jumps import jump_warnings
+from hil.estimation.unsettled.agreement import disagreement
 from hil.estimation.unsettled.plausibility import implausible, undetermined
 from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.idim import fit_inverse_dynamics
@@ -34,6 +36,10 @@ log = logging.getLogger(__name__)
 
 START_CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the inverse dynamics that start the likelihood: the first that can be used
 START_WIDTH = 0.05  # rad/s
+JUMPED = (
+    "A position jumped (see the warnings), so angles before and after the jump do not belong together: use only the "
+    "part before or after it, or give each part in a file of its own."
+)
 NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 
 
@@ -54,11 +60,13 @@ class Given:
     """What is known of the drives and encoders beforehand.
 
     torque_scale_std: see `hil.estimator.models.conflicts.conflicts`. zeros: whether the encoder zeros are those of a
-    configuration.
+    configuration. names: of the recordings. jumps: a sentence for each joint of a recording whose position jumped.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
     zeros: bool = False
+    names: tuple[str, ...] = ()
+    jumps: tuple[str, ...] = ()
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
@@ -75,7 +83,7 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
         between="held",
         command_to_sample=facts.command_to_sample,
     )
-    given = Given(torque_scale_std(config), zeros=True)
+    given = Given(torque_scale_std(config), zeros=True, jumps=tuple(jump_warnings(config, facts, samples)))
     zeros, gravity = config.model.zeros, config.arm.gravity
     result = estimate_any([recording], config.model, 1.0, zeros, facts.config, gravity, given=given).result
     result = replace(result, warnings=(*result.warnings, *current_findings(config, samples).warnings))
@@ -106,17 +114,21 @@ def estimate_any(
     estimate, choice, held_out = _fitted(recordings, wanted, start, segment, zeros)
     estimate = considered(recordings, estimate)
     found = doubts_of(recordings, estimate)
-    odd = (*implausible(recordings, estimate, gravity), *undetermined(estimate))
+    apart = () if given.jumps else disagreement(recordings, given.names, estimate, segment, zeros)
+    odd = (*apart, *implausible(recordings, estimate, gravity), *undetermined(estimate))
+    if given.jumps:
+        odd = (JUMPED, *odd)
     verdict = judge_segments(
         recordings,
         estimate,
         SegmentEvidence(
             held_out,
-            missing_terms(recordings, estimate),
+            () if given.jumps or apart else missing_terms(recordings, estimate),
             odd,
             bool(found.faults),
             bool(found.doubts),
             conflicts_in(estimate, given),
+            bool(given.jumps or apart),
         ),
     )
     result = _result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3), stepped)
@@ -127,7 +139,7 @@ def estimate_any(
             residual_over_floor=tuple(estimate.residual_over_noise.tolist()),
         ),
         verdict=describe_verdict(verdict),
-        warnings=(*found.faults, *found.doubts, *found.warnings),
+        warnings=(*given.jumps, *found.faults, *found.doubts, *found.warnings),
         model_choice=None if choice is None else describe_segment_choice(choice),
     )
     log.info("%s: %s, trust this model: %s", shown_path, result.method, verdict.trust)

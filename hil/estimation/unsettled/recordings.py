@@ -14,8 +14,9 @@ from hil.arm_model import JointFacts
 from hil.config.csv_columns import Columns, RecordingConfig, load_recording_config
 from hil.errors import ConfigError, CsvError
 from hil.estimation.physical import physical_of
+from hil.estimation.slips.recorded_jumps import jump_sentences
 from hil.estimation.unsettled.chain_recordings import estimate_chain_recordings
-from hil.estimation.unsettled.estimate import Estimated, estimate_any
+from hil.estimation.unsettled.estimate import Estimated, Given, estimate_any
 from hil.estimation.unsettled.slips import refuse_slips
 from hil.estimator.baselines.zero import turned_zeros
 from hil.estimator.data.recording import Recording
@@ -50,12 +51,14 @@ def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder:
     config = RecordingConfig() if config_path is None else load_recording_config(config_path)
     if config.arm.urdf is not None:
         return _estimate_chain(paths, config_path, config, folder)
-    read = _averaged(_zeroed(_read(paths, config.columns), config.arm.gravity))
+    whole = _zeroed(_read(paths, config.columns), config.arm.gravity)
+    read = _averaged(whole)
     columns, gravity = read.columns, config.arm.gravity
     zeros = (columns.zeros_unknown or config.model.zeros) and gravity > 0.0
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
     refuse_slips(read.recordings, ", ".join(map(str, paths)))
-    found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped)
+    given = Given(names=read.names, jumps=jump_sentences(whole.recordings, whole.names, whole.stepped))
+    found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped, given)
     result = _named(found, read, gravity)
     if config.known is not None:
         result = replace(result, physical=physical_of(result, config.known.quantities(), gravity))
@@ -76,7 +79,9 @@ def _estimate_chain(
     names = config.joint_names
     assert names is not None and config.arm.urdf is not None  # checked by the estimate
     arm = replace(arm, joints=tuple(replace(each, name=name) for each, name in zip(arm.joints, names, strict=True)))
-    result = replace(found.result, recordings=read.names, arm=arm, notes=read.notes)
+    jumps = jump_sentences(read.recordings, read.names, read.stepped, names)
+    warnings = (*jumps, *found.result.warnings)
+    result = replace(found.result, recordings=read.names, arm=arm, notes=read.notes, warnings=warnings)
     if folder is not None:
         _keep(folder, paths, config_path, config, read, found.predicted)
         urdf = Path(config.arm.urdf)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from hil.errors import CsvError
-from hil.estimator.baselines.signs import suspect_absolute, suspect_signs
+from hil.estimator.baselines.signs import suspect_absolute, suspect_signs, suspect_swapped
 from hil.estimator.data.recording import Recording
 
 CLEAR = 0.25
@@ -14,7 +14,7 @@ WELL = 0.3
 
 
 def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
-    """Raise CsvError if a sign is reversed, or an angle measured from a different direction, beyond doubt."""
+    """Raise CsvError if a sign is reversed, torques are swapped, or an angle is measured from another direction."""
     absolute = suspect_absolute(recordings)
     if absolute is not None and _is_clear(*absolute):
         raise CsvError(
@@ -22,6 +22,13 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
             f"instead of from link 1. With the difference of both angles, inverse dynamics leaves "
             f"{_percent(absolute[0])} of the torque unexplained instead of {_percent(absolute[1])}. Set in "
             '[columns] of --config ARM.toml (in Python: config="ARM.toml"): angles = "absolute"'
+        )
+    swapped = suspect_swapped(recordings)
+    if swapped is not None and _is_clear(*swapped):
+        raise CsvError(
+            f"{source}: the torque columns of joints 1 and 2 seem to be swapped: exchanged, inverse dynamics leaves "
+            f"{_percent(swapped[0])} of the torque unexplained instead of {_percent(swapped[1])}. Exchange them in the "
+            "file, or in [columns] of --config ARM.toml."
         )
     signs = suspect_signs(recordings)
     if signs is None:

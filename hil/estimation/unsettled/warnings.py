@@ -14,6 +14,7 @@ LOST = 0.01  # fraction of the samples
 MANY_TURNS = 2.0
 FLAT = 0.05  # fraction of samples at the largest torque; a sine has fewer
 LEFT = 0.1  # RMS residual relative to the motion's RMS
+CERTAIN, LEAST_EARLY = 4.0, 0.1  # standard errors and sampling intervals by which a delay is negative
 WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
 
 
@@ -41,7 +42,7 @@ def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate) -> Do
                 f"{name}: the fit leaves {100 * left:.2g} % of the motion unexplained, so do not use these numbers: "
                 "check the units, signs and zero of position and torque; then try shorter segments."
             )
-    return Doubts(tuple(faults), tuple(doubts), (*warnings, *_weak(estimate)))
+    return Doubts(tuple(faults), tuple(doubts), (*warnings, *_early(recordings, estimate), *_weak(estimate)))
 
 
 def _signs(recordings: Sequence[Recording]) -> list[str]:
@@ -89,6 +90,22 @@ def _flat(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
                 "current was clipped, use the measured current, or use less torque."
             ]
     return []
+
+
+def _early(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[str]:
+    """Detect a torque that is logged after it acted: its fitted delay is negative."""
+    if "delay" not in estimate.names:
+        return []
+    index = estimate.names.index("delay")
+    delay, std = float(estimate.value[index]), float(estimate.std[index])
+    intervals = -delay / float(np.median([each.interval for each in recordings]))
+    if delay + CERTAIN * std >= 0.0 or intervals < LEAST_EARLY:
+        return []
+    return [
+        f"The delay is negative, {1e3 * delay:.3g} ms ({intervals:.2g} samples): the torque acted before the time at "
+        "which it is logged, or the positions are logged too early. The fit allows for it; correct the times, or shift "
+        "the torque column, before you use the delay."
+    ]
 
 
 def _weak(estimate: ShootingEstimate) -> list[str]:

@@ -147,6 +147,46 @@ def test_settings_that_another_program_changed_are_the_cause_that_is_named(
     assert_stopped(ports[0])
 
 
+@pytest.mark.parametrize(("register", "value"), [("PWM Limit", 5), ("Current Limit", 20)])
+def test_a_limit_that_another_program_lowered_is_the_cause_that_is_named(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
+) -> None:
+    def lower() -> None:
+        rewritten(ports, register, value)
+        if register == "PWM Limit":  # this arm's supply is ideal, so that a lower PWM Limit alone changes nothing
+            fault(ports, FaultKind.ENCODER_JUMP, servo=2, amount=-120)
+
+    stop, _ = run_until_stopped(arm(), tmp_path / "run", once(lower), plan)
+    assert str(stop).startswith("Another program changed the settings of a servo during the run (joint 'elbow'")
+    assert f"{register} is {value} and was " in str(stop) and stop.overruled
+    unrestored = [line for line in stop.__notes__ if f"PWM Limit was changed meanwhile from 885 to {value}" in line]
+    assert len(unrestored) == (register == "PWM Limit")
+    assert not any("next hil identify" in line for line in stop.__notes__), "a promise that could not be kept"
+    assert_stopped(ports[0])
+
+
+@pytest.mark.parametrize(("register", "value"), [("PWM Limit", 700), ("Current Limit", 250)])
+def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
+) -> None:
+    def lower(progress: Progress) -> None:
+        if progress.phase == Phase.COMING_TO_REST:
+            servo = ports[0].bus.servos[2]
+            servo.memory.set(register, value)
+
+    config = arm()
+    run = RunFolder.create(tmp_path / "run", config)
+    if register == "Current Limit":
+        said = run_experiment(config, run, config.path, lower, plan)
+        assert ports[0].bus.servos[2].value(register) == 1193
+    else:
+        with pytest.raises(ExperimentError, match="PWM Limit was changed meanwhile from 885 to 700") as stop:
+            run_experiment(config, run, config.path, lower, plan)
+        said = str(stop.value)
+    assert "'elbow'" in said and str(value) in said
+    assert f"{register} is {value} and was " in (run.path / "events.jsonl").read_text(encoding="utf-8")
+
+
 def test_a_return_delay_that_another_program_raised_is_named_before_late_replies(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
 ) -> None:

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from hil.recordings.convert import Converted, convert
 from hil.recordings.encoder import encoder_step
 from hil.recordings.files import read_tables
 from hil.recordings.periodic import mean_period
-from hil.recordings.units import split_head, unit_of
+from hil.recordings.units import split_head, unit_of, wrapped
 
 STEP = 2.0 * np.pi / 4096
 TIME = 0.005 * np.arange(800)
@@ -293,6 +294,51 @@ def swung(slip: Callable[[np.ndarray], np.ndarray]) -> Recording:
 def test_a_plain_slip_is_refused_before_the_fit(slip: Callable[[np.ndarray], np.ndarray], said: str) -> None:
     with pytest.raises(CsvError, match=said):
         refuse_slips([swung(slip)], "arm.csv")
+
+
+def test_swapped_torques_are_refused_before_the_fit() -> None:
+    recording = swung(lambda q: q)
+    with pytest.raises(CsvError, match="torque columns of joints 1 and 2 seem to be swapped"):
+        refuse_slips([replace(recording, torque=recording.torque[::-1].copy())], "arm.csv")
+
+
+@pytest.mark.parametrize(
+    ("low", "sizes", "bits"),
+    [(-1024.0, (32,), 32), (-1024.0, (16, 32), 32), (-200.0, (16, 32), 16), (0.0, (16, 32), None)],
+)
+def test_registers_read_as_unsigned_numbers_are_recognised(
+    low: float, sizes: tuple[int, ...], bits: int | None
+) -> None:
+    values = np.round(np.linspace(low, 900.0, 500))
+    assert wrapped(values % 2.0 ** (bits or 16), sizes) == bits
+    assert wrapped(np.linspace(0.0, 65535.0, 65536), sizes) is None, "numbers of all sizes"
+    assert wrapped(values + 0.5, sizes) is None
+
+
+def test_unsigned_ticks_and_currents_are_taken_as_signed_and_it_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "raw.csv"
+    position = [round(-1500 + 800 * math.sin(0.05 * k)) for k in range(400)]
+    current = [round(150 * math.sin(0.03 * k)) for k in range(400)]
+    rows = (f"{0.01 * k:.2f},{p % 2**32},{i % 2**16}\n" for k, (p, i) in enumerate(zip(position, current, strict=True)))
+    path.write_text("t,position [ticks],current [mA]\n" + "".join(rows), encoding="utf-8")
+    columns = Columns(position=["position"], current=["current"], ticks_per_turn=4096, torque_constant=[1.5])
+    found = convert(read_tables(path)[0], columns)
+    (recording,) = found.recordings
+    assert recording.position[0] == pytest.approx(np.array(position) * 2 * np.pi / 4096)
+    assert recording.torque[0] == pytest.approx(np.array(current) * 1.5e-3)
+    said = " ".join(found.notes)
+    assert "column 'position [ticks]' wraps at 2^32" in said and "column 'current [mA]' wraps at 2^16" in said
+
+
+def test_rows_stamped_when_they_arrived_are_not_called_coarse(tmp_path: Path) -> None:
+    random = np.random.default_rng(5)
+    stamp = np.maximum.accumulate(0.005 * np.arange(400) + random.uniform(0.0, 0.02, 400))
+    path = tmp_path / "bursts.csv"
+    rows = "".join(f"{at:.6f},{math.sin(0.1 * k):.6f},{k % 7}\n" for k, at in enumerate(stamp))
+    path.write_text("t,q1,tau1\n" + rows, encoding="utf-8")
+    with pytest.raises(CsvError, match=r"stamped when they arrived, in bursts.*columns\.rate") as refused:
+        convert(read_tables(path)[0], Columns())
+    assert "more digits" not in str(refused.value)
 
 
 def test_a_right_recording_is_not_refused() -> None:

@@ -16,7 +16,7 @@ import serial
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongSetting
-from hil.errors import Cause, HilError, SafetyStop, StopRequested
+from hil.errors import Cause, ExperimentError, HilError, SafetyStop, StopRequested
 from hil.experiment.run import run_experiment
 from hil.fakes.bus.faults import Fault
 from hil.fakes.servo.servo import EmulatedServo
@@ -122,15 +122,49 @@ def test_settings_are_on_the_disk_before_the_first_write(arm: Arm, tmp_path: Pat
     assert seen == [True, True] and not any(path.exists() for path in files)
 
 
-def test_a_return_delay_that_another_program_changed_is_named(
-    arm: Arm, bench: Bench, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with servo_session(arm(SHORT)):
+def test_a_return_delay_that_another_program_changed_is_named(arm: Arm, bench: Bench) -> None:
+    with pytest.raises(ExperimentError) as stop, servo_session(arm(SHORT)):
         servo = bench.servos[2]
         servo.memory.store(servo.model.registers["Return Delay Time"], 250)
-    said = capsys.readouterr().err
+    said = str(stop.value)
     assert "'elbow'" in said and "changed meanwhile from 0 to 500 us" in said and "--return-delay-us 0" in said
     assert "'shoulder'" not in said
+
+
+@pytest.mark.parametrize("limit", [400, 60])
+def test_a_pwm_limit_that_another_program_lowered_is_named_and_goals_are_restored_up_to_it(
+    arm: Arm, bench: Bench, limit: int, state_folder: Path
+) -> None:
+    def lower() -> None:
+        servo = bench.servos[2]
+        servo.write(36, limit.to_bytes(2, "little"))
+        assert servo.value("PWM Limit") == limit
+
+    with (
+        pytest.raises(ExperimentError, match=rf"Joint 'elbow'.*PWM Limit was .* 885 to {limit}, .*Goal PWM is {limit}"),
+        servo_session(arm(SHORT)),
+    ):
+        lower()
+    assert bench.changed() == [f"PWM Limit of 2: 885 -> {limit}", f"Goal PWM of 2: 885 -> {limit}"]
+    assert list(state_folder.glob("*.json")) == [], "nothing that this program could restore"
+    with servo_session(arm(SHORT)):
+        pass
+
+
+def test_settings_that_a_killed_program_left_are_restored_up_to_a_limit_lowered_since(
+    arm: Arm, bench: Bench, state_folder: Path
+) -> None:
+    config = arm(SHORT)
+    joint = config.bus.joints[1]
+    with servo_session(config):
+        bench.servos[2].write(36, (300).to_bytes(2, "little"))
+        kept = settings_path(config.url, joint.id, joint.servo.name)
+        left = kept.read_text(encoding="utf-8")
+        bench.servos[2].write(36, (885).to_bytes(2, "little"))
+    bench.servos[2].write(36, (300).to_bytes(2, "little"))
+    kept.write_text(left, encoding="utf-8")
+    list(check_arm(config))
+    assert not kept.exists() and bench.servos[2].value("Goal PWM") == 300
 
 
 @pytest.mark.parametrize("kind", ["silent_servo", "reboot", "overheating", "cable_pulled"])

@@ -1,0 +1,68 @@
+"""Whether several recordings show the same arm: a load that was changed between them is no missing term."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hil.estimator.data.recording import Recording
+from hil.estimator.errors import EstimationError
+from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
+from hil.estimator.models.terms import kind_of
+
+UNEXPLAINED = 1.5  # residual over noise above which the recordings are compared
+MUCH_BETTER = 0.5  # largest residual of separate fits, relative to that of the common one
+APART = 4.0  # standard deviations between the values of two recordings
+NAMED = 3  # parameters
+MOST = 8  # recordings: each is fitted once more
+
+
+def disagreement(
+    recordings: Sequence[Recording],
+    names: Sequence[str],
+    estimate: ShootingEstimate,
+    segment: float,
+    zeros: bool,
+) -> tuple[str, ...]:
+    """A sentence if each recording by itself is explained much better than all together; () otherwise.
+
+    The encoder zeros are taken as unknown if they were in the common estimate.
+    """
+    left = float(estimate.residual_over_noise.max())
+    if not 1 < len(recordings) <= MOST or left <= UNEXPLAINED:
+        return ()
+    alone = _separately(recordings, estimate, segment, zeros)
+    if alone is None or max(float(each.residual_over_noise.max()) for each in alone) > MUCH_BETTER * left:
+        return ()
+    called = names if len(names) == len(recordings) else [f"recording {k + 1}" for k in range(len(recordings))]
+    worst = max(float(each.residual_over_noise.max()) for each in alone)
+    differs = _differences(alone, called)
+    return (
+        f"The recordings disagree: fitted one by one, their residuals are at most {worst:.1f} times the noise, "
+        f"together {left:.1f} times{': ' if differs else ''}{'; '.join(differs)}. Was the load, the mounting or a "
+        "setting changed between them? Estimate each by itself.",
+    )
+
+
+def _separately(
+    recordings: Sequence[Recording], estimate: ShootingEstimate, segment: float, zeros: bool
+) -> list[ShootingEstimate] | None:
+    base = estimate.value[: len(estimate.model.base_names)]
+    try:
+        return [estimate_by_shooting([each], estimate.model, base, length=segment, zeros=zeros) for each in recordings]
+    except EstimationError:
+        return None
+
+
+def _differences(alone: Sequence[ShootingEstimate], names: Sequence[str]) -> list[str]:
+    """The base parameters whose values are farthest apart in standard deviations, with both values."""
+    found = []
+    for index, name in enumerate(alone[0].model.base_names):
+        if kind_of(name) == "offset":
+            continue
+        value = np.array([each.value[index] for each in alone])
+        std = np.array([each.std[index] for each in alone])
+        low, high = int(np.argmin(value)), int(np.argmax(value))
+        away = float((value[high] - value[low]) / np.hypot(std[low], std[high]))
+        if away > APART:
+            found.append((away, f"{name} is {value[low]:.4g} in {names[low]} and {value[high]:.4g} in {names[high]}"))
+    return [said for _, said in sorted(found, reverse=True)[:NAMED]]
