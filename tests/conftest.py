@@ -1,6 +1,7 @@
 """Fixtures: a fake arm with a short experiment, and the ports that a test opened, for inspecting the servos."""
 
 import gc
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -22,15 +23,16 @@ from tests.support.paths import CONFIGS
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Start with the tests that take a minute each, so that no worker is left with one at the end.
 
-    Of two workers, the second starts in the middle, with those of spatial arms: it compiles their loops while the first
-    compiles those of planar arms, and later each finds on disk what the other has compiled.
+    Of several workers, each starts with its part of the list, the second with those of spatial arms: it compiles their
+    loops while the first compiles those of planar arms, and later each finds on disk what the others have compiled.
     """
     long = [item for item in items if item.get_closest_marker("long")]
     spatial = [item for item in long if "chain" in item.nodeid]
     planar = [item for item in long if item not in spatial]
     others = [item for item in items if item not in long]
-    middle = max(0, len(items) // 2 - len(planar))
-    items[:] = [*planar, *others[:middle], *spatial, *others[middle:]]
+    workers = max(2, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "2")))
+    second = max(0, len(items) // workers - len(planar))
+    items[:] = [*planar, *others[:second], *spatial, *others[second:]]
 
 
 def pytest_collection_finish() -> None:

@@ -47,7 +47,8 @@ WORDS = {
     STRANGER: r"another (program|master)|Drive Mode is|somebody else|not asked for|collision|other master",
     MIXED: r"another servo's|mixed up|swapped|ID has changed|same ID|was not addressed:",
     REPEATED: r"repeated|too late or twice",
-    SETTING: r"changed the settings.{0,80}(Homing Offset|Return Delay Time) is",
+    SETTING: r"changed the settings.{0,80}(Homing Offset|Return Delay Time|PWM Limit|Current Limit) is"
+    r"|(Homing Offset|Return Delay Time|PWM Limit) was changed meanwhile",
     HAND: r"pushes or holds|hit it|slips",
     DISK: r"\bdisk\b|no space|File too large|cannot be written",
     POSE: r"rest[_ ]pose|before the start|starts? (from|at)",
@@ -93,7 +94,7 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.MODE_TAKEN: _OTHER_GOALS,
     Kind.ANSWERS_LESS: frozenset({SILENCE}),
     Kind.RAISED_LIMIT: frozenset(),
-    Kind.LOWERED_LIMIT: _LOST_GOALS | {LIMIT},
+    Kind.LOWERED_LIMIT: _LOST_GOALS | {LIMIT, SETTING},
     Kind.WATCHDOG_OFF: frozenset({TORQUE, STRANGER}),
     Kind.WATCHDOG_LONG: frozenset({TORQUE, STRANGER}),
     Kind.TURNED_ROUND: _FORGED | {LIMIT, POSE, REFUSED, STRANGER},

@@ -75,6 +75,9 @@ class ServoSession:
     """Return Delay Time of each servo at the beginning [2 us]."""
     settings: Settings = field(default_factory=dict)
     """What `settings_now` found at the beginning."""
+    _left: set[Joint] = field(default_factory=set)
+    """Servos whose settings an earlier run had left; a goal that a lowered limit cuts is tried once more, not for ever.
+    """
     shared: int = 0
     """Number of inner blocks that have used the bus."""
     was_stopped: bool = False
@@ -99,6 +102,7 @@ class ServoSession:
             settings = read_settings(servo)
             self._delays[joint] = servo.read(_DELAY)
             if joint in left:
+                self._left.add(joint)
                 settings = _before(left[joint], settings)
                 self._say(
                     f"{joint.title}: an earlier run ended before it could restore its settings "
@@ -186,10 +190,13 @@ class ServoSession:
                     continue
                 possible = attainable(servo, wanted).items()
                 cut = [f"{name} is {value}, not {wanted[name]}" for name, value in possible if value != wanted[name]]
+                later = (
+                    "; the next start on this port then restores the goal" if cut and joint not in self._left else ""
+                )
                 yield (
                     f"{joint.title}: {_PWM_LIMIT} was changed meanwhile from {before} to {now}, by another program "
                     f"or a factory reset, and is left as it is{': ' if cut else ''}{', '.join(cut)}. "
-                    "To change it back, use DYNAMIXEL Wizard 2.0."
+                    f"To change it back, use DYNAMIXEL Wizard 2.0{later}."
                 )
 
     def _where(self, joints: Sequence[Joint]) -> str:
@@ -203,11 +210,14 @@ class ServoSession:
         for joint in joints:
             try:
                 self.bus.confirm_later(joint)
-                put_back(self.bus.drives[joint], self._kept[joint].settings)
+                servo, settings = self.bus.drives[joint], self._kept[joint].settings
+                put_back(servo, settings)
+                is_whole = attainable(servo, settings) == settings
             except DriverError as error:
                 failed[joint] = error
             else:
-                settings_file.forget(self._kept[joint])
+                if is_whole or joint in self._left:
+                    settings_file.forget(self._kept[joint])
         return failed
 
 

@@ -131,9 +131,9 @@ def test_a_return_delay_that_another_program_changed_is_named(arm: Arm, bench: B
     assert "'shoulder'" not in said
 
 
-@pytest.mark.parametrize("limit", [400, 60])
+@pytest.mark.parametrize(("limit", "is_undone"), [(400, True), (60, False)])
 def test_a_pwm_limit_that_another_program_lowered_is_named_and_goals_are_restored_up_to_it(
-    arm: Arm, bench: Bench, limit: int, state_folder: Path
+    arm: Arm, bench: Bench, limit: int, is_undone: bool, state_folder: Path
 ) -> None:
     def lower() -> None:
         servo = bench.servos[2]
@@ -146,9 +146,13 @@ def test_a_pwm_limit_that_another_program_lowered_is_named_and_goals_are_restore
     ):
         lower()
     assert bench.changed() == [f"PWM Limit of 2: 885 -> {limit}", f"Goal PWM of 2: 885 -> {limit}"]
-    assert list(state_folder.glob("*.json")) == [], "nothing that this program could restore"
+    assert len(list(state_folder.glob("*.json"))) == 1, "the goal that the limit cuts"
+    if is_undone:
+        bench.servos[2].write(36, (885).to_bytes(2, "little"))
     with servo_session(arm(SHORT)):
         pass
+    assert list(state_folder.glob("*.json")) == [], "the next start tries once more, whether or not it is possible"
+    assert bench.servos[2].value("Goal PWM") == (885 if is_undone else limit)
 
 
 def test_settings_that_a_killed_program_left_are_restored_up_to_a_limit_lowered_since(
