@@ -87,6 +87,11 @@ CURVED = 0.35
 samples per period, the fastest that is used, needs 0.27.
 """
 
+CURVED_AT_FIRST = 0.3
+"""The same as a fraction of the motion, for the first interval: over the peak of such a wave the velocity does not
+change from sample to sample, and no earlier change shows how fast it may.
+"""
+
 
 _FADING = np.dtype(
     [(name, "f8") for name in ("apart", "far", "mean", "span", "curved", "unknown", "highest", "lowest")]
@@ -159,6 +164,8 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
     turned = abs(velocity - before)
     difference = moved - 0.5 * (before + velocity) * seconds
     curved = CURVED * seconds * turned
+    if short.far == 0.0 and short.curved == 0.0:
+        curved = max(curved, CURVED_AT_FIRST * 0.5 * seconds * abs(before + velocity))
     unknown = unsure * abs(velocity)
     known = LAG_S * turned + SCALE * abs(moved) + curved + unknown
     if _has_jumped(memory.steps, abs(difference) - known, seconds):
