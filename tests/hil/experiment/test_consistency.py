@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hil.drivers.state import State
 from hil.experiment.consistency import (
     CURVED,
+    CURVED_AT_FIRST,
     LAG_S,
     LEARNT_S,
     LONG_EVERY_S,
@@ -269,7 +270,10 @@ def test_both_memories_and_what_is_learnt_are_what_their_definitions_say() -> No
         else:
             moved = position - former
             row = (moved, moved - 0.5 * (velocity + before) * seconds, velocity, seconds)
-            row = (*row, CURVED * seconds * abs(velocity - before), unsure * abs(velocity))
+            curved = CURVED * seconds * abs(velocity - before)
+            if index == 1:
+                curved = max(curved, CURVED_AT_FIRST * 0.5 * seconds * abs(velocity + before))
+            row = (*row, curved, unsure * abs(velocity))
             short.rows.append(row)
             waiting.append(row)
             if sum(each[3] for each in waiting) >= LONG_EVERY_S:
