@@ -277,8 +277,7 @@ class Guard:
             Cause.JUMP,
             f"reports an angle that changed by {joint['moved']:+.3f} rad within {1e3 * joint['seconds']:.0f} ms; its "
             f"velocity limit allows at most {joint['most']:.3f} rad. Check the encoder, its magnet and the supply, "
-            "whether its horn slips, and whether a device between adapter and servos delivers old replies or another "
-            "servo's.",
+            "and whether its horn slips.",
         )
 
     def _outside(self, index: int, state: State) -> NoReturn:
