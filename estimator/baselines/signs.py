@@ -89,15 +89,13 @@ def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | N
     """
     if recordings[0].joints != 2:
         return None
-    as_given = Signs((1, 1), (1, 1))
-    relative = [
-        replace(each, position=np.stack([each.position[0], each.position[1] - each.position[0]])) for each in recordings
-    ]
-    given, fitted = _fit(recordings, as_given), _fit(relative, as_given)
-    if given is None or fitted is None or _impossible(fitted):
-        return None
-    residual, left = float(fitted.relative_residual.max()), float(given.relative_residual.max())
-    return (residual, left) if residual < LESS_RESIDUAL * left else None
+    return _better_explained(
+        recordings,
+        [
+            replace(each, position=np.stack([each.position[0], each.position[1] - each.position[0]]))
+            for each in recordings
+        ],
+    )
 
 
 def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | None:
@@ -108,9 +106,15 @@ def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | No
     """
     if recordings[0].joints != 2:
         return None
+    return _better_explained(recordings, [replace(each, torque=each.torque[::-1].copy()) for each in recordings])
+
+
+def _better_explained(recordings: Sequence[Recording], changed: Sequence[Recording]) -> tuple[float, float] | None:
+    """Relative RMS of the torque residual of two joints, worst joint, of the changed recordings and of those given;
+    None if the change does not explain them much better.
+    """
     as_given = Signs((1, 1), (1, 1))
-    given = _fit(recordings, as_given)
-    fitted = _fit([replace(each, torque=each.torque[::-1].copy()) for each in recordings], as_given)
+    given, fitted = _fit(recordings, as_given), _fit(changed, as_given)
     if given is None or fitted is None or _impossible(fitted):
         return None
     residual, left = float(fitted.relative_residual.max()), float(given.relative_residual.max())

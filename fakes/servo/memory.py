@@ -24,15 +24,14 @@ class Memory:
 
     def value(self, name: str) -> int:
         """Return the register's content; raises KeyError if the model has no such register."""
-        register = self.registers[name]
-        raw = self.data[register.address : register.address + register.size]
-        return int.from_bytes(raw, "little", signed=register.signed)
+        return self._of(self.registers[name])
 
     def get(self, name: str, otherwise: int = 0) -> int:
         """Return the register's content, or `otherwise` if the model has no such register."""
         register = self.registers.get(name)
-        if register is None:
-            return otherwise
+        return otherwise if register is None else self._of(register)
+
+    def _of(self, register: Register) -> int:
         raw = self.data[register.address : register.address + register.size]
         return int.from_bytes(raw, "little", signed=register.signed)
 

@@ -3,7 +3,6 @@
 Each arm follows every path in full: the transition from the rest pose, two periods, and the transition back.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,12 +13,12 @@ from hil.config.schema import Config
 from hil.dry_run.prediction import Prediction, limits_of, peaks_of
 from hil.dry_run.resting_stops import resting_stops
 from hil.estimator.chain.simulation.rollout import ChainArms, Loop, Motions, roll_out
+from hil.estimator.progress import Tell, counted
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan
 
 Array = NDArray[np.float64]
-Tell = Callable[[int, int], None]
 
 PERIODS = 2
 SHOWN = 30
@@ -72,7 +71,7 @@ def predict_chain(
     worst: tuple[float, Nearest, str, float] | None = None
     seen: list[Array] = []
     tracking = np.zeros((arms.size, len(rest)))
-    done = 0
+    told = counted(tell, arms.size * len(plan.segments))
     for number, segment in enumerate(plan.segments):
         assert isinstance(segment, PathSegment)
         loop = loop_of(config, segment, plan.rate, stops)
@@ -92,9 +91,7 @@ def predict_chain(
                 worst = nearest.room, nearest, segment.role, moment
             if number == 0 and arm < shown:
                 seen.append(position.copy())
-            done += 1
-            if tell is not None:
-                tell(done, arms.size * len(plan.segments))
+            told()
     assert worst is not None
     together = np.stack(seen) if seen else np.empty((0, 0, 0))
     prediction = Prediction(

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from hil.clearance.space import LYING_RAD, Nearest, Space
 from hil.config.schema import Config
 from hil.dry_run.resting_stops import resting_stops
-from hil.estimator.chain.excitation.path_design import Tell, counted
 from hil.estimator.chain.simulation.rollout import ChainArms, Loop, roll_out
+from hil.estimator.progress import Tell, counted
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan

@@ -22,7 +22,7 @@ from hil.errors import Cause, SafetyStop
 from hil.estimator.chain.simulation.motion_observer import ChainObserver
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.experiment.apart import causes_of_standstill
-from hil.experiment.consistency import moved_at_standstill
+from hil.experiment.consistency import check_standstill
 from hil.plan.chain_model import known_chain
 
 Array = NDArray[np.float64]
@@ -107,14 +107,7 @@ class ChainWatch:
     def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]
         name = self._names[joint]
-        states = (state for state, _ in reversed(self._commanded))
-        if moved := moved_at_standstill(states, joint, _STILL_RAD_S):
-            raise SafetyStop(
-                f"{name} reports a velocity of {state.velocity[joint]:+.2f} rad/s that contradicts its position: "
-                f"{moved}. One of the two readings is wrong. Check the encoder and its magnet; replace the servo if "
-                "necessary.",
-                Cause.FROZEN,
-            )
+        check_standstill(name, (state for state, _ in reversed(self._commanded)), joint, _STILL_RAD_S)
         if abs(state.velocity[joint]) < _STILL_RAD_S:
             since = self._seen_at - WINDOW_S
             recent = [torque[joint] for at, torque in self._commanded if at.time_before_write >= since]

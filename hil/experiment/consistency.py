@@ -36,8 +36,9 @@ import numba
 import numpy as np
 
 from hil.drivers.state import State
+from hil.errors import Cause, SafetyStop
 
-__all__ = ["MEMORY", "begin", "look", "lost", "moved_at_standstill"]
+__all__ = ["MEMORY", "begin", "check_standstill", "look", "lost", "moved_at_standstill"]
 
 SHORT_S, LONG_S = 0.3, 1.2
 """Time constants of the memories [s]."""
@@ -212,6 +213,21 @@ def moved_at_standstill(states: Iterable[State], joint: int, still: float) -> st
         if abs(moved) > STEP_RAD + still * seconds:
             said = f"its position has changed by {moved:+.3f} rad in the last {1e3 * seconds:.0f} ms"
     return said
+
+
+def check_standstill(name: str, states: Iterable[State], joint: int, still: float) -> None:
+    """Raise SafetyStop if a joint moved while its velocity was reported to be below `still` [rad/s].
+
+    name: of the joint. states: as in `moved_at_standstill`.
+    """
+    states = list(states)
+    if moved := moved_at_standstill(states, joint, still):
+        raise SafetyStop(
+            f"{name} reports a velocity of {states[0].velocity[joint]:+.2f} rad/s that contradicts its position: "
+            f"{moved}. One of the two readings is wrong. Check the encoder and its magnet; replace the servo if "
+            "necessary.",
+            Cause.FROZEN,
+        )
 
 
 def _looks_long(memory: Any, velocity: float) -> bool:

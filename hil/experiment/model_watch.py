@@ -24,7 +24,7 @@ from hil.estimator.compiled import compiled, only_version
 from hil.estimator.models.momentum_observer import NAMES, MomentumObserver
 from hil.estimator.models.parameters import CONSTANTS
 from hil.experiment.apart import causes_of_standstill
-from hil.experiment.consistency import moved_at_standstill
+from hil.experiment.consistency import check_standstill
 
 ARMS = 64
 WIDENED = 1.5
@@ -232,14 +232,7 @@ class ModelWatch:
     def _raise(self, joint: int, state: State) -> None:
         lacking = self._observer.lacking[joint]
         name, velocity = self._names[joint], state.velocity[joint]
-        states = (state for state, _ in reversed(self._commanded))
-        if moved := moved_at_standstill(states, joint, _STILL_RAD_S):
-            raise SafetyStop(
-                f"{name} reports a velocity of {state.velocity[joint]:+.2f} rad/s that contradicts its position: "
-                f"{moved}. One of the two readings is wrong. Check the encoder and its magnet; replace the servo if "
-                "necessary.",
-                Cause.FROZEN,
-            )
+        check_standstill(name, (state for state, _ in reversed(self._commanded)), joint, _STILL_RAD_S)
         if abs(velocity) < _STILL_RAD_S:
             since = self._seen_at - _WINDOW_S
             recent = [torque[joint] for at, torque in self._commanded if at.time_before_write >= since]

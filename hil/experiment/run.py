@@ -214,10 +214,10 @@ def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException) 
         return
     stop = error if isinstance(error, SafetyStop) else error.__context__
     now = settings_now(bus)
-    cause = stop.cause if isinstance(stop, SafetyStop) and stop.cause in EXPLAINED else None
-    if cause is not None and isinstance(stop, SafetyStop) and (changed := changed_settings(before, now, cause)):
-        stop.args = (f"{changed} Symptom: {stop}",)
-        stop.overruled = True
+    explained = stop if isinstance(stop, SafetyStop) and stop.cause in EXPLAINED else None
+    if explained is not None and (changed := changed_settings(before, now, explained.cause)):
+        explained.args = (f"{changed} Symptom: {explained}",)
+        explained.overruled = True
     elif changed := changed_settings(before, now):
         error.add_note(changed)
 

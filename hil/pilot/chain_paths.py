@@ -10,8 +10,9 @@ from hil.config.chain import DEFAULT_BAND, POSITION_RESERVE
 from hil.config.schema import Config
 from hil.errors import NoSafeTorque
 from hil.estimator.chain.excitation.fourier_path import Path
-from hil.estimator.chain.excitation.path_design import Design, PathDesigner, PathLimits, Tell
+from hil.estimator.chain.excitation.path_design import Design, PathDesigner, PathLimits
 from hil.estimator.errors import ExcitationError
+from hil.estimator.progress import Tell
 from hil.plan.chain_model import ChainTorque, known_chain, limit_names, torque_limits
 from hil.plan.chain_plan import check_rest_pose, path_plan
 from hil.plan.plan import HELD_OUT, Plan

@@ -2,13 +2,14 @@
 
 from hil.clearance.space import Space
 from hil.config.schema import Config
-from hil.dry_run.chain_prediction import Tell, predict_chain
+from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import ChainDryRun
 from hil.dry_run.supply_speed import lowered, within_supply
 from hil.errors import NoSafeTorque
 from hil.estimator.chain.simulation.rollout import ChainArms
+from hil.estimator.progress import Tell
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
 from hil.pilot.chain_shares import ARMS, PILOT_SHARES, SafeShares, step_config

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from hil.config.schema import Config
-from hil.dry_run.chain_prediction import ChainPrediction, Tell, predict_chain
+from hil.dry_run.chain_prediction import ChainPrediction, predict_chain
 from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import nearest_limit, unsafe
 from hil.dry_run.prediction import QUANTITIES
 from hil.errors import NoSafeTorque
+from hil.estimator.progress import Tell
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths
 from hil.pilot.steps import Say

@@ -78,6 +78,8 @@ class ServoSession:
     _left: set[Joint] = field(default_factory=set)
     """Servos whose settings an earlier run had left; a goal that a lowered limit cuts is tried once more, not for ever.
     """
+    _cut: dict[Joint, dict[str, int]] = field(default_factory=dict)
+    """Goals that could only be restored as far as a lowered limit allows, with their values."""
     shared: int = 0
     """Number of inner blocks that have used the bus."""
     was_stopped: bool = False
@@ -188,8 +190,7 @@ class ServoSession:
                 now, wanted = servo.read(_PWM_LIMIT), self._kept[joint].settings
                 if now == before:
                     continue
-                possible = attainable(servo, wanted).items()
-                cut = [f"{name} is {value}, not {wanted[name]}" for name, value in possible if value != wanted[name]]
+                cut = [f"{name} is {value}, not {wanted[name]}" for name, value in self._cut[joint].items()]
                 later = (
                     "; the next start on this port then restores the goal" if cut and joint not in self._left else ""
                 )
@@ -212,11 +213,12 @@ class ServoSession:
                 self.bus.confirm_later(joint)
                 servo, settings = self.bus.drives[joint], self._kept[joint].settings
                 put_back(servo, settings)
-                is_whole = attainable(servo, settings) == settings
+                possible = attainable(servo, settings)
+                self._cut[joint] = {name: value for name, value in possible.items() if value != settings[name]}
             except DriverError as error:
                 failed[joint] = error
             else:
-                if is_whole or joint in self._left:
+                if not self._cut[joint] or joint in self._left:
                     settings_file.forget(self._kept[joint])
         return failed
 
@@ -265,10 +267,10 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
                 left = session.end()
             if isinstance(stopped, TorqueNotOff):  # a servo may have started to answer again
                 stopped.args = (str(bus.torque_off_report),)
-            for line in left:  # after what stopped the arm and the state of its torque, which matter more
-                if stopped is not None:
+            if stopped is not None:
+                for line in left:  # after what stopped the arm and the state of its torque, which matter more
                     stopped.add_note(line)
-            if left and stopped is None:
+            elif left:
                 raise ExperimentError(" ".join(left))
 
 

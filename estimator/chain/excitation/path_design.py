@@ -23,6 +23,7 @@ from hil.estimator.chain.excitation.fourier_path import Path, random_lines
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.errors import ExcitationError
+from hil.estimator.progress import Tell, counted
 
 LOOKED_AT = 120  # samples at which a variation is evaluated
 NOISE = 0.02  # assumed residual of a regression, relative to a joint's RMS torque, friction included
@@ -64,23 +65,6 @@ class Design:
     path: Path
     worst: float
     median: float
-
-
-Tell = Callable[[int, int], None]
-"""Called with the number of steps done and their total."""
-
-
-def counted(tell: Tell | None, total: int) -> Callable[[], None]:
-    """Return a function to be called after each of `total` steps, which reports their number to `tell`."""
-    done = 0
-
-    def step() -> None:
-        nonlocal done
-        done += 1
-        if tell is not None:
-            tell(done, total)
-
-    return step
 
 
 class PathDesigner:

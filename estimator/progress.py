@@ -1,0 +1,21 @@
+"""Progress of long computations, told to whoever wants to know."""
+
+from collections.abc import Callable
+
+__all__ = ["Tell", "counted"]
+
+Tell = Callable[[int, int], None]
+"""Called with the number of steps done and their total."""
+
+
+def counted(tell: Tell | None, total: int) -> Callable[[], None]:
+    """Return a function to be called after each of `total` steps, which reports their number to `tell`."""
+    done = 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        if tell is not None:
+            tell(done, total)
+
+    return step
