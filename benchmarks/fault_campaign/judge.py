@@ -101,7 +101,8 @@ class Verdict:
 
 def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Verdict:
     """Judge the run of `story`, into which `drawn` was injected."""
-    reasons = reasons_of(config, drawn, story, undisturbed)
+    told = Told(config, story.traffic, drawn.start)
+    reasons = reasons_of(config, drawn, story, undisturbed, told)
     owed, since = min(reasons, key=lambda reason: reason[1], default=("", np.inf))
     driven = np.asarray(story.record["driven"].any(axis=1))
     time = story.record["time"][:, 0]
@@ -119,18 +120,17 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     limits = np.array([joint.position_limit for joint in config.joints])
     position = story.record["position"]
     beyond = np.maximum(limits[:, 0] - position.min(axis=0), position.max(axis=0) - limits[:, 1])
-    drives_ms = driving_ms(config, drawn, story, undisturbed)
+    drives_ms = driving_ms(config, told, undisturbed)
     unsafe = (late_ms > bound and not unseen) or left_on or drives_ms > DRIVES_MS
     return Verdict(owed, late_ms, unsafe, beyond, named, misleading, unseen, drives_ms)
 
 
-def driving_ms(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> float:
+def driving_ms(config: Config, told: "Told", undisturbed: Story) -> float:
     """Longest time for which the program commanded a joint more than ever in the undisturbed run, in the direction in
     which the positions that it received were moving [ms]; 0 for an arm that a stabiliser may hold with any torque.
     """
     if config.stabiliser is not None:
         return 0.0
-    told = _Told(config, story.traffic, drawn.start)
     longest = 0.0
     for joint, (sent, heard) in enumerate(zip(told.sent, told.heard, strict=True)):
         record = undisturbed.record[:, joint]
@@ -158,7 +158,7 @@ def _visible_motion(when: NDArray[np.float64], heard: NDArray[np.float64]) -> ND
 
 def received(config: Config, story: Story) -> Heard:
     """What the program received in a run, and what it commanded."""
-    told = _Told(config, story.traffic, 0.0)
+    told = Told(config, story.traffic, 0.0)
     return Heard.of(config, told.heard, told.sent)
 
 
@@ -205,11 +205,10 @@ def causes_in(text: str) -> set[str]:
 Reason = tuple[str, float]
 
 
-def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> list[Reason]:
+def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, told: "Told") -> list[Reason]:
     """Reasons why the current had to end, each with its time [s]."""
     record = story.record
     time = record["time"][:, 0]
-    told = _Told(config, story.traffic, drawn.start)
     interval = 1.0 / config.experiment.rate
     joints = range(len(config.joints))
     holds = np.asarray(record["torque"].any(axis=1))  # while servos are set up, nobody needs to be heard regularly
@@ -246,10 +245,9 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -
     return [reason for reason in found if reason is not None]
 
 
-def overruled_ms(config: Config, drawn: Drawn, story: Story) -> float:
+def overruled_ms(config: Config, story: Story, told: "Told") -> float:
     """Longest time for which a motor carried a current that the program had not commanded [ms]."""
     time = story.record["time"][:, 0]
-    told = _Told(config, story.traffic, drawn.start)
     longest = 0
     for joint in range(len(config.joints)):
         own = story.record[:, joint]
@@ -271,8 +269,8 @@ def _since(what: str, time: NDArray[Any], wrong: NDArray[np.bool_], hold_ms: int
     return (what, float(time[starts[lasting[0]]])) if lasting.size else None
 
 
-class _Told:
-    """What the program received and what it sent, decoded from the bytes from the first fault on."""
+class Told:
+    """What the program received and what it sent, decoded from the bytes from the first fault, at `start` [s], on."""
 
     def __init__(self, config: Config, traffic: Traffic, start: float) -> None:
         self._joints = config.joints

@@ -42,7 +42,16 @@ from benchmarks.fault_campaign.arms import Setting
 from benchmarks.fault_campaign.attack import Kind
 from benchmarks.fault_campaign.campaign import DoesNotRun, Ready, play, prepare
 from benchmarks.fault_campaign.draw import UNHEARD, Drawn, draw
-from benchmarks.fault_campaign.judge import BOUND_MS, TRIP_MS, Reason, Story, judge_words, overruled_ms, reasons_of
+from benchmarks.fault_campaign.judge import (
+    BOUND_MS,
+    TRIP_MS,
+    Reason,
+    Story,
+    Told,
+    judge_words,
+    overruled_ms,
+    reasons_of,
+)
 from hil.clearance.space import Space
 from hil.config.schema import Config
 from hil.plan.way_home import WayHome
@@ -169,7 +178,8 @@ def inject(setting: Setting, seed: int) -> ChainOutcome:
 
 def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: tuple[str, ...]) -> ChainOutcome:
     config, record = ready.config, story.record
-    reasons = reasons_of(config, drawn, story, ready.undisturbed)
+    told = Told(config, story.traffic, drawn.start)
+    reasons = reasons_of(config, drawn, story, ready.undisturbed, told)
     time, driven = record["time"][:, 0], np.asarray(record["driven"].any(axis=1))
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     moved = record["position"][driven] if driven.any() else record["position"][:1]
@@ -193,7 +203,7 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
         cut_ms,
         _clearance(config, record) - min(0.0, _clearance(config, ready.undisturbed.record)) + SAME_M,
         float(np.maximum(low - moved.min(axis=0), moved.max(axis=0) - high).max()),
-        overruled_ms(config, drawn, story),
+        overruled_ms(config, story, told),
         stopped,
         not cannot and _leaves_command(drawn, story.ended),
         _lies(config, record["position"][last[-1] if last.size else -1]),
