@@ -67,5 +67,6 @@ def _weak(joint: JointConfig) -> str:
     return (
         f"{joint.goal_limit_name} of joint {joint.name!r} = {joint.goal_limit:g} {unit} allows at most {torque:.2g} "
         f"N m, no more than the typical dry friction of its servos, {friction:.2g} N m: it probably would not move. "
-        f"About {2.0 * friction / joint.torque_per_goal:.2g} {unit} move it without a load, more lift one."
+        f"It takes about {2.0 * friction / joint.torque_per_goal:.2g} {unit} to move it without a load, and more to "
+        "lift one."
     )

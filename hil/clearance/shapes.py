@@ -87,7 +87,7 @@ def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule
     why = "; ".join(unread) if unread else "it has no collision or visual geometry"
     if not instead:
         left = "Only its other shapes are checked" if has_others else "It has no shape"
-        return f'link "{name}": {why}. {left}: how close the arm comes to it is not known.'
+        return f'link "{name}": {why}. {left}: the clearance to it is unknown.'
     (capsule,) = instead
     length = float(np.linalg.norm(capsule.ends[1]))
     along = f"capsule {1e3 * length:.0f} mm long from its joint to {'its end' if is_last else 'the next one'}"
@@ -178,7 +178,7 @@ def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Ca
                 unread.append(f'its mesh "{shape.get("filename", "")}" is not used: {error}')
                 continue
             if around is None:
-                unread.append(f"its <{shape.tag}> is not used: no such shape is known")
+                unread.append(f"its <{shape.tag}> is not used: unknown shape")
             for ends, radius in around or []:
                 found.append(Capsule(link, (ends @ turn.T + shift) @ rotation.T + translation, radius))
     return found, unread

@@ -152,7 +152,7 @@ class _Tree:
     def branch(self, names: list[str]) -> list[int]:
         """The bodies that these joints move. Raises ArmFileError unless they lie on one branch, in this order."""
         if not names:
-            raise ArmFileError(f"{self.path} has no hinge, so there is no arm")
+            raise ArmFileError(f"{self.path} has no hinge joint, so it does not describe an arm")
         moved = [self._moved(name) for name in names]
         self._check_equalities(names)
         way = self._way(moved[-1])

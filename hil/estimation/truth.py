@@ -101,13 +101,11 @@ def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str
         if abs(ratio - 1.0) > _EQUAL
     ]
     note = (
-        f"The torque constants of the fake arm's motors differ from the file's ({', '.join(named)}), and the result is "
-        "in the torque that the file's constants imply: the true values are shown in that unit"
+        f"The torque constants of the fake arm's motors differ from the file's ({', '.join(named)}), and the result "
+        "assumes the file's: the true values are scaled accordingly"
     )
     left = (
-        ""
-        if len(values) == len(truth)
-        else "; those that joints with different errors determine together are not shown"
+        "" if len(values) == len(truth) else "; those that depend on several joints with different errors are not shown"
     )
     return Truth(values, f"{note}{left}.")
 

@@ -335,9 +335,10 @@ class Guard:
             self._stop(
                 index,
                 Cause.GOALS_CHANGED,
-                f"{said}: by the published figures {self._supply[index]:.1f} V would drive it at that speed. Its goals "
-                "are changed on the way or by another program, its supply sags, or its current sensor is wrong: check "
-                f"these. If none is so, its motor is weaker than published: lower velocity_limit to {slower}.",
+                f"{said}: {self._supply[index]:.1f} V would drive it at that speed, according to the published "
+                "figures. Its goals are changed on the way or by another program, its supply sags, or its current sensor is "
+                "wrong: check these. If they are in order, its motor is weaker than published: lower velocity_limit "
+                f"to {slower}.",
             )
         seconds = self._joints[index]["found"]
         self._stop(
@@ -357,7 +358,7 @@ class Guard:
         along = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
         allowed = self._joints[index]["following"]["allowed"]
         if along > abs(commanded) + allowed or along < -allowed:
-            return "It has torque, but another: another program commands it, or its current sensor is wrong."
+            return "Its torque is not the commanded one: another program commands it, or its current sensor is wrong."
         weak = "it cannot deliver this much at its speed and supply voltage (safety.follow_share)."
         if along > HARDLY_ANY * abs(commanded):
             return f"Its goals are changed on the way or by another program, its current sensor is wrong, or {weak}"

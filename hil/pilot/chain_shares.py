@@ -195,7 +195,7 @@ def _remedy(config: Config, foreseen: ChainPrediction) -> str:
 def _better_known(config: Config) -> str:
     spread = 0.3 if config.arm.prior is None else config.arm.prior.spread
     return (
-        f"Masses in the URDF that are known better ([arm.prior] spread below {spread:g}) help too, as does a larger "
+        f"More accurate masses in the URDF ([arm.prior] spread below {spread:g}) help too, as does a larger "
         f"{limit_names(config)}"
     )
 

@@ -22,7 +22,7 @@ TIMES_NO_LOAD = 5.0
 """Highest plausible speed, relative to the no-load speed of the fastest servo."""
 
 _ONE_WAY = 0.7
-"""Least share of a joint's path that leads in one direction if it rotates on and on."""
+"""Smallest share of a joint's path in one direction for which it counts as rotating continuously."""
 
 _OVER_S, _USUAL = 0.02, 0.9
 """Time over which speeds are measured, so that noise hardly counts [s], and the fraction of them that is slower."""

@@ -50,7 +50,7 @@ class Moved:
     """Angles by which all joints moved [rad]."""
     well: bool
     found: str
-    """Finding in words, with what to change if it differs from the description."""
+    """Finding in words, including what to change if it differs from the description."""
 
 
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:

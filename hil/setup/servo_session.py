@@ -76,7 +76,8 @@ class ServoSession:
     settings: Settings = field(default_factory=dict)
     """What `settings_now` found at the beginning."""
     _left: set[Joint] = field(default_factory=set)
-    """Servos whose settings an earlier run had left; a goal that a lowered limit cuts is tried once more, not for ever.
+    """Servos whose settings an earlier run left changed; restoring a goal that a lowered limit cuts is retried only
+    once.
     """
     _cut: dict[Joint, dict[str, int]] = field(default_factory=dict)
     """Goals that could only be restored as far as a lowered limit allows, with their values."""

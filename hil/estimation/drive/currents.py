@@ -92,7 +92,8 @@ def _other(name: str, goal: Array, measured: Array) -> str:
     )
     if beyond > _BEYOND_OFTEN:
         return (
-            f"{name} carried another current than commanded in {100 * beyond:.0f} % of the samples, of the other sign "
+            f"{name} carried a current other than the commanded one in {100 * beyond:.0f} % of the samples, of the "
+            f"other sign "
             f"or larger: {why}"
         )
     part = _short_part(goal, measured)

@@ -38,7 +38,7 @@ START_CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the inverse dynamics that start the li
 START_WIDTH = 0.05  # rad/s
 JUMPED = (
     "A position jumped (see the warnings), so angles before and after the jump do not belong together: use only the "
-    "part before or after it, or give each part in a file of its own."
+    "part before or after it, or put each part in a file of its own."
 )
 NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 
