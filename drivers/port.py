@@ -43,8 +43,8 @@ _ALWAYS = 1 << 62
 """As `_LOOKS`, for a line whose replies usually arrive earlier than its baud rate allows, such as a pty."""
 
 _EARLY_BITS = 9.0
-"""Bits of the ten per byte; a reply counts as early if it arrives before the request can have been transmitted at this
-number. The difference allows for baud rates that deviate.
+"""Bits per byte that are assumed, of ten in fact; a reply counts as early if it arrives before the request can have
+been transmitted at this number. The difference allows for inaccurate baud rates.
 """
 
 _WRITE_PATIENCE_S = 0.1
@@ -79,7 +79,7 @@ class Port:
         self.baud = baud
         self.latency = adapter_latency(url)
         self.latency_measured = False
-        """Whether `latency` was measured, because replies arrive later than expected of this kind of adapter."""
+        """Whether `latency` was measured, because replies arrive later than expected from this kind of adapter."""
         self.echoes = False
         """Whether the adapter echoes what it sends; detected during set-up."""
         self._serial = opened

@@ -107,7 +107,7 @@ class Servo:
     def write_despite_error(self, register: str, value: int, attempts: int | None = None) -> None:
         """Write a register as `write` does, but ignore errors that replies report if the value reads back as written.
 
-        What makes an arm safe, and what restores it, must not fail because of a servo that reports errors but obeys.
+        Writes that make an arm safe or restore it must not fail because of a servo that reports errors but obeys.
         """
         self._write_and_read_back(register, value, attempts, despite_error=True)
 

@@ -89,7 +89,7 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: the same scale of torque is at least this multiple of dry friction, as far as it is known: near
+    frictions: multiple of dry friction, as far as it is known, that serves as a lower bound on this torque scale: near
     standstill, friction behaves differently from the model.
     """
 
@@ -215,7 +215,7 @@ def _learn(m: Any, gain: Any, lacking: float, spread: float) -> None:
 
 
 def _keep_dissipative(m: Any) -> None:
-    """Return friction that has become negative to zero, and the other parameters with it as the covariance demands."""
+    """Reset friction that has become negative to zero, and adjust the other parameters according to the covariance."""
     for i in range(6, 10):
         if m[_THETA, i] < 0.0 and m[_COVARIANCE + i, i] > 0.0:
             share = m[_THETA, i] / m[_COVARIANCE + i, i]

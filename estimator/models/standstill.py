@@ -7,7 +7,7 @@ offset cancel in their difference, and so do their errors. Only what other joint
 
 A torque outside the band accelerates a free joint. The joint is blocked once it would have gained a momentum that shows
 in the velocity register, wherever the band lies: half of the excess may be on its other side. A joint that does move
-again was held by friction: what it withstood until then is never an alarm again.
+again was held by friction: a torque that it withstood until then never raises an alarm again.
 
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """

@@ -41,15 +41,15 @@ def described_arm(config: "Config") -> ArmDescription:
 
 
 def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
-    """Warn of described inertias that no mass distribution can have, one sentence each."""
+    """Yield one sentence per described inertia that no mass distribution can have."""
     return tuple(f"{arm.path.name}: {doubt}." for doubt in arm.doubts)
 
 
 def doubted_limits(config: "Config") -> Iterator[str]:
     """Yield one sentence per joint whose limits in the file make no sense or do not contain the paths.
 
-    At either end, position_limit may exceed them by what a path leaves free: it stops an arm, and some arms rest on a
-    stop.
+    At either end, position_limit may exceed them by the margin that a path leaves free: it only stops the arm, and some
+    arms rest on a stop.
     """
     arm = described_arm(config)
     wanted = config.joint_path

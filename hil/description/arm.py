@@ -89,7 +89,8 @@ class ArmJoint:
     """Names of the links attached to this joint's link by fixed or held joints."""
     movable: Mapping[str, Body] = field(default_factory=dict)
     """Those of these links that held joints move, each without its own attached links, in the frame of this joint's
-    link."""
+    link.
+    """
 
 
 @dataclass(frozen=True)

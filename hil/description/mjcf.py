@@ -131,7 +131,7 @@ class _Tree:
         return None if (x, y, z) == USUAL_GRAVITY else (x, y, z)
 
     def not_modelled(self, names: list[str], bodies: list[int]) -> Iterator[str]:
-        """Yield one sentence per kind of force in the file that an arm of rigid links and friction does not have."""
+        """Yield one sentence per kind of force in the file that rigid links with friction do not include."""
         model = self.model
         sprung = [name for name in names if np.any(model.jnt_stiffness[model.joint(name).id])]
         if sprung:

@@ -18,15 +18,15 @@ servo are known:
 A reading that jumps back and forth, as with a stuck bit, cancels in those memories. Therefore each single interval is
 also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
 
-A velocity that stays exactly the same was that of the joint all the while, except for the last `LAG_S` at most. So the
-distance covered until then must equal the velocity times the time. A velocity that freezes near its peak is found by
-this sooner than by the memories, in which a lag could explain the difference.
+A velocity that stays exactly the same was the joint's true velocity throughout, except for the last `LAG_S` at most. So
+the distance covered up to then must equal the velocity times the time. This detects a velocity that freezes near its
+peak sooner than the memories do, in which a lag could explain the difference.
 
 Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to twice the
 values estimated by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
 
-It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state that it
-keeps for a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
+that it keeps for a joint is a record of the type `MEMORY`.
 """
 
 from collections.abc import Iterable

@@ -14,8 +14,8 @@ per sample. The step is bounded so that no single reply decides, and the sum is 
 weighted by the time that it represents. The commanded current is any value between the last two goals,
 because a reply may be measured before or after the motor follows the latest goal.
 
-It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state that it
-keeps for a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
+that it keeps for a joint is a record of the type `MEMORY`.
 """
 
 from typing import Any

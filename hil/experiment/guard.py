@@ -336,9 +336,9 @@ class Guard:
                 index,
                 Cause.GOALS_CHANGED,
                 f"{said}: {self._supply[index]:.1f} V would drive it at that speed, according to the published "
-                "figures. Its goals are changed on the way or by another program, its supply sags, or its current sensor is "
-                "wrong: check these. If they are in order, its motor is weaker than published: lower velocity_limit "
-                f"to {slower}.",
+                "figures. Its goals are changed on the way or by another program, its supply sags, or its current "
+                "sensor is wrong: check these. If all are in order, its motor is weaker than published: lower "
+                f"velocity_limit to {slower}.",
             )
         seconds = self._joints[index]["found"]
         self._stop(

@@ -1,6 +1,6 @@
 """An arm as frames and shapes: where each link is at each sample, and what to draw there.
 
-Used by the MCAP export, whose messages `FrameTransforms` and `SceneUpdate` Foxglove's 3D panel shows.
+Used by the MCAP export; Foxglove's 3D panel shows its messages `FrameTransforms` and `SceneUpdate`.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Ensemble of spatial arms that may equal the real one, and its update with the recording of a run.
+"""Ensemble of spatial arms consistent with what is known of the real one, and its update with the recording of a run.
 
 Torque is linear in base parameters and friction, so each arm is updated by one randomised maximum a posteriori step (Y.
 Chen and D. Oliver, Mathematical Geosciences 44 (2012) 1), with itself as the prior mean and independent noise added to

@@ -43,7 +43,7 @@ SILENT_S = 30.0
 
 
 class Said:
-    """Passes messages on, and reports that work goes on when nothing has been said for a while.
+    """Passes messages on, and reports progress when there has been no message for a while.
 
     now: the time [s].
     """

@@ -1,4 +1,4 @@
-"""The largest share of a spatial arm's designed paths that is safe for every arm that it may be.
+"""The largest share of a spatial arm's designed paths that is safe for every arm of the current belief.
 
 `hil identify` and `hil dry-run` both decide in this way, on the same arms, so that they agree.
 """

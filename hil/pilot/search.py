@@ -1,4 +1,5 @@
-"""From the first careful run to a plan at the limits: run, update the belief, and raise the torque until it is certain.
+"""From the first careful run to a plan at the limits: run, update the belief, and raise the torque until the belief is
+precise.
 
 A run that moved nothing, exceeded a limit or never settled is informative too.
 """

@@ -158,7 +158,7 @@ def tells_of_the_arm(error: ExperimentError) -> bool:
     """Whether the error is informative about the arm, so that another run may follow: limit, no motion, no steady
     motion, a period that differs from the one before.
 
-    What another program or a change of goals on the way has caused is not: a further run with less torque or speed
+    Errors caused by another program or by goals changed on the way are not: a further run with less torque or speed
     would only hide it.
     """
     if isinstance(error, SafetyStop):

@@ -1,8 +1,9 @@
-"""How fast each joint can be turning, by the change of its position: no brake may rely on a reported velocity alone.
+"""How fast each joint can be turning, judged by the change of its position: no brake may rely on a reported velocity
+alone.
 
 A servo can report a false velocity in an intact reply. A brake that trusted it would drive the joint. Therefore the
 velocity to brake against is the reported one, confined to the range that the change of position allows over two spans
-of time: a short one, which soon shows a reversal, and a long one, in which a slow motion is visible in spite of the
+of time: a short one, which soon shows a reversal, and a long one, in which a slow motion is visible despite the
 encoder's steps. Each range includes zero and never the direction opposite to a visible motion.
 """
 
@@ -79,7 +80,7 @@ class RecentMotion:
         return found
 
     def contradicts(self, joint: int, velocity: float) -> bool:
-        """Whether a velocity is not that of the joint: none of its changes of position allows it, or none is known
+        """Whether a velocity cannot be the joint's: none of its changes of position allows it, or none is known
         and no servo turns that fast.
         """
         travels = self.travels(joint)

@@ -1,6 +1,6 @@
 """Refusal of angles that no servo arm reaches: most often they are in degrees, although the file does not say so.
 
-An estimate from such angles takes minutes and means nothing. Joints that rotate on and on are accepted, and so is
+An estimate from such angles takes minutes and is meaningless. Joints that rotate continuously are accepted, and so is
 everything if [columns] states the unit.
 """
 
@@ -29,7 +29,7 @@ _OVER_S, _USUAL = 0.02, 0.9
 
 
 def refuse_degrees(source: str, names: Sequence[str], time: Values, position: Values) -> None:
-    """Raise CsvError if `position` (joints, samples) [rad] is beyond what servos do.
+    """Raise CsvError if `position` (joints, samples) [rad] is beyond the range of servos.
 
     names: columns of the positions. time: (samples,) [s].
     """

@@ -39,7 +39,7 @@ def print_result(result: SettledResult, config: Config, run: Path, console: Cons
 
 
 def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
-    """A result of multiple shooting. run: the folder it is in."""
+    """Print a result of multiple shooting. run: its folder."""
     print(f"{result.joints}-joint arm, {result.config}")
     for name, entry in result.quantities.items():
         print(f"{name:22s} {entry.unit:10s} {entry.value:12.5g} {entry.std:9.1e}")

@@ -66,7 +66,8 @@ class Difference:
     trust: tuple[str | None, str | None] = (None, None)
     other_joints: tuple[str, ...] = ()
     """One sentence per joint that is described differently, since the arms may differ, or on a run compared with
-    itself."""
+    itself.
+    """
 
     @property
     def changed(self) -> tuple[Change, ...]:

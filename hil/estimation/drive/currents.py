@@ -64,7 +64,7 @@ def current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindin
 
 
 def settled_current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindings:
-    """The same for the periodic samples, which a settled estimate is based on."""
+    """Compare the currents of the periodic samples only, on which a settled estimate is based."""
     return current_findings(config, samples[samples["phase"] == Phase.PERIODIC])
 
 

@@ -102,7 +102,7 @@ def estimate_any(
     given: Given = Given(),
 ) -> Estimated:
     """The estimate, its checks and its verdict. stepped: whether each joint's encoder step is known; by default it is.
-    given: what contradicts the estimate if it is far off.
+    given: prior knowledge, which the estimate must not contradict.
 
     Raises ConfigError, EstimationError.
     """
