@@ -159,7 +159,7 @@ class ServoModel:
             return False
         along = math.copysign(1.0, goal) * carried
         if along < -HARDLY_ANY * abs(goal):
-            return False  # for lack of voltage a current falls short of its goal, but never turns round
+            return False  # for lack of voltage a current falls short of its goal, but never reverses
         along = max(0.0, along)
         back_emf = self.back_emf * abs(velocity)
         has_current = along > HARDLY_ANY * abs(goal)

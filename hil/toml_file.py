@@ -40,7 +40,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 
 def _encoding_of(path: Path, error: UnicodeDecodeError) -> str:
-    """What a file that is not UTF-8 text is, and how to save it as such."""
+    """Say what a file that is not UTF-8 text is, and how to save it as UTF-8."""
     data = path.read_bytes()
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and (b"=\0" in data or b"\0=" in data):
         return "UTF-16 text, as some Windows programs write it: save it with the encoding UTF-8"

@@ -78,7 +78,8 @@ _PENDING = _COVARIANCE + _COUNT
 _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
 # Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration; mean square velocity.
 _TAUGHT, _TEACHES, _SQUARED = 0, 2, 4
-# The constants: joints, interval, floors; from 4 drifts; then two least noises, the highest floors and their friction.
+# The constants: joints, interval, floors; from 4 drifts; then two minimum noises, the highest floors and their
+# friction.
 _HIGHEST = 4 + _COUNT + 2
 
 

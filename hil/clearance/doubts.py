@@ -34,7 +34,7 @@ def doubts(config: Config) -> Iterator[str]:
 
 
 def _same_direction(config: Config, joint: JointConfig) -> str:
-    """Say that two servos of a joint are described as turning the same way, which is rarely so; "" otherwise."""
+    """Say that two servos of a joint are described as turning the same way, which is rarely true; "" otherwise."""
     if len(joint.ids) == 1 or len(set(joint.directions)) > 1:
         return ""
     (first, second), sign = joint.ids, joint.direction

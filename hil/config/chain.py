@@ -54,7 +54,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
     arm = described_arm(config)
     wanted = config.joint_path
     for index, (joint, described) in enumerate(zip(config.joints, arm.joints, strict=True)):
-        if described.limits is None or described.limits == (0.0, 0.0):  # the latter are not limits, but missing ones
+        if described.limits is None or described.limits == (0.0, 0.0):  # the latter means that limits are missing
             continue
         lower, upper = described.limits
         where = f'{arm.path.name}: joint "{joint.name}": its limits are [{lower:g}, {upper:g}] rad'

@@ -49,7 +49,7 @@ class Fall:
 class LoweringForeseen:
     """Predicted lowering.
 
-    seconds: longest duration [s]. nearest: least clearance. lies: fraction of simulations that end in the rest pose.
+    seconds: longest duration [s]. nearest: smallest clearance. lies: fraction of simulations that end in the rest pose.
     joint: name of the joint that ends farthest from it, `away` [rad]. limit: name of the setting that limits its
     torque. slower: the change of settings that makes the lowering slower.
     """

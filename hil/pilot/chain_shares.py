@@ -183,7 +183,7 @@ def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _remedy(config: Config, foreseen: ChainPrediction) -> str:
-    """Return the changes with which a user may make a path safe that `unsafe` rejects."""
+    """Return the changes by which a user may make a path safe that was rejected as `unsafe`."""
     if not foreseen.is_clear:
         helps = "A rest_pose farther from obstacles, or more room in [clearance] (floor, boxes, margin)"
     else:

@@ -275,8 +275,8 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """`found`; if it leaves much of the range unused, the best amplitude among other waves too, whichever leaves
-        least.
+        """Return `found` or, if it leaves much of the range unused, the best amplitude among other waves if that leaves
+        less.
 
         Slightly more torque may tip some of the arms over: with other waves that happens at larger amplitudes, or to
         the other side.

@@ -78,7 +78,7 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
 
 
 def _other(name: str, goal: Array, measured: Array) -> str:
-    """Say that the current was another one than commanded; "" if it was not, or only clipped."""
+    """Say that the current was not the commanded one; "" if it was, or was only clipped."""
     if len(goal) < _RECENT or not goal.any():
         return ""
     recent = np.lib.stride_tricks.sliding_window_view(goal, _RECENT)
