@@ -152,8 +152,9 @@ class ServoModel:
         that of its winding and its back-EMF, is about the supply's. Without torque, only the back-EMF is present. A
         current opposite to its goal has another cause.
 
-        goal, carried: commanded and measured current [A]. velocity: of the output shaft [rad/s]. supply: lowest
-        measured voltage of the supply [V]; NaN if unknown, in which case the lowest plausible voltage is assumed.
+        goal, carried: commanded and measured current [A]. velocity: velocity of the output shaft [rad/s]. supply:
+        lowest measured voltage of the supply [V]; NaN if unknown, in which case the lowest plausible voltage is
+        assumed.
         """
         if goal == 0.0 or velocity * goal <= 0.0 or not abs(carried) < abs(goal):
             return False

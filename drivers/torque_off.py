@@ -166,9 +166,10 @@ def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseExcepti
 
 
 def cut_again(servo: Servo, *, armed: bool) -> bool:
-    """Cut the torque of a servo that did not answer before; return whether it was rebooted. Raises as `Servo.write`.
+    """Cut the torque of a servo that did not answer before; return whether it was rebooted.
 
     armed: whether its Bus Watchdog was armed before torque was switched on; if so, it is switched off.
+    Same errors as `Servo.write`.
     """
     if servo.read_despite_error("Torque Enable"):
         servo.write_despite_error("Torque Enable", 0)

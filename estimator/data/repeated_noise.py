@@ -138,8 +138,8 @@ def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:
     Each is the median of a few lines and so has an error of its own; the smaller of two would be too small.
 
     Args:
-        white: from the fastest lines of a period of `samples` samples (joints,) [rad].
-        repeated: from the difference of two halves of such periods (joints,) [rad], if known.
+        white: bound from the fastest lines of a period of `samples` samples (joints,) [rad].
+        repeated: bound from the difference of two halves of such periods (joints,) [rad], if known.
         samples: number of samples of the period.
     """
     if repeated is None:

@@ -113,9 +113,9 @@ def blocked(
     """Return whether something other than friction holds the joint.
 
     distance: result of `look` [N m]. held: torque that certainly acts on the joint now, to one side. friction: what dry
-    friction may hold to one side [N m]. tolerance: of the distance [N m]. momentum: that of the joint at the smallest
-    visible velocity [N m s]. filter_s: time constant of the equation's filter [s]. dt: time since the previous sample
-    [s].
+    friction may hold to one side [N m]. tolerance: tolerance of the distance [N m]. momentum: momentum of the joint at
+    the smallest visible velocity [N m s]. filter_s: time constant of the equation's filter [s]. dt: time since the
+    previous sample [s].
     """
     width = abs(distance)
     rest[_RANGE] = max(rest[_RANGE], max(width, 2.0 * held) - momentum / filter_s)

@@ -64,7 +64,7 @@ class Evidence:
     motion itself.
     """
     held_out_as_fitted: Array | None = None
-    """As `held_out`, but with friction as it was in the fitted motion (joints,); None where it has not changed.
+    """Like `held_out`, but with friction as it was in the fitted motion (joints,); None where it has not changed.
     """
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""

@@ -22,10 +22,10 @@ from hil.printing import print_fitting, say
 class ChainDryRun:
     """A dry run of a spatial arm.
 
-    config: with the path and stabiliser that would be used. share: fraction of the designed path's amplitude; 1 if
-    [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of links with parts
-    that are closer than the margin in nearly every pose and are not checked. refused: why the pilot has no safe first
-    step; "" if it has one, None without a pilot, whose decision counts.
+    config: configuration with the path and stabiliser that would be used. share: fraction of the designed path's
+    amplitude; 1 if [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of
+    links with parts that are closer than the margin in nearly every pose and are not checked. refused: why the pilot
+    has no safe first step; "" if it has one, None without a pilot, whose decision counts.
     """
 
     config: Config

@@ -142,7 +142,7 @@ def predict(
         pose: where the arm starts at rest (joints,) [rad]; by default the rest pose.
         briefly: simulate only one period of each multisine; used during a search.
         shown: number of arms whose motion is stored.
-        executor: simulates the arms, some at a time; the result is the same with and without it.
+        executor: executor that simulates the arms, some at a time; the result is the same with and without it.
     """
     commands = [commands_of(config, segment) for segment in plan.segments]
     start = np.array(config.arm.rest_pose) if pose is None else pose

@@ -25,8 +25,8 @@ PLANAR_RADIUS = 0.1
 class Frame:
     """The frame of a link, which turns about `axis` (3,) of its joint.
 
-    rotation, translation: of the frame at angle zero in `parent` (3, 3), (3,) [m]. joint: index of the angle; None for
-    the base, which is fixed.
+    rotation, translation: pose of the frame in `parent` at angle zero (3, 3), (3,) [m]. joint: index of the angle; None
+    for the base, which is fixed.
     """
 
     name: str

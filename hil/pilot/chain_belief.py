@@ -42,7 +42,7 @@ _HALVINGS = 6
 _LIGHTER = 0.25
 """Smallest plausible inertia of a joint, relative to that of the lightest arm of the prior."""
 _LIGHTER_THAN_MEAN = 0.5
-"""The same relative to the inertia of the arm with the fitted parameters, if that arm is lighter still."""
+"""Smallest plausible inertia relative to that of the arm with the fitted parameters, if that arm is lighter still."""
 
 SIMULATED = 100
 """Largest number of arms that are simulated."""

@@ -166,7 +166,7 @@ def identify_chain_in_steps(
 ) -> tuple[str, SettledResult]:
     """Identify a spatial arm from its description, limits and rest pose. Returns the torque state and the result.
 
-    Raises what a run raises, and NoSafeTorque.
+    Raises whatever a run raises, and NoSafeTorque.
     """
     with StopRequest(), servo_session(config, run.path, say) as bus:
         if from_where_it_lies(config, bus.read_positions()) is not config and (moving := wait_for_rest(bus)):

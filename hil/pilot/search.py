@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 DEFAULTS = PilotOptions()
 
 _LINES_FOR_DETECTION = 4
-"""Lines of the band per joint of which enough are excited with experiment.detection."""
+"""Number of lines of the band per joint at which experiment.detection still excites enough of them."""
 
 
 @dataclass
@@ -100,7 +100,7 @@ class Search:
     def find(self) -> tuple[Config, Amplitude]:
         """Find the configuration and the amplitude of the full run.
 
-        Raises what a run raises, and ExperimentError if a joint does not move at its current limit.
+        Raises whatever a run raises, and ExperimentError if a joint does not move at its current limit.
         """
         self._pilot()
         return self._raise_to_limits()

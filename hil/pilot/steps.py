@@ -120,9 +120,9 @@ class Player:
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude, arms: Ensemble) -> Played:
         """Play one run on an arm that could be any of `arms`, compare it with the prediction, and report.
 
-        A run that is stopped because this computer was late is repeated. Raises what a run raises, except errors that
-        are informative about the arm: limit exceeded, no motion, no steady motion, a period that differs from the one
-        before.
+        A run that is stopped because this computer was late is repeated. Raises whatever a run raises, except errors
+        that are informative about the arm: limit exceeded, no motion, no steady motion, a period that differs from the
+        one before.
         """
         torque, error = "", None
         try:

@@ -87,10 +87,9 @@ class ServoSession:
     """Whether the last inner block ended with an exception: the arm went limp earlier than planned."""
 
     def begin(self, config: Config, folder: Path | None) -> None:
-        """Check that the servos answer and that nobody holds the arm, then save their settings. Raises as
-        `ServoBus.open`.
+        """Check that the servos answer and that nobody holds the arm, then save their settings.
 
-        Nothing is written to a servo before its settings are on disk.
+        Nothing is written to a servo before its settings are on disk. Same errors as `ServoBus.open`.
         """
         bus = self.bus
         bus.check_identity()
@@ -235,8 +234,8 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
 
     A TorqueNotOff that leaves the block reports the final state: servos that answer again are read back.
 
-    folder: run folder that receives a copy of the settings. say: receives messages for the user. Raises as
-    `ServoBus.open`, and RunFolderError.
+    folder: run folder that receives a copy of the settings. say: receives messages for the user. Same
+    errors as `ServoBus.open`, and RunFolderError.
     """
     outer = _outermost.get()
     if outer is not None and outer.bus.port.is_open and outer.bus.config.is_same_arm(config.bus):
@@ -325,7 +324,7 @@ def left_behind(port: str, joint: Joint) -> Kept | None:
 
 
 def recover(servo: Servo, port: str) -> list[str]:
-    """Restore settings that a terminated program left changed; return what was written. Raises as `Servo.write`."""
+    """Restore settings that a terminated program left changed; return those written. Same errors as `Servo.write`."""
     kept = settings_file.load(port, servo.id, servo.table.model)
     if kept is None or not kept.may_restore:
         return []

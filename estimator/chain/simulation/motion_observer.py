@@ -58,7 +58,7 @@ class ChainObserver:
     """Detects motion that is inconsistent with the arm's parameters, and refines these as the arm moves.
 
     mean: base parameters, then viscous friction, dry friction and offsets (base + 3 joints,) [SI].
-    covariance: of `mean`.
+    covariance: covariance of `mean`.
     largest: largest planned torque of each joint (joints,) [N m].
     interval: sampling interval [s].
     frictions: multiple of dry friction, as far as it is known, that serves as a lower bound on this torque scale.

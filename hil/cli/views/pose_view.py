@@ -38,13 +38,13 @@ def print_moved(moved: Moved) -> None:
 
 
 def pose_values(config: Config, pose: Pose) -> dict[str, Any]:
-    """As plain values."""
+    """Return the pose as plain values for JSON."""
     names = [joint.name for joint in config.joints]
     return {"angles": dict(zip(names, pose.angles, strict=True)), "end": list(pose.end)}
 
 
 def moved_values(moved: Moved) -> dict[str, Any]:
-    """As plain values."""
+    """Return the outcome of moving one joint as plain values for JSON."""
     return {"joint": moved.joint, "asked": moved.asked, "angles": list(moved.angles), "well": moved.well} | {
         "found": moved.found
     }

@@ -60,7 +60,8 @@ class Given:
     """What is known of the drives and encoders beforehand.
 
     torque_scale_std: see `hil.estimator.models.conflicts.conflicts`. zeros: whether the encoder zeros are those of a
-    configuration. names: of the recordings. jumps: a sentence for each joint of a recording whose position jumped.
+    configuration. names: names of the recordings. jumps: a sentence for each joint of a recording whose position
+    jumped.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)

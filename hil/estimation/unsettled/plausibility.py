@@ -18,7 +18,7 @@ SHOWN = 1e-3  # of the largest torque of a joint, or of a ratio: less counts as 
 
 
 def implausible(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: float) -> list[str]:
-    """One sentence for each impossible value. gravity: in the arm's plane [m/s^2]."""
+    """One sentence for each impossible value. gravity: gravity in the arm's plane [m/s^2]."""
     late = limited(estimate.parameters)
     return [
         *_torques(recordings),
