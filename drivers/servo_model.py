@@ -146,7 +146,7 @@ class ServoModel:
         return self.no_load.voltage / self.no_load.speed
 
     def is_out_of_voltage(self, goal: float, carried: float, velocity: float, supply: float = math.nan) -> bool:
-        """Whether a current stays behind its goal because the supply cannot drive more through the turning motor.
+        """Whether a current falls short of its goal because the supply cannot drive more through the turning motor.
 
         This is taken as the cause if the motor turns in the direction of its goal and the voltage across its terminals,
         that of its winding and its back-EMF, is about the supply's. Without torque, only the back-EMF is present. A

@@ -147,7 +147,7 @@ def cut_torque(
 
 
 def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
-    """Send torque off to all servos in one packet; a failure shows when they are read back.
+    """Send torque off to all servos in one packet; a failure is noticed when they are read back.
 
     It is a Sync Write because other servos on the bus may be in use, and it is sent twice because a packet may be lost.
     """

@@ -31,7 +31,7 @@ _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 
 Three of the same value are required for a goal that this program may have written in an earlier cycle, and for 0, which
 a servo itself may have set. By then, the status has detected lost writes, a tripped watchdog or a reboot; and writes
-that are lost now and then leave a different goal each time.
+that are lost occasionally leave a different goal each time.
 """
 
 _UNSURE_S = 0.01
@@ -66,7 +66,7 @@ class Overruled(NamedTuple):
 
 
 class ReadBack:
-    """Reads back the goals that the servos hold right before a cycle, and now and then their operating modes instead.
+    """Reads back the goals that the servos hold right before a cycle, and occasionally their operating modes instead.
 
     Every cycle overwrites the goals of another master, so one that writes less often than this program is seen only if
     the goals are read before every cycle.

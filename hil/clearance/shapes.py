@@ -94,8 +94,8 @@ def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule
     end = ", and the end is estimated from the centre of mass" if is_last else ""
     return (
         f'link "{name}": {why}. It is replaced by a {along if length > _NOTHING else "sphere at its joint"}'
-        f"{', beside its other shapes' if has_others else ''}. The radius of {1e3 * capsule.radius:.0f} mm is a guess"
-        f"{end}: its clearance is not certain."
+        f"{', in addition to its other shapes' if has_others else ''}. The radius of {1e3 * capsule.radius:.0f} mm is "
+        f"a guess{end}: its clearance is uncertain."
     )
 
 
@@ -103,8 +103,8 @@ def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule
 class Solid:
     """A primitive of a file's collision geometry, in the frame of its moving link.
 
-    link: 0 for the fixed base. kind: "box", "cylinder", "capsule", "sphere" or "mesh". size: as MuJoCo counts it: half
-    edges, or radius and half length [m]; empty for a mesh. rotation: (3, 3); translation: (3,) [m].
+    link: 0 for the fixed base. kind: "box", "cylinder", "capsule", "sphere" or "mesh". size: as in MuJoCo: half edge
+    lengths, or radius and half length [m]; empty for a mesh. rotation: (3, 3); translation: (3,) [m].
     """
 
     link: int

@@ -34,7 +34,7 @@ SIGMA_TICKS = 4.0
 """Lower bound of that standard deviation, in register ticks."""
 
 LOST_AFTER_S = 0.03
-"""Time for which a current must look like zero, at full weight, before it is taken for zero [s]."""
+"""Time for which a current must look like zero, at full weight, before it counts as zero [s]."""
 
 _FULL_WEIGHT = 2.0
 """Upper bound on the log likelihood ratio of one sample: that of a commanded current of two sigma if zero is measured.

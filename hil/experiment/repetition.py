@@ -106,8 +106,8 @@ class Repetition:
 
     @property
     def difference(self) -> float:
-        """RMS difference between the second halves of the periods, relative to the RMS of the motion; the worst
-        joint's.
+        """RMS difference between the second halves of the periods, relative to the RMS of the motion, for the worst
+        joint.
         """
         return max(_relative(sums) for sums in self._sums)
 
