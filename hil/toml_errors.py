@@ -243,7 +243,7 @@ def _allowed_keys(location: Sequence[str | int], root: type[BaseModel]) -> str:
 
 
 def fields_of(model: Any) -> dict[str, Any]:
-    """The fields of a table, by the keys used in the file."""
+    """The fields of a table, keyed as in the file."""
     return {field.alias or name: field for name, field in model.model_fields.items()}
 
 

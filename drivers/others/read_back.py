@@ -41,7 +41,7 @@ TRY_AGAIN_S = 0.005
 """Delay after which a read-back for which a cycle left no time is tried again [s]."""
 
 LOST_GOALS, LOST_OF = 3, 6
-"""A servo that misses this many of so many goals does not accept them, although the next one may arrive.
+"""A servo that misses `LOST_GOALS` of `LOST_OF` goals does not accept them, although the next one may arrive.
 
 The status, in which two consecutive goals must be missed, may not show for 0.1 s that every second goal is lost. If a
 hundredth is lost, three of six are rarer than two consecutive ones.

@@ -144,7 +144,7 @@ class _Tree:
         if floating:
             yield (
                 f"{_listed('body', floating)} gravcomp, which is not used: gravity acts on every link of a real arm, "
-                "and the torque that carries it is identified"
+                "and the torque that supports it is identified"
             )
         if any(np.any(model.tendon_stiffness[each]) for each in range(model.ntendon)):
             yield "a tendon has a stiffness, but tendons and springs are not modelled: their forces are ignored"

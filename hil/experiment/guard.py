@@ -45,7 +45,7 @@ _ERRORS_IN_A_ROW = 3
 """Consecutive replies with values and an error number at which a servo is stopped; it may not accept its goals."""
 
 NONE_HEARD = "No servo was heard"
-"""Beginning of the message of a stop because all replies are missing."""
+"""Beginning of the message of a stop due to missing replies from all servos."""
 
 
 class Guard:

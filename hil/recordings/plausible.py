@@ -25,7 +25,7 @@ _ONE_WAY = 0.7
 """Smallest share of a joint's path in one direction for which it counts as rotating continuously."""
 
 _OVER_S, _USUAL = 0.02, 0.9
-"""Time over which speeds are measured, so that noise hardly counts [s], and the fraction of them that is slower."""
+"""Time over which speeds are measured, so that noise hardly matters [s], and the quantile of them that is checked."""
 
 
 def refuse_degrees(source: str, names: Sequence[str], time: Values, position: Values) -> None:
