@@ -274,8 +274,8 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
     if as_fitted is None or _percent(as_fitted) == worst:
         return (f"{said}.",)
     return (
-        f"{said} with friction as it was by then, one factor per joint taken from that motion itself; with friction as "
-        f"it was in the fitted motion, to within {_percent(as_fitted)}.",
+        f"{said} with friction as it was at that time, one factor per joint taken from that motion itself; with "
+        f"friction as it was in the fitted motion, to within {_percent(as_fitted)}.",
     )
 
 

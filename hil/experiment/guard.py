@@ -191,7 +191,8 @@ class Guard:
                 Cause.ERRORS,
                 f"reports an error ({describe_status_error(error)}) with its values, {_ERRORS_IN_A_ROW} times in a "
                 "row, although nothing that it was sent should cause one: whether it accepts its goals is unknown. "
-                "Power-cycle it and check its firmware; a device between adapter and servo may also change replies.",
+                "Power-cycle it and check its firmware; a device between adapter and servo may also be changing "
+                "replies.",
             )
 
     def goals_are_lost(self, index: int, held: str) -> NoReturn:
@@ -344,7 +345,8 @@ class Guard:
         self._stop(
             index,
             Cause.NOT_FOLLOWING,
-            f"{said}, by the readings of the last {1e3 * seconds:.0f} ms. {self._why_not_followed(index, state)}",
+            f"{said}, according to the readings of the last {1e3 * seconds:.0f} ms. "
+            f"{self._why_not_followed(index, state)}",
         )
 
     def _why_not_followed(self, index: int, state: State) -> str:
@@ -413,7 +415,7 @@ class Guard:
                 self._stop(
                     index,
                     Cause.TEMPERATURE,
-                    f"is at {celsius:.0f} degrees C, safety.max_temperature is {safety.max_temperature:g}. Let it "
+                    f"is at {celsius:.0f} degrees C; safety.max_temperature is {safety.max_temperature:g}. Let it "
                     "cool.",
                 )
             if volt < safety.min_voltage or volt > safety.max_voltage:

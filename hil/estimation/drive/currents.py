@@ -92,9 +92,8 @@ def _other(name: str, goal: Array, measured: Array) -> str:
     )
     if beyond > _BEYOND_OFTEN:
         return (
-            f"{name} carried a current other than the commanded one in {100 * beyond:.0f} % of the samples, of the "
-            f"other sign "
-            f"or larger: {why}"
+            f"{name} carried a current other than the commanded one in {100 * beyond:.0f} % of the samples, of "
+            f"opposite sign or larger: {why}"
         )
     part = _short_part(goal, measured)
     if part > OFTEN and _follows_small_goals(goal, measured) < SHORT:
