@@ -80,7 +80,7 @@ class TorqueOff:
                 )
 
     def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:
-        """Each reason why servos are unconfirmed, with their joints; reasons that differ only in the name are one."""
+        """Each reason why servos are unconfirmed, with their joints; those that differ only in the name are merged."""
         yield from by_reason(self.unconfirmed).items()
 
     def _outcome(self) -> str:
@@ -212,7 +212,7 @@ def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) 
 
 
 def by_reason(failures: Iterable[tuple[Joint, str]]) -> dict[str, list[Joint]]:
-    """The joints for which each reason applies; reasons that differ only in the joint's name are one."""
+    """The joints for which each reason applies; reasons that differ only in the joint's name are merged."""
     joints: dict[str, list[Joint]] = {}
     own = {joint: why.replace(joint.title, "It").replace(str(joint), "it") for joint, why in failures}
     for joint, why in own.items():

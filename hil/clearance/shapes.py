@@ -34,7 +34,8 @@ _NOTHING = 1e-6
 class Capsule:
     """A capsule fixed to a link.
 
-    link: 0 for the fixed base, then 1 to the number of joints. ends: (2, 3) [m] in that link's frame. radius: [m].
+    link: 0 for the fixed base, then 1 to the number of joints. ends: end points (2, 3) [m] in that link's frame.
+    radius: radius [m].
     """
 
     link: int
@@ -104,7 +105,7 @@ class Solid:
     """A primitive of a file's collision geometry, in the frame of its moving link.
 
     link: 0 for the fixed base. kind: "box", "cylinder", "capsule", "sphere" or "mesh". size: as in MuJoCo: half edge
-    lengths, or radius and half length [m]; empty for a mesh. rotation: (3, 3); translation: (3,) [m].
+    lengths, or radius and half length [m]; empty for a mesh. rotation (3, 3), translation (3,) [m]: its pose.
     """
 
     link: int

@@ -55,9 +55,9 @@ _LEAST_SPREAD = 0.01  # relative model error, per doubling of the range of motio
 class Belief:
     """Arms that could be the real one.
 
-    coordinates: (arms, parameters), logarithms of positive parameters; parameters of either sign are divided by
-    `scale`. scale: standard deviation in the prior (parameters,). fixed: parameters that do not vary. learned: number
-    of updates.
+    coordinates: coordinates (arms, parameters): logarithms of positive parameters; parameters of either sign are
+    divided by `scale`. scale: standard deviation in the prior (parameters,). fixed: parameters that do not vary.
+    learned: number of updates.
     """
 
     names: tuple[str, ...]

@@ -36,9 +36,9 @@ _BESIDE = 2
 class Step:
     """One intermediate run.
 
-    name: shown to the user. peak_torque: (joints,) [N m]. median, quantile: predicted median and 99 % peaks; seen:
-    measured peaks, each (quantities, joints) in the order of hil.dry_run.prediction.QUANTITIES. ended: why the run
-    ended early; empty if it did not.
+    name: name shown to the user. peak_torque: peak torques (joints,) [N m]. median, quantile: predicted median and 99 %
+    peaks; seen: measured peaks, each (quantities, joints) in the order of hil.dry_run.prediction.QUANTITIES. ended: why
+    the run ended early; empty if it did not.
     """
 
     name: str

@@ -21,7 +21,8 @@ RESTART = 0.2  # s: a larger backward step in time starts a new recording
 class Rows:
     """Rows of a recording.
 
-    time: (rows,) [s]. torque, position: (joints, rows) [N m, rad]. notes: one sentence per correction.
+    time: times of the rows (rows,) [s]. torque, position: values (joints, rows) [N m, rad]. notes: one sentence per
+    correction.
     """
 
     time: Values

@@ -31,7 +31,7 @@ _OVER_S, _USUAL = 0.02, 0.9
 def refuse_degrees(source: str, names: Sequence[str], time: Values, position: Values) -> None:
     """Raise CsvError if `position` (joints, samples) [rad] is beyond the range of servos.
 
-    names: columns of the positions. time: (samples,) [s].
+    names: columns of the positions. time: sampling times (samples,) [s].
     """
     fastest = TIMES_NO_LOAD * fastest_no_load()
     for name, row in zip(names, position, strict=True):

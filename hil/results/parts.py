@@ -334,8 +334,8 @@ class StabiliserShare:
 class PlayedStep:
     """One run between the pilot and full amplitude.
 
-    Rows are the quantities of hil.dry_run.prediction.QUANTITIES, columns the joints. peak_torque: [N m]. ended: why the
-    run ended early; None if it did not.
+    Rows are the quantities of hil.dry_run.prediction.QUANTITIES, columns the joints. peak_torque: peak torque per joint
+    [N m]. ended: why the run ended early; None if it did not.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Workers as jobs of a Slurm queue, by dask-jobqueue."""
+"""Workers as jobs of a Slurm queue, through dask-jobqueue."""
 
 import shutil
 import time
