@@ -49,7 +49,7 @@ LEAST_SUPPLY = 0.6
 sag, and resistance and no-load speed differ by tens of percent from servo to servo."""
 
 LEAST_OF_MEASURED = 0.75
-"""The same ratio if the supply was measured: it may sag between two readings, and motors differ."""
+"""`LEAST_SUPPLY` if the supply was measured: it may sag between two readings, and motors differ."""
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
 """Fraction of the goal below which a current may as well be that of a servo without torque, and the voltage ratio

@@ -51,9 +51,9 @@ MEMORY = np.dtype(
 )
 """Constants and state of the check of one joint.
 
-per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V], and share, relative to the goal; follow_time: how
-long a larger one may last [s]. evidence, count: sum of the log likelihood ratios times seconds, and its number of
-samples.
+per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V]; share: the same, relative to the goal; follow_time:
+how long a larger one may last [s].
+evidence, count: sum of the log likelihood ratios times seconds, and its number of samples.
 differs_for, differs: duration [s] and number of samples of a deviation.
 """
 

@@ -18,7 +18,7 @@ from hil.drivers.state import State
 __all__ = ["RecentMotion", "Travel"]
 
 SHORT_S, LONG_S = 0.004, 0.02
-"""The two spans [s], or as many exchanges as it takes."""
+"""The two spans [s]; each reaches back to the latest exchange that is at least as old."""
 
 _OLDEST_S = 0.05
 _LONGER = 1.5
@@ -31,8 +31,8 @@ _MORE = 1.25
 """Tolerance for a velocity that increases within the span, as a factor on the mean velocity."""
 
 CONTRADICTS = 2.0
-"""Factor on that range beyond which a velocity contradicts the position: at constant acceleration from standstill, the
-last velocity is twice the mean one.
+"""Factor on the range that the position allows, beyond which a velocity contradicts it: at constant acceleration from
+standstill, the last velocity is twice the mean one.
 """
 
 UNREACHABLE = 3.0
