@@ -283,7 +283,9 @@ class ServoBus:
         )
 
     def read_drives(self, joint: Joint) -> tuple[float, ...]:
-        """Read what each servo of a joint gives as its angle [rad], the first servo's first; see `read_positions`."""
+        """Read the joint angle [rad] according to each servo of a joint, the first servo's first; see
+        `read_positions`.
+        """
         return tuple(
             self._measured[self._drives.index(drive)].angle(self._servos[drive].read("Present Position"))
             for drive in joint.drives
@@ -292,7 +294,7 @@ class ServoBus:
     def exchange(self, goals: Sequence[float], *, between: bool = False) -> State:
         """Send goals, one per joint [A, or V in PWM mode], and return the arm's state.
 
-        between: an exchange between two samples (`Exchange.cycle`).
+        between: whether this exchange lies between two samples (`Exchange.cycle`).
         A servo that does not reply is marked as missing. Raises PortLost; BusShared if instructions of another master
         are heard repeatedly; ValueError for a goal that is not a finite number.
         """

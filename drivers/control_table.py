@@ -79,7 +79,7 @@ def _folder() -> Path:
 
 @cache
 def model_names() -> Mapping[int, str]:
-    """Return the model name as printed on the servo by model number, for every model with a control table."""
+    """Return the model names as printed on the servos, by model number, for every model with a control table."""
     names: dict[int, str] = {}
     for line in (_folder() / "dynamixel.model").read_text(encoding="utf-8").splitlines()[1:]:
         number, _, file = line.partition("\t")

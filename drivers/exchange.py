@@ -386,7 +386,7 @@ class _Plan(NamedTuple):
     """One of the group reads of an exchange.
 
     span: the span that a Reply reports. timeout: how long to wait for the replies [s]. wire_s: wire time of goals,
-    request and replies [s]. soonest: replies that are complete earlier after the start of a cycle may belong to an
+    request and replies [s]. soonest: time after the start of a cycle before which a complete reply may belong to an
     earlier request [s].
     """
 

@@ -15,7 +15,7 @@ LOCAL_S = 1e-3
 """
 
 REMOTE_S = 16e-3
-"""Latency allowed for a port behind a network [s]."""
+"""Latency allowed for a port on a network [s]."""
 
 BLUETOOTH_S = 60e-3
 """Latency allowed for a serial port over Bluetooth [s]."""

@@ -33,18 +33,18 @@ _MOST_OVERHEARD = 4096
 
 _LOOKS = 100
 """Number of replies in a row, each complete and none too early, after which `DescriptorPort.ask` no longer looks for
-pending input in advance: on such a line, input that was pending shows because it arrives too early.
+pending input in advance: on such a line, pending input is noticed because it arrives too early.
 """
 
 _LOOKS_AFTER_LOSS = 2 * _LOOKS
-"""As `_LOOKS`, after input was pending or a reply was lost: a late reply may then arrive at any time."""
+"""Like `_LOOKS`, but after input was pending or a reply was lost: a late reply may then arrive at any time."""
 
 _ALWAYS = 1 << 62
-"""As `_LOOKS`, for a line whose replies usually arrive earlier than its baud rate allows, such as a pty."""
+"""Like `_LOOKS`, but for a line whose replies usually arrive earlier than its baud rate allows, such as a pty."""
 
 _EARLY_BITS = 9.0
-"""Bits of the ten per byte; a reply counts as early if it arrives before the request can have been transmitted at this
-number. The difference allows for baud rates that deviate.
+"""Bits per byte that are assumed, of ten in fact; a reply counts as early if it arrives before the request can have
+been transmitted at this number. The difference allows for inaccurate baud rates.
 """
 
 _WRITE_PATIENCE_S = 0.1
@@ -79,7 +79,7 @@ class Port:
         self.baud = baud
         self.latency = adapter_latency(url)
         self.latency_measured = False
-        """Whether `latency` was measured, because replies arrive later than expected of this kind of adapter."""
+        """Whether `latency` was measured, because replies arrive later than expected from this kind of adapter."""
         self.echoes = False
         """Whether the adapter echoes what it sends; detected during set-up."""
         self._serial = opened
@@ -252,7 +252,7 @@ class DescriptorPort(Port):
             raise self._lost(error) from error
 
     def _ask_on(self, received: bytes, count: int, deadline: float, looks: int) -> bytes:
-        """Return the whole of a reply of which only a part, or nothing yet, was received within whole milliseconds."""
+        """Return a complete reply when only a part of it, or nothing yet, was received within whole milliseconds."""
         received = self._read_on(received, count, deadline)
         self._looks = max(0, looks - 1) if len(received) == count else max(looks, _LOOKS_AFTER_LOSS)
         return received

@@ -64,7 +64,7 @@ class Servo:
         return self.read_entry(self.table[register], attempts, despite_error=True)
 
     def read_entry(self, entry: Register, attempts: int = _ATTEMPTS, *, despite_error: bool = False) -> int:
-        """Read a register that is missing from the model's table; raises as `read`.
+        """Read a register that is missing from the model's table; same errors as `read`.
 
         despite_error: accept a reply that carries the value and reports an error too.
         """
@@ -98,7 +98,7 @@ class Servo:
         return entry.decode(bytes(self._try(f"reading {entry.name}", ask, attempts, is_read=True)))
 
     def write(self, register: str, value: int, attempts: int | None = None) -> None:
-        """Write a register and read it back; raises as `read`, and ServoRefused if another value is read back.
+        """Write a register and read it back; same errors as `read`, and ServoRefused if another value is read back.
 
         attempts: how often the write, and then the read, may be tried; by default as often as in all set-up work.
         """
@@ -107,7 +107,7 @@ class Servo:
     def write_despite_error(self, register: str, value: int, attempts: int | None = None) -> None:
         """Write a register as `write` does, but ignore errors that replies report if the value reads back as written.
 
-        What makes an arm safe, and what restores it, must not fail because of a servo that reports errors but obeys.
+        Writes that make an arm safe or restore it must not fail because of a servo that reports errors but obeys.
         """
         self._write_and_read_back(register, value, attempts, despite_error=True)
 
@@ -128,7 +128,7 @@ class Servo:
             raise refused or _not_held(self.title, register, value, actual)
 
     def write_only(self, register: str, value: int, attempts: int = _ATTEMPTS) -> None:
-        """Write a register without reading it back, as needed for ID and Baud Rate; raises as `read`."""
+        """Write a register without reading it back, as needed for ID and Baud Rate; same errors as `read`."""
         entry = self.table[register]
         data = list(entry.encode(value))
 
@@ -139,7 +139,7 @@ class Servo:
         self._try(f"writing {value} to {register}", send, attempts)
 
     def hardware_error(self) -> HardwareError:
-        """Return the Hardware Error Status, the reason for a raised alert bit; raises as `read`."""
+        """Return the Hardware Error Status, the reason for a raised alert bit; same errors as `read`."""
         return HardwareError(self.read("Hardware Error Status"))
 
     def _try(

@@ -45,14 +45,15 @@ FULL_PWM_TICKS = 885
 """Goal PWM that applies the whole supply voltage to the motor [ticks]."""
 
 LEAST_SUPPLY = 0.6
-"""Lowest voltage across a motor that counts as that of its supply, relative to the lowest one published: supplies sag,
-and resistance and no-load speed differ by tens of percent from servo to servo."""
+"""Lowest voltage across a motor that counts as the full supply voltage, relative to the lowest one published: supplies
+sag, and resistance and no-load speed differ by tens of percent from servo to servo."""
 
 LEAST_OF_MEASURED = 0.75
-"""The same ratio if the supply was measured: it may sag between two readings, and motors differ."""
+"""`LEAST_SUPPLY` if the supply was measured: it may sag between two readings, and motors differ."""
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
-"""Fraction of the goal below which a current may as well be that of a servo without torque, and the same ratio then."""
+"""Fraction of the goal below which a current may as well be that of a servo without torque, and the voltage ratio
+then."""
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Baud rates by the value of the register Baud Rate. The 330 models only go up to 4 MBd."""
@@ -145,20 +146,21 @@ class ServoModel:
         return self.no_load.voltage / self.no_load.speed
 
     def is_out_of_voltage(self, goal: float, carried: float, velocity: float, supply: float = math.nan) -> bool:
-        """Whether a current stays behind its goal because the supply cannot drive more through the turning motor.
+        """Whether a current falls short of its goal because the supply cannot drive more through the turning motor.
 
-        It is taken for the cause if the motor turns in the direction of its goal and the voltage across its terminals,
-        that of its winding and its back-EMF, is about the supply's. A servo without torque has the back-EMF alone. A
-        current against its goal has another cause.
+        This is taken as the cause if the motor turns in the direction of its goal and the voltage across its terminals,
+        that of its winding and its back-EMF, is about the supply's. Without torque, only the back-EMF is present. A
+        current opposite to its goal has another cause.
 
-        goal, carried: commanded and measured current [A]. velocity: of the output shaft [rad/s]. supply: lowest
-        measured voltage of the supply [V]; NaN if unknown, in which case it may be as low as supplies ever are.
+        goal, carried: commanded and measured current [A]. velocity: velocity of the output shaft [rad/s]. supply:
+        lowest measured voltage of the supply [V]; NaN if unknown, in which case the lowest plausible voltage is
+        assumed.
         """
         if goal == 0.0 or velocity * goal <= 0.0 or not abs(carried) < abs(goal):
             return False
         along = math.copysign(1.0, goal) * carried
         if along < -HARDLY_ANY * abs(goal):
-            return False  # for lack of voltage a current falls short of its goal, but never turns round
+            return False  # for lack of voltage a current falls short of its goal, but never reverses
         along = max(0.0, along)
         back_emf = self.back_emf * abs(velocity)
         has_current = along > HARDLY_ANY * abs(goal)

@@ -20,7 +20,8 @@ class Slow(NamedTuple):
     """Values that are read alternately, a few times a second; NaN if not read in this cycle, or if the servo did not
     reply.
 
-    tick: the servo's own clock [s], which wraps at 32.768 s. voltage: supply [V]. temperature: [degrees C].
+    tick: the servo's own clock [s], which wraps at 32.768 s. voltage: supply voltage [V]. temperature: temperature
+    inside the servo [degrees C].
     """
 
     tick: tuple[float, ...]

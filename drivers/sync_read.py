@@ -19,7 +19,7 @@ Answer = tuple[int, ...] | None
 _crc = crc16.umts
 _ERROR_BITS = 0xFF & ~ALERT
 _FAST_ID = 9
-"""Index of the first servo's ID in a fast reply: behind header, broadcast ID, LEN, INST and its ERR."""
+"""Index of the first servo's ID in a fast reply: after the header, broadcast ID, LEN, INST and the servo's ERR."""
 _FORMATS = {(1, False): "B", (2, False): "H", (4, False): "I", (1, True): "b", (2, True): "h", (4, True): "i"}
 
 

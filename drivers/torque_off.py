@@ -80,7 +80,7 @@ class TorqueOff:
                 )
 
     def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:
-        """Each reason why servos are unconfirmed, with their joints; reasons that differ only in the name are one."""
+        """Each reason why servos are unconfirmed, with their joints; those that differ only in the name are merged."""
         yield from by_reason(self.unconfirmed).items()
 
     def _outcome(self) -> str:
@@ -147,7 +147,7 @@ def cut_torque(
 
 
 def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
-    """Send torque off to all servos in one packet; a failure shows when they are read back.
+    """Send torque off to all servos in one packet; a failure is noticed when they are read back.
 
     It is a Sync Write because other servos on the bus may be in use, and it is sent twice because a packet may be lost.
     """
@@ -166,9 +166,10 @@ def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseExcepti
 
 
 def cut_again(servo: Servo, *, armed: bool) -> bool:
-    """Cut the torque of a servo that did not answer before; return whether it was rebooted. Raises as `Servo.write`.
+    """Cut the torque of a servo that did not answer before; return whether it was rebooted.
 
     armed: whether its Bus Watchdog was armed before torque was switched on; if so, it is switched off.
+    Same errors as `Servo.write`.
     """
     if servo.read_despite_error("Torque Enable"):
         servo.write_despite_error("Torque Enable", 0)
@@ -211,7 +212,7 @@ def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) 
 
 
 def by_reason(failures: Iterable[tuple[Joint, str]]) -> dict[str, list[Joint]]:
-    """The joints for which each reason applies; reasons that differ only in the joint's name are one."""
+    """The joints for which each reason applies; reasons that differ only in the joint's name are merged."""
     joints: dict[str, list[Joint]] = {}
     own = {joint: why.replace(joint.title, "It").replace(str(joint), "it") for joint, why in failures}
     for joint, why in own.items():

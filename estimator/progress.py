@@ -1,4 +1,4 @@
-"""Progress of long computations, told to whoever wants to know."""
+"""Progress of long computations, reported to a callback."""
 
 from collections.abc import Callable
 

@@ -96,7 +96,7 @@ class PtyServer:
         self._late_max_s = 0.0
         if link is not None and (link.exists() or link.is_symlink()):
             self._close_wake()
-            raise LinkError(f"{link} exists already; remove it or choose another --link")
+            raise LinkError(f"{link} already exists; remove it or choose another --link")
         self._plug_in()
 
     def __enter__(self) -> "PtyServer":

@@ -57,7 +57,7 @@ class ArmModel:
     joints: tuple[JointFacts, ...]
 
     def __repr__(self) -> str:
-        """One line; the numbers are in `values` and `stds`."""
+        """Return a one-line summary; the numbers are in `values` and `stds`."""
         names = ", ".join(joint.name for joint in self.joints)
         return f"<{type(self).__name__} of {len(self.joints)} joints ({names}), {len(self.values)} parameters>"
 

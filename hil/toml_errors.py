@@ -199,7 +199,7 @@ def _meant(value: object, expected: str) -> str:
 
 
 def meant_name(given: str, names: Sequence[str]) -> str:
-    """The name that is meant: the same but for case, spaces and dashes, or the most similar one; "" if none is."""
+    """Return the intended name: the same except for case, spaces and dashes, or the most similar one; "" if none is."""
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
     near = difflib.get_close_matches(re.sub(r"[^a-z0-9]", "", given.lower()), list(plain), n=1, cutoff=0.75)
     return plain[near[0]] if near else ""
@@ -243,7 +243,7 @@ def _allowed_keys(location: Sequence[str | int], root: type[BaseModel]) -> str:
 
 
 def fields_of(model: Any) -> dict[str, Any]:
-    """The fields of a table, by the keys used in the file."""
+    """The fields of a table, keyed as in the file."""
     return {field.alias or name: field for name, field in model.model_fields.items()}
 
 

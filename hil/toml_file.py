@@ -40,7 +40,7 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
 
 
 def _encoding_of(path: Path, error: UnicodeDecodeError) -> str:
-    """What a file that is not UTF-8 text is, and how to save it as such."""
+    """Say what a file that is not UTF-8 text is, and how to save it as UTF-8."""
     data = path.read_bytes()
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and (b"=\0" in data or b"\0=" in data):
         return "UTF-16 text, as some Windows programs write it: save it with the encoding UTF-8"
@@ -115,8 +115,8 @@ def _other_brackets(header: re.Match[str], lines: list[str], begins: list[int]) 
 def _repeated(what: str, table: str, number: int, first: int | None) -> str:
     where = f" in {table}" if table else ""
     if first is None:
-        return f"{what} in line {number} is already given{where}, in another form. Delete one of them"
-    return f"{what} is given twice{where}, in lines {first} and {number}. Delete one of them"
+        return f"{what} on line {number} is already given{where}, in another form. Delete one of them"
+    return f"{what} is given twice{where}, on lines {first} and {number}. Delete one of them"
 
 
 def _is_within(given: tuple[str, str], name: str) -> bool:
@@ -139,7 +139,7 @@ def _beginnings(text: str) -> list[int]:
 _TOKEN = re.compile(
     r'"""(?:\\.|[^\\])*?"""|\'\'\'.*?\'\'\'|"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\'|#[^\n]*|[\[\]{}\n]', re.DOTALL
 )
-"""Strings, comments, brackets and line ends."""
+"""Strings, comments, brackets and line endings."""
 
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*(\]\]?)")
 _KEY = re.compile(r"^\s*([\w.\"'-]+)\s*=")

@@ -42,7 +42,7 @@ OTHER_UNITS: dict[str, tuple[tuple[_Unit, ...], ...]] = {
     "ticks": ((("thousandths", 1e-3),),),
     FRACTION: ((("percent", 1e-2), ("per mille", 1e-3)),),
 }
-"""Units that people use for a quantity, as multiples of its unit. Of each group only the first that makes sense is
+"""Units that people use for a quantity, as multiples of its unit. Only the first unit of each group that makes sense is
 proposed; the groups are different quantities (a torque in newton metres, or in kilogram-force centimetres).
 """
 

@@ -1,1 +1,1 @@
-"""Signs of other masters on the bus, and of other faults in what arrives: packets heard, and values read back."""
+"""Signs of other masters on the bus, and of other communication faults: packets heard, and values read back."""

@@ -1,4 +1,4 @@
-"""What is heard on the wire besides the replies that were asked for, or instead of them, and what to do about it."""
+"""Unexpected bytes on the wire, besides the requested replies or instead of them, and what to do about them."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -40,7 +40,7 @@ class Heard:
         """Number of packets received that this program neither sent nor asked for: another master is on the bus."""
 
     def expect(self, reads: Iterable[GroupRead]) -> None:
-        """Take the replies to these reads for replies to this program from now on."""
+        """From now on, treat replies to these reads as replies to this program."""
         self._expected = self._expected.union(*(read.expected for read in reads))
 
     def pending(self, received: bytes, now: float, *, echoes: bool) -> None:
@@ -100,7 +100,7 @@ class Heard:
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
 
     def _is_anothers(self, servo_id: int, length: int) -> bool:
-        """Whether an instruction whose end is missing is another master's, not a damaged reply of such a LEN."""
+        """Whether a truncated instruction is another master's, not a damaged reply with that LEN."""
         lengths = {size + _BESIDE_DATA for _, size in self._expected}
         return servo_id in (*self._ids, BROADCAST_ID) and length <= _LONGEST_CUT_OFF and length not in lengths
 
@@ -120,7 +120,7 @@ def _packets_within(received: bytes) -> list[Packet]:
 def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:
     """ID and LEN of each instruction that is cut off by the next packet.
 
-    A master that transmits does not receive: of another one's packet it hears what preceded its own.
+    A master does not receive while it transmits: it hears only the part of another one's packet that preceded its own.
     """
     at = received.find(HEADER)
     while (following := received.find(HEADER, at + len(HEADER))) >= 0:

@@ -12,13 +12,13 @@ from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRea
 __all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack"]
 
 _MODES_S = 0.025
-"""Mean time between two read-backs of the modes [s]; all others are of the goals.
+"""Mean time between two read-backs of the modes [s]; all others read the goals.
 
 It is random: a program that overwrites goals regularly must not always do so when the modes are read.
 """
 
 _GOALS_PER_MODE_IN_DOUBT = 4
-"""Least number of goal read-backs between two mode read-backs while a foreign value is suspected."""
+"""Minimum number of goal read-backs between two mode read-backs while a foreign value is suspected."""
 
 _RECENT = 4
 """Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
@@ -31,17 +31,17 @@ _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 
 Three of the same value are required for a goal that this program may have written in an earlier cycle, and for 0, which
 a servo itself may have set. By then, the status has detected lost writes, a tripped watchdog or a reboot; and writes
-that are lost now and then leave a different goal each time.
+that are lost occasionally leave a different goal each time.
 """
 
 _UNSURE_S = 0.01
-"""Least time between the first and the last of these three [s], in which the status is read."""
+"""Minimum time between the first and the last of these three [s], in which the status is read."""
 
 TRY_AGAIN_S = 0.005
 """Delay after which a read-back for which a cycle left no time is tried again [s]."""
 
 LOST_GOALS, LOST_OF = 3, 6
-"""A servo that misses this many of so many goals does not accept them, although the next one may arrive.
+"""A servo that misses `LOST_GOALS` of `LOST_OF` goals does not accept them, although the next one may arrive.
 
 The status, in which two consecutive goals must be missed, may not show for 0.1 s that every second goal is lost. If a
 hundredth is lost, three of six are rarer than two consecutive ones.
@@ -66,7 +66,7 @@ class Overruled(NamedTuple):
 
 
 class ReadBack:
-    """Reads back the goals that the servos hold right before a cycle, and now and then their operating modes instead.
+    """Reads back the goals that the servos hold right before a cycle, and occasionally their operating modes instead.
 
     Every cycle overwrites the goals of another master, so one that writes less often than this program is seen only if
     the goals are read before every cycle.
@@ -95,12 +95,12 @@ class ReadBack:
         self._goals_sighted: list[_Sightings] = [deque() for _ in ids]
         self._modes_sighted: list[_Sightings] = [deque() for _ in ids]
         self.is_unexpected = False
-        """Whether the latest read-back found anything else than the latest goals or the modes that were set."""
+        """Whether the latest read-back found anything other than the latest goals or the modes that were set."""
         self.lost: Overruled | None = None
         """A servo that has missed `LOST_GOALS` of `LOST_OF` goals, and the older goal that it holds."""
         self._looks = 0  # read-backs of goals so far
         self._missed: list[deque[int]] = [deque(maxlen=LOST_GOALS) for _ in ids]
-        """Numbers of the latest ones that found an older goal of this program, by servo."""
+        """Numbers of the latest read-backs that found an older goal of this program, by servo."""
         self.doubts_until = -math.inf
         self.sighted: Overruled | None = None
         """The latest value read back that this program did not write; it is recent until `doubts_until`."""
@@ -171,7 +171,7 @@ class ReadBack:
         ]
 
     def _count_missed(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> None:
-        """Count the goals that did not arrive: the servo holds one of this program's before."""
+        """Count the goals that did not arrive: the servo still holds an earlier goal of this program."""
         before = list(islice(reversed(sent), 1, _RECENT))
         for place, (answer, missed) in enumerate(zip(servos, self._missed, strict=True)):
             if answer is None or answer[-1] == sent[-1][place] or all(answer[-1] != each[place] for each in before):

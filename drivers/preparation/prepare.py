@@ -141,7 +141,7 @@ def fault_text(joint: Joint, cause: str, *, shuts_down: bool = True) -> str:
             f"{joint.title} raised its alert, but reports no hardware error now. Check its supply and its plug, then "
             "power-cycle it."
         )
-    raised = f"{joint.title} raised its alert, hardware error: {cause}."
+    raised = f"{joint.title} raised its alert; hardware error: {cause}."
     if not shuts_down:
         return f"{raised} Its Shutdown setting lets it keep its torque. Find the cause, then power-cycle it."
     return f"{raised} It stays without torque until it is rebooted: find the cause, then power-cycle it."

@@ -42,7 +42,7 @@ WATCHDOG_TRIPPED = 0xFF
 
 
 def read_settings(servo: Servo) -> dict[str, int]:
-    """Return the registers that an experiment may change, by name [ticks]; raises as `Servo.read`.
+    """Return the registers that an experiment may change, by name [ticks]; same errors as `Servo.read`.
 
     All are read twice, the second time in reverse order. A reply does not identify its register: one that belongs to an
     earlier request would be stored, and later restored, as the value of another register.
@@ -65,7 +65,7 @@ def read_settings(servo: Servo) -> dict[str, int]:
 def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
     """The settings with goals cut to the servo's present limits, which another program may have lowered since.
 
-    Raises as `Servo.read`.
+    Same errors as `Servo.read`.
     """
     cut = dict(settings)
     for goal, limit in _BOUNDS.items():
@@ -104,7 +104,7 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
 
 
 def arms_itself(servo: Servo) -> bool:
-    """Return whether torque comes on by itself when this servo is powered up or rebooted; raises as `Servo.read`."""
+    """Return whether this servo switches torque on by itself at power-up or reboot; same errors as `Servo.read`."""
     with suppress(DriverError):
         return bool(servo.read_entry(STARTUP_CONFIGURATION) & TORQUE_ON_AT_STARTUP)
     return False  # older firmware has no such register

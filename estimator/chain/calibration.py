@@ -75,8 +75,8 @@ def calibrate_chain(
 ) -> ChainCalibration:
     """Estimate the torque constants of all joints from two settled periods.
 
-    model: with `added_mass` and, for several joints, `torque_scale`. prior: without knowledge of the torque constants.
-    Raises ModelError, ConvergenceError.
+    model: a model with `added_mass` and, for several joints, `torque_scale`. prior: a prior without knowledge of the
+    torque constants. Raises ModelError, ConvergenceError.
     """
     if not model.added_mass or model.torque_scale == (model.joints == 1):
         raise ModelError("a calibration needs a model with added_mass and, for several joints, torque_scale")

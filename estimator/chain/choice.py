@@ -62,7 +62,7 @@ def choose_chain(
 ) -> ChainChoice:
     """Estimate under `model`, and under richer ones if its residual is more than noise; choose the best supported.
 
-    Raises what `identify_chain` raises for `model` itself.
+    Raises whatever `identify_chain` raises for `model` itself.
     """
     started = time.perf_counter()
     best = identify_chain(periods, model, prior, test_zeros=True)

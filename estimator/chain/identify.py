@@ -31,7 +31,7 @@ model error rather than noise.
 
 It is 0.6 to 0.9 for encoder rounding and noise. Torque ripple of 0.2 %, or load-dependent friction of 0.3 % of the
 torque, raises it to 2 or 3, while the residual still exceeds the noise by less than a tenth; friction of one joint that
-depends on its load, behind a noisy encoder, to 1.5 or more.
+depends on its load, with a noisy encoder, to 1.5 or more.
 """
 
 SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005

@@ -13,9 +13,8 @@ Widrow and I. Kollar, Quantization Noise, 2008). The drift is the slow part of t
 changing friction. Solving for s gives the error variance of one reading, s^2 + 1/12. It is an upper bound, since other
 differences between the passes increase it.
 
-That is the noise if it is white before rounding. Noise that a servo has filtered is stronger at low frequencies; what
-it has there in excess of the fast part is measured by the same difference, except where drift may be
-(`coloured_noise`).
+That is the noise if it is white before rounding. Noise that a servo has filtered is stronger at low frequencies; its
+excess there over the fast part is measured by the same difference, except where drift may be (`coloured_noise`).
 """
 
 from collections.abc import Sequence
@@ -139,8 +138,8 @@ def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:
     Each is the median of a few lines and so has an error of its own; the smaller of two would be too small.
 
     Args:
-        white: from the fastest lines of a period of `samples` samples (joints,) [rad].
-        repeated: from the difference of two halves of such periods (joints,) [rad], if known.
+        white: bound from the fastest lines of a period of `samples` samples (joints,) [rad].
+        repeated: bound from the difference of two halves of such periods (joints,) [rad], if known.
         samples: number of samples of the period.
     """
     if repeated is None:

@@ -71,7 +71,7 @@ class SettledPeriod:
     """Standard deviation of one sample's error (joints,) [rad]: the measured white noise, at least that of rounding,
     and coloured noise.
 
-    The fastest lines of a motion sampled slowly are no noise: what repeats from period to period does not count.
+    The fastest lines of a motion sampled slowly are not noise: what repeats from period to period does not count.
     """
 
     def __post_init__(self) -> None:
@@ -114,9 +114,9 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
 
     A reading is an outlier if its distance from the median of itself and two neighbours on either side, and that from
     a cubic through its neighbours, exceed SPIKE encoder steps and SPIKE times the typical distance from the median. The
-    median alone would take every fast reversal at a low rate for an outlier, as most readings are the median of a joint
-    that moves on. If the fraction of such readings exceeds MOST_SPIKES, they are not outliers: the joint moves fast
-    compared with the sample rate.
+    median alone would take every fast reversal at a low rate for an outlier, since most readings of a steadily moving
+    joint are the median themselves. If the fraction of such readings exceeds MOST_SPIKES, they are not outliers: the
+    joint moves fast compared with the sample rate.
     """
     from scipy.ndimage import median_filter
 

@@ -71,7 +71,8 @@ def minimise(
         ftol: stop when the actual or predicted relative decrease of a step is below this.
         damping: initial damping; by default `options.initial_damping`.
         at: the sum of squares at `start`, if known.
-        cost: returns the sum of squares alone, the same as `evaluate` but for rounding; by default `evaluate` is used.
+        cost: returns the sum of squares alone, the same as `evaluate` except for rounding; by default `evaluate` is
+        used.
         move: applies a step to coordinates.
         limits: returns the minimum and maximum change of each coordinate in a step; by default +-`options.max_step`.
         options: limits of the iteration.
@@ -87,7 +88,7 @@ def minimise(
     if not np.isfinite(here.cost):
         raise ConvergenceError(
             "the simulation diverges at the initial guess: too little motion was recorded, or torque or time "
-            "have other units"
+            "is in another unit"
         )
     damping = options.initial_damping if damping is None else damping
     evaluations = int(at is None)

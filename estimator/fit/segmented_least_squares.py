@@ -184,7 +184,7 @@ def minimise_segmented(
         if not np.isfinite(cost):
             raise ConvergenceError(
                 "the simulation diverges at the initial guess: too little motion was recorded, or torque or time "
-                "have other units"
+                "is in another unit"
             )
         damping = options.initial_damping
         for iteration in range(1, options.max_iterations + 1):

@@ -23,9 +23,9 @@ MOVED = 1.0  # standard errors by which the bound must shift another parameter f
 def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, Array]:
     """Return the undamped step of the parameters (parameters,) [SI], ignoring their range, and its standard errors.
 
-    The standard errors are those of independent errors with variance 1. normal, gradient: of the sum of squares in
-    coordinates (coordinates, coordinates) and (coordinates,). slopes: derivatives of the parameters, which are first
-    among them, with respect to their coordinates (parameters, parameters).
+    The standard errors are those of independent errors with variance 1. normal, gradient: normal matrix and gradient of
+    the sum of squares in coordinates (coordinates, coordinates) and (coordinates,). slopes: derivatives of the
+    parameters, which are first among them, with respect to their coordinates (parameters, parameters).
     """
     # Each coordinate by its own scale: that of a parameter that has run to zero is many orders of magnitude smaller.
     scale = np.sqrt(np.diag(normal))

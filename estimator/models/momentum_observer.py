@@ -78,7 +78,8 @@ _PENDING = _COVARIANCE + _COUNT
 _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
 # Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration; mean square velocity.
 _TAUGHT, _TEACHES, _SQUARED = 0, 2, 4
-# The constants: joints, interval, floors; from 4 drifts; then two least noises, the highest floors and their friction.
+# The constants: joints, interval, floors; from 4 drifts; then two minimum noises, the highest floors and their
+# friction.
 _HIGHEST = 4 + _COUNT + 2
 
 
@@ -89,7 +90,7 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: the same scale of torque is at least this multiple of dry friction, as far as it is known: near
+    frictions: multiple of dry friction, as far as it is known, that serves as a lower bound on this torque scale: near
     standstill, friction behaves differently from the model.
     """
 
@@ -215,7 +216,7 @@ def _learn(m: Any, gain: Any, lacking: float, spread: float) -> None:
 
 
 def _keep_dissipative(m: Any) -> None:
-    """Return friction that has become negative to zero, and the other parameters with it as the covariance demands."""
+    """Reset friction that has become negative to zero, and adjust the other parameters according to the covariance."""
     for i in range(6, 10):
         if m[_THETA, i] < 0.0 and m[_COVARIANCE + i, i] > 0.0:
             share = m[_THETA, i] / m[_COVARIANCE + i, i]

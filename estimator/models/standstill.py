@@ -7,7 +7,7 @@ offset cancel in their difference, and so do their errors. Only what other joint
 
 A torque outside the band accelerates a free joint. The joint is blocked once it would have gained a momentum that shows
 in the velocity register, wherever the band lies: half of the excess may be on its other side. A joint that does move
-again was held by friction: what it withstood until then is never an alarm again.
+again was held by friction: a torque that it withstood until then never raises an alarm again.
 
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """
@@ -113,9 +113,9 @@ def blocked(
     """Return whether something other than friction holds the joint.
 
     distance: result of `look` [N m]. held: torque that certainly acts on the joint now, to one side. friction: what dry
-    friction may hold to one side [N m]. tolerance: of the distance [N m]. momentum: that of the joint at the smallest
-    visible velocity [N m s]. filter_s: time constant of the equation's filter [s]. dt: time since the previous sample
-    [s].
+    friction may hold to one side [N m]. tolerance: tolerance of the distance [N m]. momentum: momentum of the joint at
+    the smallest visible velocity [N m s]. filter_s: time constant of the equation's filter [s]. dt: time since the
+    previous sample [s].
     """
     width = abs(distance)
     rest[_RANGE] = max(rest[_RANGE], max(width, 2.0 * held) - momentum / filter_s)

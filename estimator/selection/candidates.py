@@ -5,7 +5,7 @@ One simulation with the derivatives with respect to all of them yields the decre
 added (C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the fitted
 parameters. Terms that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the standard
 errors even if the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3
-(1966) 293), with their typical size as the prior and the information from the motion in addition.
+(1966) 293), with their typical size as the prior, to which the information from the motion is added.
 """
 
 from collections.abc import Mapping, Sequence

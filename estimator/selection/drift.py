@@ -111,7 +111,7 @@ class TorqueChange:
     std: Array
     """Standard error of the torque (joints,) [N m]."""
     left: float
-    """As in `Drift`."""
+    """Sum of squares of what the torque does not explain, in units of the noise."""
     noticed: Array
     """Torque of each joint above which it matters (joints,) [N m]."""
 

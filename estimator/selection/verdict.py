@@ -64,7 +64,7 @@ class Evidence:
     motion itself.
     """
     held_out_as_fitted: Array | None = None
-    """As `held_out`, but with friction as it was in the fitted motion (joints,); None where it has not changed.
+    """Like `held_out`, but with friction as it was in the fitted motion (joints,); None where it has not changed.
     """
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""
@@ -274,8 +274,8 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
     if as_fitted is None or _percent(as_fitted) == worst:
         return (f"{said}.",)
     return (
-        f"{said} with friction as it was by then, one factor per joint taken from that motion itself; with friction as "
-        f"it was in the fitted motion, to within {_percent(as_fitted)}.",
+        f"{said} with friction as it was at that time, one factor per joint taken from that motion itself; with "
+        f"friction as it was in the fitted motion, to within {_percent(as_fitted)}.",
     )
 
 

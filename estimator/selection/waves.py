@@ -28,10 +28,10 @@ def wave_peaks(
 ) -> dict[str, tuple[float, ...]]:
     """Return the numbers of `cycles` per turn at which a wave explains more than at neighbouring ones, best first.
 
-    What the fitted parameters explain is removed first. The result is by parameter name. If the estimate's model
-    includes a wave that is sought, that wave is disabled first. While other terms have absorbed part of a wave, the
-    best number may be wrong: those that explain at least the fraction `COMPARABLE` of what it explains are returned as
-    well.
+    The part that the fitted parameters explain is removed first. The result is by parameter name. If the estimate's
+    model includes a wave that is sought, that wave is disabled first. While other terms have absorbed part of a wave,
+    the best number may be wrong: those that explain at least the fraction `COMPARABLE` of what it explains are returned
+    as well.
 
     only: joints, from 1, that are considered; by default all.
     """

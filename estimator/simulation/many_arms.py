@@ -54,7 +54,7 @@ class ManyArms:
 
     scale: ratio of true to assumed torque of each command (arms, joints).
     pose: initial pose of each arm, at rest (arms, joints) [rad].
-    feedback: in terms of assumed torques.
+    feedback: feedback in terms of assumed torques.
     """
 
     physics: Sequence[Physics]

@@ -1,6 +1,6 @@
 """Precomputed group reads of the control cycle.
 
-These are of Present Current, Velocity and Position of several servos, and of registers outside the present ones, such
+These read Present Current, Velocity and Position of several servos, or registers other than the present ones, such
 as goals. They return the same bytes as the general path in `hil.fakes.bus.instructions`, in half the time; a fake bus
 spends most of its time here.
 """
@@ -49,7 +49,7 @@ class _Request(NamedTuple):
     address: int
     length: int
     is_of_state: bool
-    """Whether it is of the state, rather than of registers that only a write can change."""
+    """Whether it reads the state, rather than registers that only a write can change."""
 
 
 class GroupReads:

@@ -111,7 +111,8 @@ def dry_run(
         result: run folder or result.json of an earlier identification, used instead of [arm.prior].
         arms: number of arms to simulate.
         servos: also read the servos' limits and measure bus timing, with torque off.
-        executor: of concurrent.futures, or `hil.study.engine.executor`; it simulates the arms. The result is the same
+        executor: a concurrent.futures executor, or `hil.study.engine.executor`, that simulates the arms. The result is
+        the same
             with and without it.
         on_progress: called with a `Progress` when the simulation begins.
 

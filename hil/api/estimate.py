@@ -42,8 +42,8 @@ def estimate(
             column names must be clear enough.
         out: for recordings of other tools, the folder of the result, which must be new or empty; runs/TIME-NAME unless
             given.
-        all_samples: of a run, use every sample by multiple shooting; no settled period is needed.
-        executor: of concurrent.futures, or `hil.study.engine.executor`; with `friction = "auto"` it starts fits
+        all_samples: use every sample of a run, by multiple shooting; no settled period is needed.
+        executor: a concurrent.futures executor, or `hil.study.engine.executor`; with `friction = "auto"` it starts fits
             before they are known to be needed: less waiting, more work in total. The result is the same either way.
         on_progress: called with a `Progress` when a new stage begins.
 

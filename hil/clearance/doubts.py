@@ -34,7 +34,7 @@ def doubts(config: Config) -> Iterator[str]:
 
 
 def _same_direction(config: Config, joint: JointConfig) -> str:
-    """Say that two servos of a joint are described as turning the same way, which is rarely so; "" otherwise."""
+    """Say that two servos of a joint are described as turning the same way, which is rarely true; "" otherwise."""
     if len(joint.ids) == 1 or len(set(joint.directions)) > 1:
         return ""
     (first, second), sign = joint.ids, joint.direction
@@ -67,5 +67,6 @@ def _weak(joint: JointConfig) -> str:
     return (
         f"{joint.goal_limit_name} of joint {joint.name!r} = {joint.goal_limit:g} {unit} allows at most {torque:.2g} "
         f"N m, no more than the typical dry friction of its servos, {friction:.2g} N m: it probably would not move. "
-        f"About {2.0 * friction / joint.torque_per_goal:.2g} {unit} move it without a load, more lift one."
+        f"It takes about {2.0 * friction / joint.torque_per_goal:.2g} {unit} to move it without a load, and more to "
+        "lift one."
     )

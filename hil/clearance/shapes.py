@@ -34,7 +34,8 @@ _NOTHING = 1e-6
 class Capsule:
     """A capsule fixed to a link.
 
-    link: 0 for the fixed base, then 1 to the number of joints. ends: (2, 3) [m] in that link's frame. radius: [m].
+    link: 0 for the fixed base, then 1 to the number of joints. ends: end points (2, 3) [m] in that link's frame.
+    radius: radius [m].
     """
 
     link: int
@@ -87,15 +88,15 @@ def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule
     why = "; ".join(unread) if unread else "it has no collision or visual geometry"
     if not instead:
         left = "Only its other shapes are checked" if has_others else "It has no shape"
-        return f'link "{name}": {why}. {left}: how close the arm comes to it is not known.'
+        return f'link "{name}": {why}. {left}: the clearance to it is unknown.'
     (capsule,) = instead
     length = float(np.linalg.norm(capsule.ends[1]))
     along = f"capsule {1e3 * length:.0f} mm long from its joint to {'its end' if is_last else 'the next one'}"
     end = ", and the end is estimated from the centre of mass" if is_last else ""
     return (
         f'link "{name}": {why}. It is replaced by a {along if length > _NOTHING else "sphere at its joint"}'
-        f"{', beside its other shapes' if has_others else ''}. The radius of {1e3 * capsule.radius:.0f} mm is a guess"
-        f"{end}: its clearance is not certain."
+        f"{', in addition to its other shapes' if has_others else ''}. The radius of {1e3 * capsule.radius:.0f} mm is "
+        f"a guess{end}: its clearance is uncertain."
     )
 
 
@@ -103,8 +104,8 @@ def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule
 class Solid:
     """A primitive of a file's collision geometry, in the frame of its moving link.
 
-    link: 0 for the fixed base. kind: "box", "cylinder", "capsule", "sphere" or "mesh". size: as MuJoCo counts it: half
-    edges, or radius and half length [m]; empty for a mesh. rotation: (3, 3); translation: (3,) [m].
+    link: 0 for the fixed base. kind: "box", "cylinder", "capsule", "sphere" or "mesh". size: as in MuJoCo: half edge
+    lengths, or radius and half length [m]; empty for a mesh. rotation (3, 3), translation (3,) [m]: its pose.
     """
 
     link: int
@@ -178,7 +179,7 @@ def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Ca
                 unread.append(f'its mesh "{shape.get("filename", "")}" is not used: {error}')
                 continue
             if around is None:
-                unread.append(f"its <{shape.tag}> is not used: no such shape is known")
+                unread.append(f"its <{shape.tag}> is not used: unknown shape")
             for ends, radius in around or []:
                 found.append(Capsule(link, (ends @ turn.T + shift) @ rotation.T + translation, radius))
     return found, unread

@@ -158,7 +158,7 @@ class Space:
 
     @property
     def chain(self) -> tuple[Array, Array, Array]:
-        """Each joint's rotation (joints, 3, 3), translation [m] and axis (joints, 3) in the frame before it."""
+        """Each joint's rotation (joints, 3, 3), translation [m] and axis (joints, 3) in the previous frame."""
         return self._chain
 
     @property

@@ -18,7 +18,7 @@ def exit_code(error: Exception) -> int | None:
 
 
 def message(error: Exception) -> str:
-    """Message, that of the error that was being handled when it occurred, and its notes.
+    """Return the error's message, that of the error that was being handled when it occurred, and its notes.
 
     The notes end with the next command, if they name one.
     """
@@ -32,7 +32,7 @@ def message(error: Exception) -> str:
 def stop_behind(error: BaseException) -> Exception | None:
     """The stop request during whose handling `error` occurred because the terminal was closed; None if there is none.
 
-    A closed terminal sends SIGHUP, and then refuses what is printed about it.
+    A closed terminal sends SIGHUP, and then rejects any output.
     """
     from hil.errors import StopRequested
 

@@ -126,7 +126,7 @@ def _print_difference(difference: "Difference") -> None:
     for line in (*difference.doubts, *_would_show(difference.detectable)):
         say(console, line)
     if any(": " in change.name for change in difference.changes):
-        say(console, 'A row "friction_i: TERM" assumes that, of the friction of joint i, only this term has changed.')
+        say(console, 'A row "friction_i: TERM" assumes that only this term of the friction of joint i has changed.')
     # Such a row already names the term that changed.
     whole = {change.name.partition(": ")[2] for change in difference.changed if ": " in change.name}
     found = ", ".join(change.name for change in difference.changed if change.name not in whole)

@@ -41,25 +41,25 @@ def described_arm(config: "Config") -> ArmDescription:
 
 
 def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
-    """Warn of described inertias that no mass distribution can have, one sentence each."""
+    """Yield one sentence per described inertia that no mass distribution can have."""
     return tuple(f"{arm.path.name}: {doubt}." for doubt in arm.doubts)
 
 
 def doubted_limits(config: "Config") -> Iterator[str]:
     """Yield one sentence per joint whose limits in the file make no sense or do not contain the paths.
 
-    At either end, position_limit may exceed them by what a path leaves free: it stops an arm, and some arms rest on a
-    stop.
+    At either end, position_limit may exceed them by the margin that a path leaves free: it only stops the arm, and some
+    arms rest on a stop.
     """
     arm = described_arm(config)
     wanted = config.joint_path
     for index, (joint, described) in enumerate(zip(config.joints, arm.joints, strict=True)):
-        if described.limits is None or described.limits == (0.0, 0.0):  # the latter are not limits, but missing ones
+        if described.limits is None or described.limits == (0.0, 0.0):  # the latter means that limits are missing
             continue
         lower, upper = described.limits
         where = f'{arm.path.name}: joint "{joint.name}": its limits are [{lower:g}, {upper:g}] rad'
         if lower >= upper:
-            wrong = ": they are equal" if lower == upper else ", the lower one first: they are the wrong way round"
+            wrong = ": they are equal" if lower == upper else ": the lower limit must come first"
             yield f"{where}{wrong}. They are ignored; correct them."
             continue
         if max(-lower, upper) > _MOST_TURNED_RAD:
@@ -77,7 +77,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
             shown = f"position_limit = [{joint.position_limit[0]:g}, {joint.position_limit[1]:g}]"
             yield (
                 f"{where}, but {key} lets it move from {low:.3g} to {high:.3g} rad ({shown}): it may run into its "
-                "stops. Narrow the one, or correct the other."
+                f"stops. Narrow {key}, or correct the limits."
             )
 
 
@@ -97,7 +97,7 @@ def _mounted(gravity: NDArray[np.float64]) -> str:
     """Say which settings give this gravity in the frame of the base (3,) [m/s^2]."""
     strength = float(np.linalg.norm(gravity))
     if strength <= _SAME_GRAVITY:
-        return "Correct the file, where the arm is weightless."
+        return "In the file, the arm is weightless: correct it."
     x, y, z = (-gravity / strength + 0.0).tolist()
     base = [round(angle, 4) for angle in (math.atan2(y, z), -math.asin(max(-1.0, min(1.0, x))), 0.0)]
     return f"If the arm is mounted as the file says, set base = {base} and gravity = {strength:.4g} under [arm]."
@@ -147,7 +147,7 @@ def chain_slips(config: "Config") -> Iterator[str]:
         yield from _planar_slips(config)
         return
     if config.arm.link_lengths is not None:
-        yield "arm.link_lengths: a spatial arm has its lengths from arm.urdf; remove one of the two"
+        yield "arm.link_lengths: a spatial arm takes its lengths from arm.urdf; remove one of the two"
     fake = None if config.fake is None or config.fake.chain is None else Path(config.fake.chain.urdf)
     if fake is not None and fake.name == Path(config.arm.urdf).name and fake != Path(config.arm.urdf):
         yield (
@@ -189,7 +189,7 @@ def _planar_slips(config: "Config") -> Iterator[str]:
     if config.arm.urdf is None and config.joint_path is not None:
         yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
     if config.model.base_tilt:
-        yield "model.base_tilt: the tilt of a planar arm is the zero error of its first joint: use model.zeros"
+        yield "model.base_tilt: the tilt of a planar arm equals a zero error of its first joint: use model.zeros"
 
 
 def _path_slips(config: "Config") -> Iterator[str]:

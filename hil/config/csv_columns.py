@@ -128,7 +128,7 @@ class Columns(_Table):
                     "and resistance"
                 )
             if self.pwm is not None and self.supply_voltage is None:
-                raise ValueError("columns.supply_voltage is missing: pwm is a share of it, V")
+                raise ValueError("columns.supply_voltage [V] is missing: pwm is a share of it")
         if self.position_unit == TICKS and self.ticks_per_turn is None:
             raise ValueError("columns.ticks_per_turn is missing: positions are in ticks (4096 for X-series servos)")
         self._one_each()

@@ -88,7 +88,9 @@ class ArmJoint:
     fixed: tuple[str, ...]
     """Names of the links attached to this joint's link by fixed or held joints."""
     movable: Mapping[str, Body] = field(default_factory=dict)
-    """Those of them that held joints move, each without what is attached to it, in the frame of this joint's link."""
+    """Those of these links that held joints move, each without its own attached links, in the frame of this joint's
+    link.
+    """
 
 
 @dataclass(frozen=True)

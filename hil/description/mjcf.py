@@ -62,8 +62,8 @@ def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
 class Geom:
     """A shape of an MJCF file, in the frame of its moving link.
 
-    link: 0 for whatever is fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh". size: as MuJoCo
-    counts it, half edges or radius and half length [m]; of a mesh and any other shape, those of its bounding box.
+    link: 0 for whatever is fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh". size: as in
+    MuJoCo, half edge lengths, or radius and half length [m]; of a mesh and any other shape, those of its bounding box.
     """
 
     link: int
@@ -131,7 +131,7 @@ class _Tree:
         return None if (x, y, z) == USUAL_GRAVITY else (x, y, z)
 
     def not_modelled(self, names: list[str], bodies: list[int]) -> Iterator[str]:
-        """Yield one sentence per kind of force in the file that an arm of rigid links and friction does not have."""
+        """Yield one sentence per kind of force in the file that rigid links with friction do not include."""
         model = self.model
         sprung = [name for name in names if np.any(model.jnt_stiffness[model.joint(name).id])]
         if sprung:
@@ -144,7 +144,7 @@ class _Tree:
         if floating:
             yield (
                 f"{_listed('body', floating)} gravcomp, which is not used: gravity acts on every link of a real arm, "
-                "and the torque that carries it is identified"
+                "and the torque that supports it is identified"
             )
         if any(np.any(model.tendon_stiffness[each]) for each in range(model.ntendon)):
             yield "a tendon has a stiffness, but tendons and springs are not modelled: their forces are ignored"
@@ -152,7 +152,7 @@ class _Tree:
     def branch(self, names: list[str]) -> list[int]:
         """The bodies that these joints move. Raises ArmFileError unless they lie on one branch, in this order."""
         if not names:
-            raise ArmFileError(f"{self.path} has no hinge, so there is no arm")
+            raise ArmFileError(f"{self.path} has no hinge joint, so it does not describe an arm")
         moved = [self._moved(name) for name in names]
         self._check_equalities(names)
         way = self._way(moved[-1])

@@ -24,7 +24,7 @@ def axis_of(arm: ArmDescription, angles: Array, joint: int) -> tuple[Array, Arra
 
 
 def moves(arm: ArmDescription, angles: Array, joint: int, up: Array | tuple[float, float, float] = UPRIGHT) -> str:
-    """In words: which way the positive angle of a joint moves the arm's end, or turns it.
+    """Describe in words which way a positive angle of a joint moves or turns the arm's end.
 
     up: the direction opposite to gravity in the base's frame (3,).
     """

@@ -12,7 +12,7 @@ def is_planar(arm: ArmDescription, gravity: Array) -> bool:
     """Whether the planar model applies to the arm: one or two joints with parallel axes.
 
     With gravity, the axes must also be horizontal, and at angle zero the first link must be horizontal and be lifted by
-    positive angles. `gravity`: in the base's frame (3,) [m/s^2].
+    positive angles. `gravity`: gravity in the base's frame (3,) [m/s^2].
     """
     if len(arm.joints) > PLANAR_JOINTS:
         return False

@@ -252,7 +252,7 @@ def _turns(joint: _Joint, tree: dict[str, _Joint]) -> bool:
 def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) -> list[_Joint]:
     """All joints from the base to the last of `names`, which must be on this branch in the given order."""
     if not names:
-        raise ArmFileError(f"{path}: no joint rotates, so there is no arm")
+        raise ArmFileError(f"{path}: no joint rotates, so it does not describe an arm")
     if len(set(names)) < len(names):
         raise ArmFileError(f"{path}: joints {', '.join(names)}: one is named twice")
     for name in names:

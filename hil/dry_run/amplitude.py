@@ -90,7 +90,7 @@ def largest_amplitude(
         plan: plan whose waves are scaled; by default low-crest multisines.
         pose: where the arm starts (joints,) [rad].
         cap: largest torque (joints,) [N m], in addition to the current limits.
-        executor: of concurrent.futures, for the simulations.
+        executor: a concurrent.futures executor for the simulations.
         options: tolerances and limits of the search.
 
     Raises:

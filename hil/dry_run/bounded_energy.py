@@ -22,9 +22,9 @@ _MARGIN = 0.05
 
 @dataclass(frozen=True)
 class Boundary:
-    """The position limits of an arm and the least potential energy on them.
+    """The position limits of an arm and the lowest potential energy at them.
 
-    low, high: limits (joints,) [rad]. least: [J]; -inf if the arm's energy is not bounded by this model.
+    low, high: limits (joints,) [rad]. least: that energy [J]; -inf if the arm's energy is not bounded by this model.
     """
 
     physics: Physics

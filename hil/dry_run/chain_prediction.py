@@ -33,8 +33,9 @@ RAN_AWAY = 1e3
 class ChainPrediction:
     """Prediction of a spatial arm's experiment.
 
-    peaks: predicted peaks and their limits. nearest: least clearance of all arms, `moment` [s] into the segment `role`.
-    rooms: least clearance of each arm minus the required one (arms,) [m]. tracking: median of the arms' largest
+    peaks: predicted peaks and their limits. nearest: smallest clearance of all arms, `moment` [s] into the segment
+    `role`.
+    rooms: smallest clearance of each arm minus the required one (arms,) [m]. tracking: median of the arms' largest
     tracking errors (joints,) [rad]. ways: number of samples of the transition at either end of the first segment.
     """
 
@@ -161,7 +162,7 @@ def _shares(values: Array, limits: Array, rest: Array, centre: Array) -> Array:
 
 
 def _nearest(space: Space, position: Array, ways: int, rate: float) -> tuple[Nearest, float]:
-    """Least clearance of a motion, and its time [s]. ways: samples of the transition at either end."""
+    """Smallest clearance of a motion, and its time [s]. ways: samples of the transition at either end."""
     every = max(1, round(rate / LOOKED_AT_HZ))
     count = position.shape[1]
     parts = (slice(0, ways, every), slice(ways, count - ways, every), slice(count - ways, count, every))

@@ -49,7 +49,7 @@ class Fall:
 class LoweringForeseen:
     """Predicted lowering.
 
-    seconds: longest duration [s]. nearest: least clearance. lies: fraction of simulations that end in the rest pose.
+    seconds: longest duration [s]. nearest: smallest clearance. lies: fraction of simulations that end in the rest pose.
     joint: name of the joint that ends farthest from it, `away` [rad]. limit: name of the setting that limits its
     torque. slower: the change of settings that makes the lowering slower.
     """
@@ -82,7 +82,7 @@ class ChainStops:
         if down.lies < LAID_DOWN:
             return (
                 f"only {100 * down.lies:.0f} % of the simulated stops bring the arm to the rest pose, but at least "
-                f"{100 * LAID_DOWN:.0f} % must: {down.joint!r} ends up to {down.away:.2g} rad away. Raise its "
+                f"{100 * LAID_DOWN:.0f} % must: {down.joint!r} ends up to {down.away:.2g} rad away from it. Raise its "
                 f"{down.limit}, {down.slower}, choose a rest_pose in which gravity pulls it less or farther from its "
                 "limits, or give the masses more accurately"
             )

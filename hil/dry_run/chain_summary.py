@@ -22,10 +22,10 @@ from hil.printing import print_fitting, say
 class ChainDryRun:
     """A dry run of a spatial arm.
 
-    config: with the path and stabiliser that would be used. share: fraction of the designed path's amplitude; 1 if
-    [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of links with parts
-    that are closer than the margin in nearly every pose and are not checked. refused: why the pilot has no safe first
-    step; "" if it has one, None without a pilot, whose decision counts.
+    config: configuration with the path and stabiliser that would be used. share: fraction of the designed path's
+    amplitude; 1 if [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of
+    links with parts that are closer than the margin in nearly every pose and are not checked. refused: why the pilot
+    has no safe first step; "" if it has one, None without a pilot, whose decision counts.
     """
 
     config: Config
@@ -160,7 +160,7 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         "99 %: in 99 of 100 arms, all peaks stay within these values.",
         f"Least clearance: {run.foreseen}.",
         f"A stop lowers the arm in at most {lowering.seconds:.1f} s; {100 * lowering.lies:.0f} % of the simulated "
-        f"stops reach the rest pose (at least {100 * LAID_DOWN:.0f} % are required); least clearance on the way: "
+        f"stops reach the rest pose (at least {100 * LAID_DOWN:.0f} % are required); smallest clearance on the way: "
         f"{lowering.nearest}.",
         f"Without commands (cable unplugged, program killed, servo failed) the arm falls. Hardest fall, from "
         f"{fall.moment:.1f} s into the path: {hit} {when} {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, "

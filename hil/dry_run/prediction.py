@@ -43,11 +43,11 @@ class Prediction:
     """The prediction of a dry run.
 
     values: extreme values of every arm (arms, quantities, joints), in the order of QUANTITIES and in UNITS. shares: the
-    same as fractions of the distance from rest to the limit. limits: (quantities, joints). settled_after: number of
-    periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over time of a
-    few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: samples per second
-    [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at the farther one of rest
-    and centre.
+    same as fractions of the distance from rest to the limit. limits: limits (quantities, joints). settled_after: number
+    of periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over time
+    of a few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: samples per
+    second [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at the farther one
+    of rest and centre.
     """
 
     values: Array
@@ -142,7 +142,7 @@ def predict(
         pose: where the arm starts at rest (joints,) [rad]; by default the rest pose.
         briefly: simulate only one period of each multisine; used during a search.
         shown: number of arms whose motion is stored.
-        executor: simulates the arms, some at a time; the result is the same with and without it.
+        executor: executor that simulates the arms, some at a time; the result is the same with and without it.
     """
     commands = [commands_of(config, segment) for segment in plan.segments]
     start = np.array(config.arm.rest_pose) if pose is None else pose

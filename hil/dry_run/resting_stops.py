@@ -1,6 +1,6 @@
 """Joints of a spatial arm that lie on their own mechanical stop in the rest pose, which no configuration states.
 
-In the rest pose an arm lies without torque. What carries it is a surface (floor, cradle, another link) or the joints'
+In the rest pose an arm lies without torque. It is carried by a surface (floor, cradle, another link) or by the joints'
 own stops. A surface is left behind as the arm moves; a stop holds its joint wherever the others are.
 """
 

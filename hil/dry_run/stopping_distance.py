@@ -8,8 +8,8 @@ passed    the motion differs from the plan (a blocked, reversed or unpowered joi
           described), so the guard stops it at a limit: one joint at its position limit moves outwards at its velocity
           limit, the other is anywhere within its range
 
-The simulation knows what a dry run knows: rigid links, friction, current lag, and servos that behave as their manual
-says.
+The simulation includes what a dry run includes: rigid links, friction, current lag, and servos that behave as their
+manual says.
 """
 
 import math

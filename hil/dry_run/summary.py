@@ -20,9 +20,9 @@ from hil.printing import print_fitting, say
 class FirstRun:
     """The first run of a pilot.
 
-    peak_torque: (joints,) [N m]. prediction: peaks of the simulated arms, with the limits of that run. played: its
-    configuration, with a proposed stabiliser where the arm needs one, and with position limits close to the rest pose
-    where no torque is safe in the whole range.
+    peak_torque: peak torques (joints,) [N m]. prediction: peaks of the simulated arms, with the limits of that run.
+    played: its configuration, with a proposed stabiliser where the arm needs one, and with position limits close to the
+    rest pose where no torque is safe in the whole range.
     """
 
     peak_torque: NDArray[np.float64]

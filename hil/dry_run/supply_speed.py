@@ -1,6 +1,6 @@
 """The speed that the supply allows: near no-load speed, a motor cannot carry the commanded current in either direction.
 
-A run whose currents stay behind their goals determines nothing, so a dry run and the pilot keep joints below this
+A run whose currents fall short of their goals determines nothing, so a dry run and the pilot keep joints below this
 speed, whatever velocity_limit says. In PWM mode the back-EMF is part of the model, and no such limit is needed.
 """
 

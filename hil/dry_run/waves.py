@@ -81,7 +81,7 @@ def _reversed(wave: Multisine) -> Multisine:
 
 
 def designed_plan(config: Config, physics: Physics, names: list[str]) -> Plan:
-    """As `roomy_plan`, with the first multisine designed for small standard errors of the parameters `names`."""
+    """Like `roomy_plan`, but with the first multisine designed for small standard errors of the parameters `names`."""
     plan = roomy_plan(config, physics)
     first = plan.segments[0]
     problem = design_problem(config, physics, tuple(names))

@@ -27,14 +27,14 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
             "rougher than that of a finished run.",
             next_step("estimate", steps[-1]),
         ]
-    return [f"The recording until then is kept in {run.path}; no period had settled.", next_step(command, shown)]
+    return [f"The recording up to that point is kept in {run.path}; no period had settled.", next_step(command, shown)]
 
 
 def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
     """What is kept after the guard or a failed servo ended a run, and a next command that checks the arm first."""
     if can_be_estimated(run.path):
         return ["The recording is kept and complete enough for an estimate.", next_step("estimate", run.path)]
-    return [f"The recording until then is kept in {run.path}.", next_step("check", shown)]
+    return [f"The recording up to that point is kept in {run.path}.", next_step("check", shown)]
 
 
 def can_be_estimated(path: Path) -> bool:

@@ -70,8 +70,8 @@ class CalibrationResult:
 class AddedMass:
     """The mass as the user gives it: `distance` and `length` for a planar arm, `at` and `joint` for a spatial one.
 
-    mass [kg], inertia about its own centre [kg m^2]. distance: from the last joint; length: of link 1 [m]. at: position
-    in the frame of the link that `joint` moves, by default the last joint [m].
+    mass [kg], inertia about its own centre [kg m^2]. distance: distance from the last joint [m]; length: length of link
+    1 [m]. at: position in the frame of the link that `joint` moves, by default the last joint [m].
     """
 
     mass: float
@@ -185,8 +185,8 @@ def calibration_lines(result: CalibrationResult) -> list[str]:
     lines.append(f"Largest residual of both runs: {worst:.3f} encoder steps RMS; rounding alone gives 0.289.")
     if not result.fit.reached:
         lines.append(
-            "The fit stopped short of its minimum, where a joint sticks and breaks away; the standard errors include "
-            "the distance that remains. Record both runs again with faster motion before relying on these values."
+            "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
+            "the remaining distance. Record both runs again with faster motion before relying on these values."
         )
     lines.append("The standard errors cover noise only: add the relative errors of the mass and of its distance.")
     lines.append("Set torque_constant (torque_per_volt in pwm mode) of each joint to these values and estimate again.")

@@ -219,8 +219,8 @@ def _verdict(
     if still:
         trust = "no"
         sentences.append(
-            f"{', '.join(still)} hardly moved, so the recording says little about its inertia and friction: widen "
-            "joint_path.swing and speed there, and check that nothing blocks it."
+            f"{', '.join(still)} hardly moved, so the recording says little about its inertia and friction: increase "
+            "joint_path.swing and speed for it, and check that nothing blocks it."
         )
     if estimate.from_prior:
         trust = lowered(trust, "with care")
@@ -234,8 +234,8 @@ def _verdict(
     if not estimate.reached:
         trust = lowered(trust, "with care")
         sentences.append(
-            "The fit stopped short of its minimum, where a joint sticks and breaks away; the standard errors include "
-            "the distance that remains. Use faster motion ([joint_path]), so that fewer joints stick."
+            "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
+            "the remaining distance. Use faster motion ([joint_path]), so that fewer joints stick."
         )
     if estimate.at_bound:
         trust = lowered(trust, "with care")

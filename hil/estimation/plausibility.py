@@ -18,7 +18,7 @@ FLAT = 0.02  # of the largest commanded torque, below which gravity counts as ab
 def doubts(
     config: Config, estimate: Estimate, largest_torque: float, known: Sequence[Conflict] = ()
 ) -> tuple[str, ...]:
-    """One sentence per contradiction, except for those in `known`, which say so themselves.
+    """One sentence per contradiction, except for those in `known`, which have sentences of their own.
 
     largest_torque: largest commanded torque [N m].
     """

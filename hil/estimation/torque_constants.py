@@ -35,7 +35,8 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
         ""
         if not exact
         else f"For {', '.join(exact)}, no uncertainty of the torque constant is given (torque_constant_std, or "
-        "torque_per_volt_std in PWM mode): servos of the same model differ by about 10 %, and so does every value."
+        "torque_per_volt_std in PWM mode): servos of the same model differ by about 10 %, so every value may be off "
+        "by as much."
     )
     unsure = [
         f"{joint.name} {100 * joint.torque_per_goal_std / joint.torque_per_goal:.2g} %"

@@ -1,7 +1,7 @@
-"""The true parameters of a fake arm, and the same in the unit of torque that a result has.
+"""The true parameters of a fake arm, as built and scaled to the torque constants that a result assumes.
 
-Motion and current determine the parameters only up to the torque constants: a result is in the torque that the file's
-constants imply, which need not be those of the fake arm's motors.
+Motion and current determine the parameters only up to the torque constants: a result assumes the file's constants,
+which need not be those of the fake arm's motors.
 """
 
 import math
@@ -57,10 +57,10 @@ def back_emf(config: Config, fake: FakeArm, drives: Sequence[Drive]) -> dict[str
 
 @dataclass(frozen=True)
 class Truth:
-    """True values in the file's unit of torque. note: how they differ from the arm's own; "" if they do not.
+    """True values, scaled to the file's torque constants. note: how they differ from the arm's own; "" if they do not.
 
-    Left out are values that several joints' torques determine if the constants of these joints are wrong in different
-    ways: there is no unit that such a value is in.
+    Values that several joints' torques determine are left out if the constants of these joints are wrong by different
+    factors: no single factor converts such a value.
     """
 
     values: dict[str, float]
@@ -78,18 +78,18 @@ class Truth:
 
 
 def truth_of(result: Result, config: Config) -> Truth:
-    """The truth stored in a result, in the unit of torque that the result has."""
+    """The truth stored in a result, scaled to the torque constants that the result assumes."""
     return in_file_unit(result.truth or {}, config, result.extra, result.joints)
 
 
 def scaled(truth: Mapping[str, float] | None, config: Config, extra: Mapping[str, Quantity]) -> dict[str, float] | None:
-    """The entry `truth_scaled` of a result: its `truth` in the unit of its parameters, None if that is the same."""
+    """The entry `truth_scaled` of a result: its `truth` scaled like its parameters; None if that is the same."""
     found = in_file_unit(truth or {}, config, extra, len(config.joints))
     return found.values if found.note else None
 
 
 def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str], joints: int) -> Truth:
-    """True values in the unit of torque of a result with parameters of these names."""
+    """True values, scaled like a result with parameters of these names."""
     ratios, has_ratios = _torque_ratios(config), any(kind_of(each) == RATIO for each in names)
     if not truth or all(abs(ratio - 1.0) <= _EQUAL for ratio in ratios):
         return Truth(dict(truth), "")
@@ -101,13 +101,11 @@ def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str
         if abs(ratio - 1.0) > _EQUAL
     ]
     note = (
-        f"The torque constants of the fake arm's motors differ from the file's ({', '.join(named)}), and the result is "
-        "in the torque that the file's constants imply: the true values are shown in that unit"
+        f"The torque constants of the fake arm's motors differ from the file's ({', '.join(named)}), and the result "
+        "assumes the file's: the true values are scaled accordingly"
     )
     left = (
-        ""
-        if len(values) == len(truth)
-        else "; those that joints with different errors determine together are not shown"
+        "" if len(values) == len(truth) else "; those that depend on several joints with different errors are not shown"
     )
     return Truth(values, f"{note}{left}.")
 

@@ -18,15 +18,15 @@ servo are known:
 A reading that jumps back and forth, as with a stuck bit, cancels in those memories. Therefore each single interval is
 also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
 
-A velocity that stays exactly the same was that of the joint all the while, except for the last `LAG_S` at most. So the
-distance covered until then must equal the velocity times the time. A velocity that freezes near its peak is found by
-this sooner than by the memories, in which a lag could explain the difference.
+A velocity that stays exactly the same was the joint's true velocity throughout, except for the last `LAG_S` at most. So
+the distance covered up to then must equal the velocity times the time. This detects a velocity that freezes near its
+peak sooner than the memories do, in which a lag could explain the difference.
 
 Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to twice the
 values estimated by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
 
-It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state that it
-keeps for a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
+that it keeps for a joint is a record of the type `MEMORY`.
 """
 
 from collections.abc import Iterable
@@ -89,8 +89,8 @@ samples per period, the fastest that is used, needs 0.27.
 """
 
 CURVED_AT_FIRST = 0.3
-"""The same as a fraction of the motion, for the first interval: over the peak of such a wave the velocity does not
-change from sample to sample, and no earlier change shows how fast it may.
+"""That allowance as a fraction of the motion, for the first interval: over the peak of such a wave the velocity does
+not change from sample to sample, and no earlier change shows how fast it may.
 """
 
 
@@ -134,7 +134,7 @@ MEMORY = np.dtype(
 """State of the check of one joint.
 
 position, velocity: latest ones [rad, rad/s]; the position is NaN before the first one and after a long gap. seconds,
-moved, difference, unknown, most_curved: sums (of the last one, the maximum) since the long memory was last updated.
+moved, difference, unknown, most_curved: sums (for the last one, the maximum) since the long memory was last updated.
 learnt_for: duration of the motion that lag and scale error were estimated from [s]. lag_squared, scale_squared,
 crossed, lag_product, scale_product: elements of the normal equations for the two. lag, scale: largest accepted values
 [s, 1].
@@ -218,7 +218,7 @@ def moved_at_standstill(states: Iterable[State], joint: int, still: float) -> st
 def check_standstill(name: str, states: Iterable[State], joint: int, still: float) -> None:
     """Raise SafetyStop if a joint moved while its velocity was reported to be below `still` [rad/s].
 
-    name: of the joint. states: as in `moved_at_standstill`.
+    name: name of the joint. states: as in `moved_at_standstill`.
     """
     states = list(states)
     if moved := moved_at_standstill(states, joint, still):

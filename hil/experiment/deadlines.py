@@ -40,7 +40,7 @@ class Deadlines:
     def missed(self, seconds: float = 0.0, *, waited: bool = False) -> None:
         """Record a missed deadline, `seconds` after the last command.
 
-        waited: this program was waiting for a reply that was lost or damaged.
+        waited: whether this program was waiting for a reply that was lost or damaged.
         """
         self.any_missed = True
         self._counted += 1

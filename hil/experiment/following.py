@@ -14,8 +14,8 @@ per sample. The step is bounded so that no single reply decides, and the sum is 
 weighted by the time that it represents. The commanded current is any value between the last two goals,
 because a reply may be measured before or after the motor follows the latest goal.
 
-It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state that it
-keeps for a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
+that it keeps for a joint is a record of the type `MEMORY`.
 """
 
 from typing import Any
@@ -34,7 +34,7 @@ SIGMA_TICKS = 4.0
 """Lower bound of that standard deviation, in register ticks."""
 
 LOST_AFTER_S = 0.03
-"""Time for which a current must look like zero, at full weight, before it is taken for zero [s]."""
+"""Time for which a current must look like zero, at full weight, before it counts as zero [s]."""
 
 _FULL_WEIGHT = 2.0
 """Upper bound on the log likelihood ratio of one sample: that of a commanded current of two sigma if zero is measured.
@@ -51,9 +51,9 @@ MEMORY = np.dtype(
 )
 """Constants and state of the check of one joint.
 
-per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V], and share, relative to the goal; follow_time: how
-long a larger one may last [s]. evidence, count: sum of the log likelihood ratios times seconds, and its number of
-samples.
+per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V]; share: the same, relative to the goal; follow_time:
+how long a larger one may last [s].
+evidence, count: sum of the log likelihood ratios times seconds, and its number of samples.
 differs_for, differs: duration [s] and number of samples of a deviation.
 """
 

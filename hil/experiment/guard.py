@@ -45,7 +45,7 @@ _ERRORS_IN_A_ROW = 3
 """Consecutive replies with values and an error number at which a servo is stopped; it may not accept its goals."""
 
 NONE_HEARD = "No servo was heard"
-"""Beginning of the message of a stop because all replies are missing."""
+"""Beginning of the message of a stop due to missing replies from all servos."""
 
 
 class Guard:
@@ -191,7 +191,8 @@ class Guard:
                 Cause.ERRORS,
                 f"reports an error ({describe_status_error(error)}) with its values, {_ERRORS_IN_A_ROW} times in a "
                 "row, although nothing that it was sent should cause one: whether it accepts its goals is unknown. "
-                "Power-cycle it and check its firmware; a device between adapter and servo may also change replies.",
+                "Power-cycle it and check its firmware; a device between adapter and servo may also be changing "
+                "replies.",
             )
 
     def goals_are_lost(self, index: int, held: str) -> NoReturn:
@@ -335,15 +336,17 @@ class Guard:
             self._stop(
                 index,
                 Cause.GOALS_CHANGED,
-                f"{said}: by the published figures {self._supply[index]:.1f} V would drive it at that speed. Its goals "
-                "are changed on the way or by another program, its supply sags, or its current sensor is wrong: check "
-                f"these. If none is so, its motor is weaker than published: lower velocity_limit to {slower}.",
+                f"{said}: {self._supply[index]:.1f} V would drive it at that speed, according to the published "
+                "figures. Its goals are changed on the way or by another program, its supply sags, or its current "
+                "sensor is wrong: check these. If all are in order, its motor is weaker than published: lower "
+                f"velocity_limit to {slower}.",
             )
         seconds = self._joints[index]["found"]
         self._stop(
             index,
             Cause.NOT_FOLLOWING,
-            f"{said}, by the readings of the last {1e3 * seconds:.0f} ms. {self._why_not_followed(index, state)}",
+            f"{said}, according to the readings of the last {1e3 * seconds:.0f} ms. "
+            f"{self._why_not_followed(index, state)}",
         )
 
     def _why_not_followed(self, index: int, state: State) -> str:
@@ -357,7 +360,7 @@ class Guard:
         along = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
         allowed = self._joints[index]["following"]["allowed"]
         if along > abs(commanded) + allowed or along < -allowed:
-            return "It has torque, but another: another program commands it, or its current sensor is wrong."
+            return "Its torque is not the commanded one: another program commands it, or its current sensor is wrong."
         weak = "it cannot deliver this much at its speed and supply voltage (safety.follow_share)."
         if along > HARDLY_ANY * abs(commanded):
             return f"Its goals are changed on the way or by another program, its current sensor is wrong, or {weak}"
@@ -412,7 +415,7 @@ class Guard:
                 self._stop(
                     index,
                     Cause.TEMPERATURE,
-                    f"is at {celsius:.0f} degrees C, safety.max_temperature is {safety.max_temperature:g}. Let it "
+                    f"is at {celsius:.0f} degrees C; safety.max_temperature is {safety.max_temperature:g}. Let it "
                     "cool.",
                 )
             if volt < safety.min_voltage or volt > safety.max_voltage:

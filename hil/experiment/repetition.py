@@ -27,7 +27,7 @@ FLOOR_RAD = 0.05
 
 LASTING_S = 0.03
 UNJUDGED_S, _MOST_UNJUDGED = 0.2, 0.25
-"""Time at the end of a period that does not count for what is accepted in the next [s], and its largest share."""
+"""Time at the end of a period that does not affect the tolerance in the next one [s], and its largest share."""
 
 _FEWEST = 2  # samples, however low the rate
 
@@ -106,8 +106,8 @@ class Repetition:
 
     @property
     def difference(self) -> float:
-        """RMS difference between the second halves of the periods, relative to the RMS of the motion; the worst
-        joint's.
+        """RMS difference between the second halves of the periods, relative to the RMS of the motion, for the worst
+        joint.
         """
         return max(_relative(sums) for sums in self._sums)
 

@@ -241,7 +241,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if wire > 1 / rate:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms of wire time alone at "
-            f"{bus.port.baud} baud, {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud with `hil setup`."
+            f"{bus.port.baud} baud, {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud rate with `hil setup`."
         )
     slowest = bus.port.latency + wire
     if slowest <= 1 / rate:

@@ -129,7 +129,7 @@ class Stream:
         self._sent_at: float | None = None
         self._awake_at = float("-inf")
         self._is_undriven = True
-        """Whether nothing has driven the arm yet, as until a stabiliser has seen it."""
+        """Whether nothing has driven the arm yet; a stabiliser needs a first sample before it does."""
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
         self._repetition = Repetition(longest, len(bus.joints), self._interval)
@@ -242,7 +242,7 @@ class Stream:
         seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
         return (
             f"The change decreases slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), "
-            f"as while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
+            f"as happens while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:

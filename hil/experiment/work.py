@@ -1,10 +1,10 @@
 """Work of the motors: a motor that only takes energy out of the arm turns against its command.
 
-It is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot return more work than was
+Work is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot return more work than was
 put in, so a motor that continually takes work out of it turns the wrong way.
 
-It runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state that it
-keeps for a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
+that it keeps for a joint is a record of the type `MEMORY`.
 """
 
 from typing import Any

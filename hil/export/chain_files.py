@@ -49,8 +49,8 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
             comment(link, f"without {', '.join(apart)}, which held joints move: described, not identified")
         if share < 1.0:
             reduced.append(
-                f"{100 * share:.2g} % of the inertia that the description gives {', '.join(joint.movable)}: with all "
-                f"of it, no possible body would be left for {joint.link}"
+                f"{100 * share:.2g} % of the inertia that the description gives {', '.join(joint.movable)}: "
+                f"the full inertia would leave no possible body for {joint.link}"
             )
             for name in apart:
                 _scale_inertial(links[name], share)
@@ -184,7 +184,7 @@ def _replace_inertial(link: ET.Element, body: Body) -> None:
 
 def _scale_inertial(link: ET.Element, share: float) -> None:
     """Multiply the described mass and inertia of a link by a number below 1."""
-    comment(link, f"{share:g} of the described mass and inertia: with all of it, nothing would be left for its parent")
+    comment(link, f"{share:g} of the described mass and inertia: the full values would leave nothing for its parent")
     for element in (*link.findall("inertial/mass"), *link.findall("inertial/inertia")):
         for key, value in element.attrib.items():
             element.set(key, numbers(share * float(value)))

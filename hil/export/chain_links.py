@@ -71,8 +71,8 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
 def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
     """Separate a link from what its held joints move, such as a gripper's fingers, so that these keep their inertia.
 
-    Their described masses may leave no possible body for the link itself; all of them then keep the largest fraction,
-    halved as often as needed, that does, or nothing at all. Returns the link's body and that fraction.
+    If their described masses leave no physically possible body for the link itself, all of them keep the same fraction,
+    halved until one is possible, or nothing. Returns the link's body and that fraction.
     """
     share = 1.0
     for _ in range(HALVINGS):

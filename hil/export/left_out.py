@@ -17,7 +17,10 @@ def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:
 
 
 def chain_left_out(model: ChainArmModel, carried: tuple[str, ...] = ()) -> list[str]:
-    """The same for a spatial arm, whose base parameters every description represents by its links."""
+    """One sentence per parameter of a spatial arm that the format cannot represent, except those in `carried`.
+
+    Links represent all base parameters.
+    """
     elsewhere = {*_SAID_ELSEWHERE, *carried}
     names = [name for name in model.values if name not in model.groups and kind_of(name) not in elsewhere]
     return [_sentence(name, model.values[name]) for name in names]

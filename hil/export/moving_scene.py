@@ -1,6 +1,6 @@
 """An arm as frames and shapes: where each link is at each sample, and what to draw there.
 
-Used by the MCAP export, whose messages `FrameTransforms` and `SceneUpdate` Foxglove's 3D panel shows.
+Used by the MCAP export; Foxglove's 3D panel shows its messages `FrameTransforms` and `SceneUpdate`.
 """
 
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ PLANAR_RADIUS = 0.1
 class Frame:
     """The frame of a link, which turns about `axis` (3,) of its joint.
 
-    rotation, translation: of the frame at angle zero in `parent` (3, 3), (3,) [m]. joint: index of the angle; None for
-    the base, which is fixed.
+    rotation, translation: pose of the frame in `parent` at angle zero (3, 3), (3,) [m]. joint: index of the angle; None
+    for the base, which is fixed.
     """
 
     name: str

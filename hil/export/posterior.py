@@ -32,7 +32,7 @@ _TRIES = 20
 
 _FRICTION = ("viscous", "coulomb")
 _LEAST_WIDTH = 1e-4
-"""Smallest width of a drawn arm's Coulomb step [rad/s]: hardly different from friction that truly sticks."""
+"""Smallest width of a drawn arm's Coulomb step [rad/s]: practically the same as true stiction."""
 _POSES = 20
 """Number of poses in which the mass matrix of a drawn spatial arm must be positive definite."""
 

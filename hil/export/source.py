@@ -54,7 +54,7 @@ class Recorded:
 
         if is_recording_folder(run):
             raise RunFolderError(
-                f"{run} is an estimate from another tool's recording: the samples are in its files. Export the "
+                f"{run} is an estimate from another tool's recording: the samples are in that tool's files. Export the "
                 "arm: urdf, mjcf, toml or json."
             )
         folder = RunFolder.open(run)

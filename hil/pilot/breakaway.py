@@ -1,7 +1,7 @@
 """Breakaway of joints that friction holds: more torque from run to run, stopped soon after a joint begins to move.
 
-A joint that stood still reveals little more than that its friction is larger than the torque. Just above it, motion
-grows quickly: in a large part of the plausible arms even a few percent more torque exceeds a limit, so that an
+A joint that stood still reveals little more than that its friction is larger than the torque. Just above that friction,
+motion grows quickly: in a large part of the plausible arms even a few percent more torque exceeds a limit, so that an
 amplitude which is safe for a whole run can hardly be raised. Instead, the guard is given narrow limits for such joints.
 The torque can then grow by a constant ratio up to the current limit, and the run ends, braked, where the joint has
 shown its friction.

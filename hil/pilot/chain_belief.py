@@ -1,4 +1,4 @@
-"""Ensemble of spatial arms that may equal the real one, and its update with the recording of a run.
+"""Ensemble of spatial arms consistent with what is known of the real one, and its update with the recording of a run.
 
 Torque is linear in base parameters and friction, so each arm is updated by one randomised maximum a posteriori step (Y.
 Chen and D. Oliver, Mathematical Geosciences 44 (2012) 1), with itself as the prior mean and independent noise added to
@@ -42,7 +42,7 @@ _HALVINGS = 6
 _LIGHTER = 0.25
 """Smallest plausible inertia of a joint, relative to that of the lightest arm of the prior."""
 _LIGHTER_THAN_MEAN = 0.5
-"""The same relative to the inertia of the arm with the fitted parameters, if that arm is lighter still."""
+"""Smallest plausible inertia relative to that of the arm with the fitted parameters, if that arm is lighter still."""
 
 SIMULATED = 100
 """Largest number of arms that are simulated."""

@@ -48,7 +48,7 @@ class Reserve:
 
 MORE = 1.4
 MOST_POSITION = 0.3
-"""Largest reserve of position: at one half, nothing of a joint's range would be left."""
+"""Largest reserve of position: at one half, none of a joint's range would be left."""
 RESERVE = Reserve()
 
 

@@ -43,7 +43,7 @@ SILENT_S = 30.0
 
 
 class Said:
-    """Passes messages on, and reports that work goes on when nothing has been said for a while.
+    """Passes messages on, and reports progress when there has been no message for a while.
 
     now: the time [s].
     """
@@ -166,7 +166,7 @@ def identify_chain_in_steps(
 ) -> tuple[str, SettledResult]:
     """Identify a spatial arm from its description, limits and rest pose. Returns the torque state and the result.
 
-    Raises what a run raises, and NoSafeTorque.
+    Raises whatever a run raises, and NoSafeTorque.
     """
     with StopRequest(), servo_session(config, run.path, say) as bus:
         if from_where_it_lies(config, bus.read_positions()) is not config and (moving := wait_for_rest(bus)):

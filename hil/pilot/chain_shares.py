@@ -1,4 +1,4 @@
-"""The largest share of a spatial arm's designed paths that is safe for every arm that it may be.
+"""The largest share of a spatial arm's designed paths that is safe for every arm of the current belief.
 
 `hil identify` and `hil dry-run` both decide in this way, on the same arms, so that they agree.
 """
@@ -183,7 +183,7 @@ def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _remedy(config: Config, foreseen: ChainPrediction) -> str:
-    """Return the changes with which a user may make a path safe that `unsafe` rejects."""
+    """Return the changes by which a user may make a path safe that was rejected as `unsafe`."""
     if not foreseen.is_clear:
         helps = "A rest_pose farther from obstacles, or more room in [clearance] (floor, boxes, margin)"
     else:
@@ -195,7 +195,7 @@ def _remedy(config: Config, foreseen: ChainPrediction) -> str:
 def _better_known(config: Config) -> str:
     spread = 0.3 if config.arm.prior is None else config.arm.prior.spread
     return (
-        f"Masses in the URDF that are known better ([arm.prior] spread below {spread:g}) help too, as does a larger "
+        f"More accurate masses in the URDF ([arm.prior] spread below {spread:g}) help too, as does a larger "
         f"{limit_names(config)}"
     )
 

@@ -1,4 +1,5 @@
-"""From the first careful run to a plan at the limits: run, update the belief, and raise the torque until it is certain.
+"""From the first careful run to a plan at the limits: run, update the belief, and raise the torque until the belief is
+precise.
 
 A run that moved nothing, exceeded a limit or never settled is informative too.
 """
@@ -32,7 +33,7 @@ Array = NDArray[np.float64]
 DEFAULTS = PilotOptions()
 
 _LINES_FOR_DETECTION = 4
-"""Lines of the band per joint of which enough are excited with experiment.detection."""
+"""Number of lines of the band per joint at which experiment.detection still excites enough of them."""
 
 
 @dataclass
@@ -99,7 +100,7 @@ class Search:
     def find(self) -> tuple[Config, Amplitude]:
         """Find the configuration and the amplitude of the full run.
 
-        Raises what a run raises, and ExperimentError if a joint does not move at its current limit.
+        Raises whatever a run raises, and ExperimentError if a joint does not move at its current limit.
         """
         self._pilot()
         return self._raise_to_limits()
@@ -274,8 +275,8 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """`found`; if it leaves much of the range unused, the best amplitude among other waves too, whichever leaves
-        least.
+        """Return `found` or, if it leaves much of the range unused, the best amplitude among other waves if that leaves
+        less.
 
         Slightly more torque may tip some of the arms over: with other waves that happens at larger amplitudes, or to
         the other side.

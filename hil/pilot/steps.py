@@ -36,9 +36,9 @@ _BESIDE = 2
 class Step:
     """One intermediate run.
 
-    name: shown to the user. peak_torque: (joints,) [N m]. median, quantile: predicted median and 99 % peaks; seen:
-    measured peaks, each (quantities, joints) in the order of hil.dry_run.prediction.QUANTITIES. ended: why the run
-    ended early; empty if it did not.
+    name: name shown to the user. peak_torque: peak torques (joints,) [N m]. median, quantile: predicted median and 99 %
+    peaks; seen: measured peaks, each (quantities, joints) in the order of hil.dry_run.prediction.QUANTITIES. ended: why
+    the run ended early; empty if it did not.
     """
 
     name: str
@@ -120,9 +120,9 @@ class Player:
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude, arms: Ensemble) -> Played:
         """Play one run on an arm that could be any of `arms`, compare it with the prediction, and report.
 
-        A run that is stopped because this computer was late is repeated. Raises what a run raises, except errors that
-        are informative about the arm: limit exceeded, no motion, no steady motion, a period that differs from the one
-        before.
+        A run that is stopped because this computer was late is repeated. Raises whatever a run raises, except errors
+        that are informative about the arm: limit exceeded, no motion, no steady motion, a period that differs from the
+        one before.
         """
         torque, error = "", None
         try:
@@ -158,7 +158,7 @@ def tells_of_the_arm(error: ExperimentError) -> bool:
     """Whether the error is informative about the arm, so that another run may follow: limit, no motion, no steady
     motion, a period that differs from the one before.
 
-    What another program or a change of goals on the way has caused is not: a further run with less torque or speed
+    Errors caused by another program or by goals changed on the way are not: a further run with less torque or speed
     would only hide it.
     """
     if isinstance(error, SafetyStop):

@@ -1,8 +1,9 @@
-"""How fast each joint can be turning, by the change of its position: no brake may rely on a reported velocity alone.
+"""How fast each joint can be turning, judged by the change of its position: no brake may rely on a reported velocity
+alone.
 
 A servo can report a false velocity in an intact reply. A brake that trusted it would drive the joint. Therefore the
 velocity to brake against is the reported one, confined to the range that the change of position allows over two spans
-of time: a short one, which soon shows a reversal, and a long one, in which a slow motion is visible in spite of the
+of time: a short one, which soon shows a reversal, and a long one, in which a slow motion is visible despite the
 encoder's steps. Each range includes zero and never the direction opposite to a visible motion.
 """
 
@@ -17,7 +18,7 @@ from hil.drivers.state import State
 __all__ = ["RecentMotion", "Travel"]
 
 SHORT_S, LONG_S = 0.004, 0.02
-"""The two spans [s], or as many exchanges as it takes."""
+"""The two spans [s]; each reaches back to the latest exchange that is at least as old."""
 
 _OLDEST_S = 0.05
 _LONGER = 1.5
@@ -30,8 +31,8 @@ _MORE = 1.25
 """Tolerance for a velocity that increases within the span, as a factor on the mean velocity."""
 
 CONTRADICTS = 2.0
-"""Factor on that range beyond which a velocity contradicts the position: at constant acceleration from standstill, the
-last velocity is twice the mean one.
+"""Factor on the range that the position allows, beyond which a velocity contradicts it: at constant acceleration from
+standstill, the last velocity is twice the mean one.
 """
 
 UNREACHABLE = 3.0
@@ -79,7 +80,7 @@ class RecentMotion:
         return found
 
     def contradicts(self, joint: int, velocity: float) -> bool:
-        """Whether a velocity is not that of the joint: none of its changes of position allows it, or none is known
+        """Whether a velocity cannot be the joint's: none of its changes of position allows it, or none is known
         and no servo turns that fast.
         """
         travels = self.travels(joint)

@@ -21,7 +21,8 @@ RESTART = 0.2  # s: a larger backward step in time starts a new recording
 class Rows:
     """Rows of a recording.
 
-    time: (rows,) [s]. torque, position: (joints, rows) [N m, rad]. notes: one sentence per correction.
+    time: times of the rows (rows,) [s]. torque, position: values (joints, rows) [N m, rad]. notes: one sentence per
+    correction.
     """
 
     time: Values
@@ -86,7 +87,7 @@ def _unrepeated(source: str, rows: Rows) -> Rows:
         return rows
     if count > FEW * rows.time.size:
         percent = f"{100 * count / rows.time.size:.0f} %"
-        share = f"{source}: {percent} of the times are the same as the one before, with other data"
+        share = f"{source}: {percent} of the times repeat the previous one, with different data"
         if encoder_step(rows.time) is None:
             raise CsvError(
                 f"{share}, although they have many digits: the rows were stamped when they arrived, in bursts, not "

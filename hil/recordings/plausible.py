@@ -1,6 +1,6 @@
 """Refusal of angles that no servo arm reaches: most often they are in degrees, although the file does not say so.
 
-An estimate from such angles takes minutes and means nothing. Joints that rotate on and on are accepted, and so is
+An estimate from such angles takes minutes and is meaningless. Joints that rotate continuously are accepted, and so is
 everything if [columns] states the unit.
 """
 
@@ -22,16 +22,16 @@ TIMES_NO_LOAD = 5.0
 """Highest plausible speed, relative to the no-load speed of the fastest servo."""
 
 _ONE_WAY = 0.7
-"""Least share of a joint's path that leads in one direction if it rotates on and on."""
+"""Smallest share of a joint's path in one direction for which it counts as rotating continuously."""
 
 _OVER_S, _USUAL = 0.02, 0.9
-"""Time over which speeds are measured, so that noise hardly counts [s], and the fraction of them that is slower."""
+"""Time over which speeds are measured, so that noise hardly matters [s], and the quantile of them that is checked."""
 
 
 def refuse_degrees(source: str, names: Sequence[str], time: Values, position: Values) -> None:
-    """Raise CsvError if `position` (joints, samples) [rad] is beyond what servos do.
+    """Raise CsvError if `position` (joints, samples) [rad] is beyond the range of servos.
 
-    names: columns of the positions. time: (samples,) [s].
+    names: columns of the positions. time: sampling times (samples,) [s].
     """
     fastest = TIMES_NO_LOAD * fastest_no_load()
     for name, row in zip(names, position, strict=True):

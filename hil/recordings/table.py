@@ -17,8 +17,8 @@ Values = NDArray[np.float64]
 class Table:
     """One recording as stored in a file.
 
-    columns: (rows,) by name, NaN where a value is missing and infinite where it is not a number. units: as stated in
-    the file, by column. first_row: number of the first row, for messages (a CSV file's header is
+    columns: values (rows,) by name, NaN where a value is missing and infinite where it is not a number. units: units
+    stated in the file, by column. first_row: number of the first row, for messages (a CSV file's header is
     line 1).
     """
 

@@ -32,7 +32,9 @@ class _Shown:
 
 
 def write_recording_report(folder: Path, out: Path | None = None) -> Path:
-    """Write the report of such a folder, by default into it; return its path. Raises RunFolderError, ResultError."""
+    """Write the report of a recording folder, by default into it; return its path. Raises RunFolderError,
+    ResultError.
+    """
     result = read_usable_result(folder)
     shown = _Shown(folder, load_record(folder), result, model_of(result, folder), load_recordings(folder))
     sections = (

@@ -73,7 +73,7 @@ def _frame_step(position: Array) -> int:
 
 
 def _clearances(space: Space, angles: Array, on_the_way: NDArray[np.bool_]) -> dict[str, Any]:
-    """Least clearance of each frame [mm], excess over the required one [mm], and index of the pair in `pairs`."""
+    """Smallest clearance of each frame [mm], excess over the required one [mm], and index of the pair in `pairs`."""
     pairs: dict[tuple[str, str], int] = {}
     clearance, room, nearest = [], [], []
     for frame, way in enumerate(on_the_way.tolist()):

@@ -39,9 +39,10 @@ class Folded:
 
 @dataclass(frozen=True)
 class Motion:
-    """An animated planar arm. interval: between frames [s]; angles: of each joint, frame by frame [rad].
+    """An animated planar arm. interval: time between frames [s]; angles: each joint's angles, frame by frame [rad].
 
-    lengths: of the links, in any unit; hangs: whether gravity acts in the plane, downwards; caption: what is shown.
+    lengths: link lengths in any unit; hangs: whether gravity acts in the plane, downwards; caption: text below the
+    animation.
     """
 
     interval: float

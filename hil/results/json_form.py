@@ -22,7 +22,7 @@ Spread = Annotated[float, _NULL_IS_INFINITE]
 _NOT_NEGATIVE = "not negative"
 
 StandardError = Annotated[float, _NULL_IS_INFINITE, _NOT_NEGATIVE]
-"""As `Spread`, but never negative."""
+"""Like `Spread`, but never negative."""
 
 T = TypeVar("T")
 

@@ -274,7 +274,7 @@ class ChainFacts:
     """Facts from the URDF of a spatial arm, which define its base parameters.
 
     urdf: file name, relative to the configuration. rotation, translation [m]: pose of each joint's frame in the
-    previous link's frame. axis: joint axis in its own frame. gravity: in the base frame [m/s^2]. groups: linear
+    previous link's frame. axis: joint axis in its own frame. gravity: gravity in the base frame [m/s^2]. groups: linear
     combination that each base parameter stands for. from_prior: parameters that the recording hardly determines, taken
     from the URDF. held: joints of the URDF that are treated as fixed. doubts: warnings about implausible inertias.
     """
@@ -334,8 +334,8 @@ class StabiliserShare:
 class PlayedStep:
     """One run between the pilot and full amplitude.
 
-    Rows are the quantities of hil.dry_run.prediction.QUANTITIES, columns the joints. peak_torque: [N m]. ended: why the
-    run ended early; None if it did not.
+    Rows are the quantities of hil.dry_run.prediction.QUANTITIES, columns the joints. peak_torque: peak torque per joint
+    [N m]. ended: why the run ended early; None if it did not.
     """
 
     name: str

@@ -57,9 +57,9 @@ SCHEMA = 1
 class Result:
     """The outcome of an identification. Fields are in the order of result.json.
 
-    parameters, extra: by name, in the order of `covariance.names`. truth: by name [SI].
+    parameters, extra: quantities by name, in the order of `covariance.names`. truth: true values by name [SI].
 
-    truth_scaled: `truth` in the unit of torque that the file's torque constants imply; None if that is the same.
+    truth_scaled: `truth` scaled to the file's torque constants; None if that is the same.
     """
 
     schema: int = SCHEMA

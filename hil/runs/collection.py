@@ -32,8 +32,9 @@ class Note:
 class RunSummary:
     """Summary of one run.
 
-    started: None if run.json does not contain it. verdict: "yes", "with care", "no", or what is missing. residual: of
-    the worst joint in encoder steps; None without a result. steps: number of pilot and intermediate runs in it.
+    started: None if run.json does not contain it. verdict: "yes", "with care", "no", or what is missing. residual:
+    residual of the worst joint in encoder steps; None without a result. steps: number of pilot and intermediate runs in
+    it.
     """
 
     path: Path

@@ -336,7 +336,7 @@ class RunFolder:
                 found.append((float(entry["time"]), str(entry["event"])))
             except (ValueError, KeyError, TypeError) as error:
                 if number < len(lines):
-                    raise RunFolderError(f"{path} is damaged in line {number}: {line[:60]!r}.") from error
+                    raise RunFolderError(f"{path} is damaged on line {number}: {line[:60]!r}.") from error
         return tuple(found)
 
     def write_result(self, result: Result) -> None:

@@ -205,6 +205,6 @@ def _fix(used: ExchangeMode, modes: list[ExchangeMode], wanted: float) -> str:
         else ""
     )
     return (
-        f"{busy}Set experiment.rate to at most {best.rate:.0f}, or raise the baud, or lower latency timer and return "
-        "delay."
+        f"{busy}Set experiment.rate to at most {best.rate:.0f}, or raise the baud rate, or lower the latency timer "
+        "and the return delay."
     )

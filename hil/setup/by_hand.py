@@ -1,6 +1,6 @@
 """The pose read from the bus, compared with the arm's description: each joint in turn is moved by hand, torque off.
 
-An identification cannot detect wrong IDs, directions, zeros and axes: a chain's parameters do not absorb a wrong
+An identification cannot detect wrong IDs, directions, zeros or axes: a chain's parameters do not absorb a wrong
 geometry, they become wrong. A person notices at once.
 """
 
@@ -50,13 +50,13 @@ class Moved:
     """Angles by which all joints moved [rad]."""
     well: bool
     found: str
-    """Finding in words, with what to change if it differs from the description."""
+    """Finding in words, including what to change if it differs from the description."""
 
 
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
     """The pose at these angles [rad].
 
-    Whole turns, which a servo does not count while it is off, are taken off where a joint's position limits tell them.
+    Whole turns, which a servo does not count while it is off, are removed where a joint's position limits reveal them.
     """
     limits = [joint.position_limit for joint in config.joints]
     angles = tuple(within_limits(*each) for each in zip(angles, limits, strict=True))

@@ -62,7 +62,7 @@ def settings_now(bus: ServoBus) -> Settings:
 def changed_settings(before: Settings, after: Settings, cause: Cause | None = None) -> str:
     """One sentence about the settings that differ; "" if there are none.
 
-    cause: that of a stop, by which settings that cannot explain it are left out.
+    cause: the cause of a stop; settings that cannot explain it are left out.
     """
     changed = [
         f"{joint}: {register} is {_told(register, after[joint, register])} and was {_told(register, value)}"

@@ -59,8 +59,8 @@ class MeasuredBus:
 class ArmAnswers:
     """Answers about one arm.
 
-    gravity: in the plane of the arm [m/s^2]. head: comment at the top of the file. measured: None if the bus was not
-    measured; the rate then follows from its baud rate.
+    gravity: gravity in the plane of the arm [m/s^2]. head: comment at the top of the file. measured: None if the bus
+    was not measured; the rate then follows from its baud rate.
     """
 
     url: str

@@ -28,9 +28,9 @@ def tolerance_now(config: Config) -> float:
 
 
 def wait_for_rest(bus: ServoBus) -> str:
-    """Wait for an arm that still swings after an earlier run, or falls, for at most _LONGEST_REST_S.
+    """Wait at most _LONGEST_REST_S for an arm that is still swinging or falling after an earlier run.
 
-    Returns a sentence about a joint that still moves then, "" if none does.
+    Returns a sentence about a joint that is still moving then, "" if none is.
     """
     clock = bus.port.clock
     former, end = bus.read_positions(), clock.now() + _LONGEST_REST_S

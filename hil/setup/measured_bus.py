@@ -11,7 +11,7 @@ from hil.setup.config_template import RATES, ArmAnswers, MeasuredBus, arm_toml
 
 
 def measured_bus(arm: ArmAnswers, path: Path) -> tuple[MeasuredBus | None, str]:
-    """Measure the bus of an arm that has been described; path: of the file to be written, for messages.
+    """Measure the bus of an arm that has been described; path: path of the file to be written, for messages.
 
     Returns:
         What was measured, or None if that was impossible; and a sentence about it.

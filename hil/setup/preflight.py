@@ -115,7 +115,7 @@ def _path(config: Config) -> Iterator[Finding]:
 
 
 def _described(config: Config) -> Iterator[Finding]:
-    """Report what is doubtful about the description, and whether the rest pose of a spatial arm is clear."""
+    """Report doubts about the description, and whether the rest pose of a spatial arm is clear."""
     for doubt in doubts(config):
         yield Finding(Level.WARNING, "arm", "description", "doubtful", doubt)
     if not config.is_chain:

@@ -25,7 +25,7 @@ _STATUS_BYTES = 14
 class Found(NamedTuple):
     """One servo that answered.
 
-    model: None if no control table has this model number. voltage: [V], temperature: [degrees C]; None if they could
+    model: None if no control table has this model number. voltage [V], temperature [degrees C]: None if they could
     not be read. trouble: description of a problem; empty if there is none.
     """
 

@@ -76,7 +76,8 @@ class ServoSession:
     settings: Settings = field(default_factory=dict)
     """What `settings_now` found at the beginning."""
     _left: set[Joint] = field(default_factory=set)
-    """Servos whose settings an earlier run had left; a goal that a lowered limit cuts is tried once more, not for ever.
+    """Servos whose settings an earlier run left changed; restoring a goal that a lowered limit cuts is retried only
+    once.
     """
     _cut: dict[Joint, dict[str, int]] = field(default_factory=dict)
     """Goals that could only be restored as far as a lowered limit allows, with their values."""
@@ -86,10 +87,9 @@ class ServoSession:
     """Whether the last inner block ended with an exception: the arm went limp earlier than planned."""
 
     def begin(self, config: Config, folder: Path | None) -> None:
-        """Check that the servos answer and that nobody holds the arm, then save their settings. Raises as
-        `ServoBus.open`.
+        """Check that the servos answer and that nobody holds the arm, then save their settings.
 
-        Nothing is written to a servo before its settings are on disk.
+        Nothing is written to a servo before its settings are on disk. Same errors as `ServoBus.open`.
         """
         bus = self.bus
         bus.check_identity()
@@ -234,8 +234,8 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
 
     A TorqueNotOff that leaves the block reports the final state: servos that answer again are read back.
 
-    folder: run folder that receives a copy of the settings. say: receives messages for the user. Raises as
-    `ServoBus.open`, and RunFolderError.
+    folder: run folder that receives a copy of the settings. say: receives messages for the user. Same
+    errors as `ServoBus.open`, and RunFolderError.
     """
     outer = _outermost.get()
     if outer is not None and outer.bus.port.is_open and outer.bus.config.is_same_arm(config.bus):
@@ -324,7 +324,7 @@ def left_behind(port: str, joint: Joint) -> Kept | None:
 
 
 def recover(servo: Servo, port: str) -> list[str]:
-    """Restore settings that a terminated program left changed; return what was written. Raises as `Servo.write`."""
+    """Restore settings that a terminated program left changed; return those written. Same errors as `Servo.write`."""
     kept = settings_file.load(port, servo.id, servo.table.model)
     if kept is None or not kept.may_restore:
         return []

@@ -126,7 +126,7 @@ def recordings(study: Study) -> list[Path]:
     folder = beside if beside.exists() else given
     found = sorted(_recorded(folder)) if folder.is_dir() else []
     if not found:
-        raise ConfigError(f"{study.path}: study.recordings = {study.study.recordings!r}: no run folder is in {folder}.")
+        raise ConfigError(f"{study.path}: study.recordings = {study.study.recordings!r}: no run folder in {folder}.")
     return found
 
 

@@ -118,11 +118,11 @@ def _local(count: int, memory: str) -> Any:
 
 @contextmanager
 def executor(scheduler: str | None = None, count: int | None = None) -> Iterator[Executor]:
-    """The same workers with the interface of concurrent.futures, for `executor=` of a dry run or an estimate.
+    """Yield the workers as a concurrent.futures executor, for `executor=` of a dry run or an estimate.
 
     Args:
         scheduler: as for `workers`.
-        count: workers; one per core unless given.
+        count: number of workers; one per core unless given.
 
     Raises:
         ConfigError, MissingExtra: as for `workers`.

@@ -47,9 +47,9 @@ def run_jobs(
     """Call `function` on each item, on whichever worker is free; yield the jobs as they end.
 
     Args:
-        client: of `hil.study.engine.workers`.
+        client: a client from `hil.study.engine.workers`.
         function: importable by a worker, or else picklable with everything it refers to.
-        items: each with a number, which identifies the job; consumed as workers become free.
+        items: items, each with a number that identifies its job; consumed as workers become free.
 
     Raises:
         SchedulerLost: the scheduler no longer responds.
@@ -153,7 +153,7 @@ def each(
     Args:
         function: as for `run_jobs`.
         items: its arguments.
-        count: workers; one per core unless given; 0 computes in this process.
+        count: number of workers; one per core unless given; 0 computes in this process.
         scheduler: as for `hil.study.engine.workers`.
         tell: called with each result as it arrives.
 

@@ -1,4 +1,4 @@
-"""Workers as jobs of a Slurm queue, by dask-jobqueue."""
+"""Workers as jobs of a Slurm queue, through dask-jobqueue."""
 
 import shutil
 import time
@@ -18,9 +18,9 @@ def slurm_cluster(count: int, memory: str, environment: Mapping[str, str]) -> It
     """A Dask cluster with `count` workers submitted.
 
     Args:
-        count: workers, each a job of one core.
-        memory: of each, such as "2GiB".
-        environment: of each.
+        count: number of workers, each a job with one core.
+        memory: memory of each worker, such as "2GiB".
+        environment: environment variables of each worker.
 
     Raises:
         MissingExtra: dask-jobqueue is not installed.

@@ -151,7 +151,7 @@ def _kept(name: str, columns: tuple[str, ...]) -> bool:
 
 
 def _result(spec: Spec, folder: Path) -> Row:
-    """The requested columns; raises what the run raises, with its folder's name removed from the message."""
+    """The requested columns; raises whatever the run raises, with its folder's name removed from the message."""
     try:
         result = dict(flat(_done(spec, folder)))
     except Exception as error:

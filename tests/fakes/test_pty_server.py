@@ -112,7 +112,7 @@ def test_a_link_that_exists_or_cannot_be_made(tmp_path: Path) -> None:
     taken = tmp_path / "arm"
     taken.write_text("mine")
     descriptors = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
-    with pytest.raises(LinkError, match="arm exists already; remove it or choose another"):
+    with pytest.raises(LinkError, match="arm already exists; remove it or choose another"):
         PtyServer(load_fake(CONFIG), taken)
     with pytest.raises(LinkError, match="cannot be created: No such file or directory"):
         PtyServer(load_fake(CONFIG), tmp_path / "nowhere" / "arm")
@@ -167,7 +167,7 @@ def test_list_of_faults(capsys: pytest.CaptureFixture[str]) -> None:
     ("arguments", "said"),
     [
         (("nowhere.toml", "--pty"), "nowhere.toml cannot be read"),
-        ((str(CONFIG), "--pty", "--link", str(CONFIG)), "exists already"),
+        ((str(CONFIG), "--pty", "--link", str(CONFIG)), "already exists"),
         ((str(CONFIG), "--pty", "--fault", "gone"), "kinds: lost_reply"),
         ((str(CONFIG), "--pty", "--fault", "overload:servo=9"), "servo = 9: the IDs in"),
     ],

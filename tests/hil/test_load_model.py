@@ -147,7 +147,7 @@ def test_a_damaged_toml_file_is_read_like_any_other_toml(identified: Path, tmp_p
     path.write_text("schema = 1\nschema = 1\n", encoding="utf-8")
     with pytest.raises(
         ResultError,
-        match=r"schema is given twice, in lines 1 and 2\. Delete one of them\.\nRecreate it with hil export",
+        match=r"schema is given twice, on lines 1 and 2\. Delete one of them\.\nRecreate it with hil export",
     ):
         load_model(path)
     path.write_bytes("# Länge\nschema = 1\n".encode("latin-1"))

@@ -31,7 +31,7 @@ def test_a_byte_order_mark_is_no_part_of_the_file(read: Callable[[Path], object]
     [
         (b"a = " + 3000 * b"[" + 3000 * b"]", "too many nested brackets"),
         ("a = 1\n# Länge".encode("latin-1"), "not UTF-8 text, from line 2 on:\n  # Länge"),
-        (b"[port]\nbaud = 1\n# again\nbaud = 2\n", r"baud is given twice in \[port\], in lines 2 and 4\."),
+        (b"[port]\nbaud = 1\n# again\nbaud = 2\n", r"baud is given twice in \[port\], on lines 2 and 4\."),
     ],
 )
 def test_every_reader_says_what_is_wrong(
@@ -47,15 +47,15 @@ def test_every_reader_says_what_is_wrong(
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a = 1\na = 2\n", "a is given twice, in lines 1 and 2."),
-        ("[x]\na = 1\n[y]\na = 1\n[x]\nb = 2", "[x] is given twice, in lines 1 and 5."),
-        ("[[x]]\na = 1\n[[x]]\na = 1\nb = 1\nb = 2\n", "b is given twice in the [[x]] of line 3, in lines 5 and 6."),
-        ("[x]\na.b = 1\na = 2\n", "a in line 3 is already given in [x], in another form."),
+        ("a = 1\na = 2\n", "a is given twice, on lines 1 and 2."),
+        ("[x]\na = 1\n[y]\na = 1\n[x]\nb = 2", "[x] is given twice, on lines 1 and 5."),
+        ("[[x]]\na = 1\n[[x]]\na = 1\nb = 1\nb = 2\n", "b is given twice in the [[x]] of line 3, on lines 5 and 6."),
+        ("[x]\na.b = 1\na = 2\n", "a on line 3 is already given in [x], in another form."),
         ("a = {b = 1, b = 2}", "Duplicate inline table key 'b'"),
-        ("[a]\nx = [\n  [1, 2],\n]\nx = 1\n", "x is given twice in [a], in lines 2 and 5."),
-        ("[a]\nx = 1\nx = [\n  1,\n]\n", "x is given twice in [a], in lines 2 and 3."),
-        ('[a]\ny = """\nx = 1\n[b]\n"""\nx = 1\nx = 2\n', "x is given twice in [a], in lines 6 and 7."),
-        ("[[a]]\n[a.b]\nx = 1\n[[a]]\n[a.b]\nx = 1\nx = 2\n", "x is given twice in [a.b], in lines 6 and 7."),
+        ("[a]\nx = [\n  [1, 2],\n]\nx = 1\n", "x is given twice in [a], on lines 2 and 5."),
+        ("[a]\nx = 1\nx = [\n  1,\n]\n", "x is given twice in [a], on lines 2 and 3."),
+        ('[a]\ny = """\nx = 1\n[b]\n"""\nx = 1\nx = 2\n', "x is given twice in [a], on lines 6 and 7."),
+        ("[[a]]\n[a.b]\nx = 1\n[[a]]\n[a.b]\nx = 1\nx = 2\n", "x is given twice in [a.b], on lines 6 and 7."),
         ("[a]\nb = 1\n[[a]]\n", "line 1 has [a] and line 3 [[a]]. Write [[a]], with two brackets"),
         ("[[x]]\na = 1\n[x]\na = 1\n", "line 3 has [x] and line 1 [[x]]. Write [[x]], with two brackets"),
     ],

@@ -56,7 +56,8 @@ class PathLimits:
 class Design:
     """A path within the limits, and how well it determines the base parameters.
 
-    centre: (joints,) [rad]. lines: complex Fourier coefficients (joints, harmonics), before scaling to the limits.
+    centre: centre of the path (joints,) [rad]. lines: complex Fourier coefficients (joints, harmonics), before scaling
+    to the limits.
     worst, median: standard errors of the base parameters after the path, relative to the prior's standard deviation.
     """
 

@@ -19,8 +19,8 @@ Columns = npt.NDArray[np.int64]
 def inverse_dynamics(chain: Chain, parameters: Array, position: Array, velocity: Array, acceleration: Array) -> Array:
     """Return the joint torques (joints, samples) [N m] of a motion, without friction.
 
-    `parameters`: in the order of `parameter_names` (11 joints,) [SI]; position, velocity and acceleration: (joints,
-    samples) [rad, rad/s, rad/s^2]. Raises ShapeError.
+    `parameters`: values in the order of `parameter_names` (11 joints,) [SI]; position, velocity and acceleration: the
+    motion (joints, samples) [rad, rad/s, rad/s^2]. Raises ShapeError.
     """
     link, armature = split(chain, parameters)
     q, v, a = _motion(chain, position, velocity, acceleration)

@@ -17,7 +17,7 @@ from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
 """Meanings of the kinds of parameters that only chains have."""
 PART = 0.1
-"""Smallest part that a joint has in the motion whose inertia is lost to be named."""
+"""Smallest share of a joint in the motion that loses inertia, for the joint to be named."""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
 _ARMATURE = 10  # of a link's parameters

@@ -41,7 +41,7 @@ class Prior:
 
         Args:
             base: the parameter combinations that affect the torque.
-            links: (joints, 10) [SI].
+            links: described parameters of the links (joints, 10) [SI].
             armature: rotor inertias (joints,) [kg m^2], if known.
             scale_std: relative standard deviations of the joints' torque constants (joints,), if known.
         """

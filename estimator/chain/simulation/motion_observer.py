@@ -8,10 +8,10 @@ Kalman filter for slowly drifting constants), so the tolerance narrows over time
 the friction that can hold a joint at rest, exceeds `TIMES` standard deviations and a fraction of the largest planned
 torque for `HOLD_S`; large residuals raise it sooner.
 
-The noise estimate describes motion, so it only learns from motion: what a joint at rest lacks is held by friction, or
-by something that blocks it, and would otherwise widen the tolerance until nothing exceeded it. A joint at rest is also
-judged by the range of torques on it (`hil.estimator.models.standstill`). A residual that may become an alarm enters the
-noise estimate only once it has ended without one.
+The noise estimate describes motion, so it only learns from motion: the residual of a joint at rest is due to friction,
+or to something that blocks it, and would otherwise widen the tolerance until nothing exceeded it. A joint at rest is
+also judged by the range of torques on it (`hil.estimator.models.standstill`). A residual that may become an alarm
+enters the noise estimate only once it has ended without one.
 """
 
 import math
@@ -58,10 +58,10 @@ class ChainObserver:
     """Detects motion that is inconsistent with the arm's parameters, and refines these as the arm moves.
 
     mean: base parameters, then viscous friction, dry friction and offsets (base + 3 joints,) [SI].
-    covariance: of `mean`.
+    covariance: covariance of `mean`.
     largest: largest planned torque of each joint (joints,) [N m].
     interval: sampling interval [s].
-    frictions: the same scale of torque is at least this multiple of dry friction, as far as it is known.
+    frictions: multiple of dry friction, as far as it is known, that serves as a lower bound on this torque scale.
 
     Raises ValueError for arrays of other shapes.
     """

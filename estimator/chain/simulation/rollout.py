@@ -72,7 +72,7 @@ class Loop:
 
     rate: samples per second.
     goal: torques (samples, joints) [N m].
-    stiffness, damping: of the spring [N m/rad] and damper [N m s/rad] towards `pose` (joints,).
+    stiffness, damping: gains of the spring [N m/rad] and damper [N m s/rad] towards `pose` (joints,).
     pose: rest pose (joints,) [rad], on a surface that stops joints from being moved further down by gravity.
     limit: largest commanded torque (joints,) [N m].
     stops: side on which a joint lies on its own stop in the rest pose (joints,), -1, 1, or 0 if it does not; None if

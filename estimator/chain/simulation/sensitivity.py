@@ -41,7 +41,7 @@ PIECE = 256  # samples whose derivatives fit into the processor's cache
 class Simulation:
     """A simulation that advances piece by piece, optionally with derivatives.
 
-    parameters: by name [SI].
+    parameters: values by name [SI].
     start: state at the first sample (2, joints) [rad, rad/s].
     gain: gains of the observer per sample (2, joints) [1, 1/s].
     names: parameters with respect to which to differentiate, followed by the initial angles and velocities; no

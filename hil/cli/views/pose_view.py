@@ -14,7 +14,7 @@ from hil.setup.by_hand import Moved, Pose
 
 
 def print_pose(config: Config, pose: Pose) -> None:
-    """Angles in the description's convention, which way each joint moves the end, and the position of the end."""
+    """Print the angles in the description's convention, which way each joint moves the end, and the end's position."""
     arm, angles = described_arm(config), np.array(pose.angles)
     table = Table(title=f"{escape(arm.path.name)} as read from the bus", title_justify="left")
     for heading in ("joint", "ID", "angle rad", "degrees", "limits rad", "a positive angle"):
@@ -32,19 +32,19 @@ def print_pose(config: Config, pose: Pose) -> None:
 
 
 def print_moved(moved: Moved) -> None:
-    """One joint's outcome."""
+    """Print the outcome of moving one joint."""
     style = "green" if moved.well else "red"
     result_console().print(f"[{style}]{'correct' if moved.well else 'WRONG'}[/]: {escape(moved.found)}.")
 
 
 def pose_values(config: Config, pose: Pose) -> dict[str, Any]:
-    """As plain values."""
+    """Return the pose as plain values for JSON."""
     names = [joint.name for joint in config.joints]
     return {"angles": dict(zip(names, pose.angles, strict=True)), "end": list(pose.end)}
 
 
 def moved_values(moved: Moved) -> dict[str, Any]:
-    """As plain values."""
+    """Return the outcome of moving one joint as plain values for JSON."""
     return {"joint": moved.joint, "asked": moved.asked, "angles": list(moved.angles), "well": moved.well} | {
         "found": moved.found
     }

@@ -39,7 +39,7 @@ def print_result(result: SettledResult, config: Config, run: Path, console: Cons
 
 
 def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
-    """A result of multiple shooting. run: the folder it is in."""
+    """Print a result of multiple shooting. run: its folder."""
     print(f"{result.joints}-joint arm, {result.config}")
     for name, entry in result.quantities.items():
         print(f"{name:22s} {entry.unit:10s} {entry.value:12.5g} {entry.std:9.1e}")
@@ -153,11 +153,11 @@ def _choice(result: SettledResult) -> list[str]:
         return []
     tried = list(dict.fromkeys(trial.model for trial in choice.tried))
     if len(tried) == 1:
-        return [f"Model chosen: {choice.chosen}. The motion gives no reason to add a term."]
+        return [f"Model chosen: {choice.chosen}. The data do not support any additional term."]
     among = ", ".join(tried) if len(tried) <= _MOST_NAMED else f"{len(tried)} candidates"
     cost = choice.standard_errors_times
     if choice.chosen == choice.plainest:
-        return [f"Model chosen from {among}: {choice.chosen}, which has the fewest parameters of them."]
+        return [f"Model chosen from {among}: {choice.chosen}, the one with the fewest parameters."]
     if choice.error_divided_by <= 1.0 + _ALIKE:
         return [
             f"Model chosen from {among}: {choice.chosen}. It predicts about as well as {choice.plainest}, but what it "

@@ -65,7 +65,9 @@ class Difference:
     detectable: Mapping[str, float] = field(default_factory=dict)
     trust: tuple[str | None, str | None] = (None, None)
     other_joints: tuple[str, ...] = ()
-    """Sentences: joints that are described differently, so that they may not be the same arm; or that it is one run."""
+    """One sentence per joint that is described differently, since the arms may differ, or on a run compared with
+    itself.
+    """
 
     @property
     def changed(self) -> tuple[Change, ...]:

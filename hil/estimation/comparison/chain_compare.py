@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 
 def compare_chain(run: RunFolder, mujoco: bool) -> tuple[Mapping[str, float] | None, dict[str, Peer], "Judge"]:
-    """Apply every method to the settled period of `run`; return the true parameters, if known, the results, and the
+    """Apply every method to the settled period of `run`; return the true parameters if known, the results, and the
     object that evaluates their predictions.
 
     Raises HilError, EstimationError.

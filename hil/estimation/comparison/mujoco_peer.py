@@ -43,7 +43,8 @@ def import_mujoco() -> tuple[Any, Any]:
 def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: float, gravity: float, seed: int) -> Peer:
     """Fit with mujoco.sysid, starting from values drawn within 50 % of `centre` (base parameters by name [SI]).
 
-    `length`: of link 1 [m]. `gravity`: [m/s^2]. Raises MissingExtra without mujoco[sysid].
+    `length`: length of link 1 [m]. `gravity`: acceleration of gravity [m/s^2]. Raises MissingExtra without
+    mujoco[sysid].
     """
     mujoco, sysid = import_mujoco()
     linear = fit_lines(period)

@@ -64,7 +64,7 @@ def current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindin
 
 
 def settled_current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindings:
-    """The same for the periodic samples, which a settled estimate is based on."""
+    """Compare the currents of the periodic samples only, on which a settled estimate is based."""
     return current_findings(config, samples[samples["phase"] == Phase.PERIODIC])
 
 
@@ -78,7 +78,7 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
 
 
 def _other(name: str, goal: Array, measured: Array) -> str:
-    """Say that the current was another one than commanded; "" if it was not, or only clipped."""
+    """Say that the current was not the commanded one; "" if it was, or was only clipped."""
     if len(goal) < _RECENT or not goal.any():
         return ""
     recent = np.lib.stride_tricks.sliding_window_view(goal, _RECENT)
@@ -92,8 +92,8 @@ def _other(name: str, goal: Array, measured: Array) -> str:
     )
     if beyond > _BEYOND_OFTEN:
         return (
-            f"{name} carried another current than commanded in {100 * beyond:.0f} % of the samples, of the other sign "
-            f"or larger: {why}"
+            f"{name} carried a current other than the commanded one in {100 * beyond:.0f} % of the samples, of "
+            f"opposite sign or larger: {why}"
         )
     part = _short_part(goal, measured)
     if part > OFTEN and _follows_small_goals(goal, measured) < SHORT:

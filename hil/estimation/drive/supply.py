@@ -33,8 +33,9 @@ _FULL_LOAD = 0.99  # quantile of the drop
 class Sag:
     """A supply that sags.
 
-    volts: without load, at each servo (joints,) [V]. by_square, by_product: drop per goal squared and per goal times
-    velocity of each joint (joints,). worst: drop at full load [V]. volts and goals as recorded [A, or V under PWM].
+    volts: voltage at each servo without load (joints,) [V]. by_square, by_product: drop per goal squared and per goal
+    times velocity of each joint (joints,). worst: drop at full load [V]. volts and goals as recorded [A, or V under
+    PWM].
     """
 
     volts: Array

@@ -73,9 +73,9 @@ def position_jumps(time: Array, position: Array, velocity: Array, step: float) -
     """Times [s] and sizes [rad] of jumps far outside the usual differences between position and integrated velocity.
 
     Args:
-        time: of each sample (samples,) [s].
-        position: (samples,) [rad]; NaN where a reply is missing.
-        velocity: as the servo reports it (samples,) [rad/s].
+        time: sampling times (samples,) [s].
+        position: measured angles (samples,) [rad]; NaN where a reply is missing.
+        velocity: velocities reported by the servo (samples,) [rad/s].
         step: encoder step [rad].
     """
     read = np.isfinite(position) & np.isfinite(velocity)

@@ -49,7 +49,7 @@ def jump_sentences(
 ) -> tuple[str, ...]:
     """One sentence for each joint of each recording whose position jumped.
 
-    names: of the recordings. stepped: whether each joint's encoder step is known. joints: their names.
+    names: names of the recordings. stepped: whether each joint's encoder step is known. joints: names of the joints.
     """
     grouped: dict[tuple[int, int], list[Jump]] = {}
     for jump in recorded_jumps(recordings):

@@ -57,7 +57,7 @@ def _gravity(result: SettledResult, pose: NDArray[np.float64]) -> NDArray[np.flo
 
 
 def _resting(config: Config, samples: NDArray[np.void], phase: Phase) -> NDArray[np.float64] | None:
-    """Median of the last positions of a phase (joints,) [rad]; None if a joint has none or still moves."""
+    """Median of the last positions of a phase (joints,) [rad]; None if a joint has none or is still moving."""
     rows = samples[samples["phase"] == phase][-rest_window(config.experiment.rate) :]
     position = rows["position"]
     if not len(rows) or not np.isfinite(position).any(axis=0).all():

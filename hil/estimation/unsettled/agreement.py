@@ -1,4 +1,4 @@
-"""Whether several recordings show the same arm: a load that was changed between them is no missing term."""
+"""Whether several recordings show the same arm: a load changed between them must not be taken for a missing term."""
 
 from collections.abc import Sequence
 
@@ -37,9 +37,9 @@ def disagreement(
     worst = max(float(each.residual_over_noise.max()) for each in alone)
     differs = _differences(alone, called)
     return (
-        f"The recordings disagree: fitted one by one, their residuals are at most {worst:.1f} times the noise, "
+        f"The recordings disagree: fitted separately, their residuals are at most {worst:.1f} times the noise, fitted "
         f"together {left:.1f} times{': ' if differs else ''}{'; '.join(differs)}. Was the load, the mounting or a "
-        "setting changed between them? Estimate each by itself.",
+        "setting changed between them? Estimate each separately.",
     )
 
 

@@ -113,7 +113,7 @@ def _described(config: RecordingConfig, joints: int) -> ArmDescription:
     names = config.joint_names
     if names is None:
         raise ConfigError(
-            f"{config.arm.urdf} names the arm, but nothing names its joints: give one [[joints]] with name = "
+            f"{config.arm.urdf} describes the arm, but its joints are not named: give one [[joints]] with name = "
             "per column of columns.position, from the base outwards."
         )
     if len(names) != joints:
@@ -172,9 +172,9 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
             trust = "with care"
             sentences.append(
                 "Part of the residual repeats with the motion, which increases standard errors by up to "
-                f"{found.systematic:.1f} times, and some values may be wrong by more than these say. An effect is "
+                f"{found.systematic:.1f} times, and some values may be wrong by more than these indicate. An effect is "
                 "missing from the model: torque ripple or cogging, play or elasticity of the gears, a cable, friction "
-                "that depends on load or changes with time, or torques that were not those of the commands."
+                "that depends on load or changes with time, or torques that differed from the commands."
             )
     else:
         trust = "with care"
@@ -212,8 +212,8 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     if not found.reached:
         trust = lowered(trust, "with care")
         sentences.append(
-            "The fit stopped short of its minimum, where a joint sticks and breaks away; the standard errors include "
-            "the distance that remains. Record faster motion, so that fewer joints stick."
+            "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
+            "the remaining distance. Record faster motion, so that fewer joints stick."
         )
     return Verdict(trust, weakest, tuple(sentences))
 

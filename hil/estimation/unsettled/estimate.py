@@ -38,7 +38,7 @@ START_CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the inverse dynamics that start the li
 START_WIDTH = 0.05  # rad/s
 JUMPED = (
     "A position jumped (see the warnings), so angles before and after the jump do not belong together: use only the "
-    "part before or after it, or give each part in a file of its own."
+    "part before or after it, or put each part in a file of its own."
 )
 NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 
@@ -60,7 +60,8 @@ class Given:
     """What is known of the drives and encoders beforehand.
 
     torque_scale_std: see `hil.estimator.models.conflicts.conflicts`. zeros: whether the encoder zeros are those of a
-    configuration. names: of the recordings. jumps: a sentence for each joint of a recording whose position jumped.
+    configuration. names: names of the recordings. jumps: a sentence for each joint of a recording whose position
+    jumped.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
@@ -102,7 +103,7 @@ def estimate_any(
     given: Given = Given(),
 ) -> Estimated:
     """The estimate, its checks and its verdict. stepped: whether each joint's encoder step is known; by default it is.
-    given: what contradicts the estimate if it is far off.
+    given: prior knowledge, which the estimate must not contradict.
 
     Raises ConfigError, EstimationError.
     """

@@ -18,7 +18,7 @@ SHOWN = 1e-3  # of the largest torque of a joint, or of a ratio: less counts as 
 
 
 def implausible(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: float) -> list[str]:
-    """One sentence for each impossible value. gravity: in the arm's plane [m/s^2]."""
+    """One sentence for each impossible value. gravity: gravity in the arm's plane [m/s^2]."""
     late = limited(estimate.parameters)
     return [
         *_torques(recordings),
@@ -38,8 +38,8 @@ def undetermined(estimate: ShootingEstimate) -> list[str]:
     if not found:
         return []
     return [
-        f"Not determined by this motion: {', '.join(found)}. Only together with the others do they describe friction "
-        "near standstill; do not use them by themselves."
+        f"Not determined by this motion: {', '.join(found)}. They describe friction near standstill only together "
+        "with the other parameters; do not use them alone."
     ]
 
 

@@ -24,7 +24,7 @@ def prediction(data: RunData) -> Section | None:
             pictures.append(_position(data.held_out, joint, name, "held out", said))
     words = (
         "The first pictures show the settled period that the model was fitted to. A residual that looks like noise "
-        "of one step is encoder rounding; a smooth residual comes from something that the model lacks.",
+        "of one step is encoder rounding; a smooth residual comes from an effect that the model lacks.",
     )
     return Section("prediction", "Measured and predicted motion", words, pictures=tuple(pictures))
 

@@ -158,7 +158,7 @@ def test_a_base_whose_shape_cannot_be_read_has_none(tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf"
     path.write_text(path.read_text(encoding="utf-8").replace('<link name="base"/>', f'<link name="base">{mesh}</link>'))
     (doubt,) = shapes_of(read_urdf(path, ["j"])).doubts
-    assert doubt.startswith('link "base"') and "It has no shape: how close the arm comes to it is not known." in doubt
+    assert doubt.startswith('link "base"') and "It has no shape: the clearance to it is unknown." in doubt
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ LIMITS = '<limit lower="-0.94" upper="1.38"'
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
-        ((LIMITS, '<limit lower="1.38" upper="-0.94"'), "they are the wrong way round"),
+        ((LIMITS, '<limit lower="1.38" upper="-0.94"'), "the lower limit must come first"),
         ((LIMITS, '<limit lower="0.5" upper="0.5"'), "they are equal"),
         ((LIMITS, '<limit lower="-0.94" upper="0.9"'), "but position_limit lets it move from"),
         (('iyy="', 'iyy="9'), "no mass distribution can have this inertia"),

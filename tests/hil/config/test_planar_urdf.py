@@ -62,5 +62,5 @@ def test_joints_that_the_file_does_not_know_are_named(tmp_path: Path) -> None:
 def test_lengths_beside_the_description_of_a_spatial_arm_are_refused() -> None:
     text = (CONFIGS / "leg.toml").read_text(encoding="utf-8")
     twice = text.replace("rest_pose =", "link_lengths = [0.1, 0.1, 0.1]\nrest_pose =", 1)
-    with pytest.raises(ConfigError, match=r"arm\.link_lengths: a spatial arm has its lengths from arm\.urdf"):
+    with pytest.raises(ConfigError, match=r"arm\.link_lengths: a spatial arm takes its lengths from arm\.urdf"):
         parse_config(twice, CONFIGS / "leg.toml")

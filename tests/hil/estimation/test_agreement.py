@@ -54,5 +54,5 @@ def test_a_load_that_changed_between_two_files_is_named(heavier: float) -> None:
     if heavier == 1.0:
         assert said == ()
     else:
-        assert "The recordings disagree" in said[0] and "Estimate each by itself" in said[0]
+        assert "The recordings disagree" in said[0] and "Estimate each separately" in said[0]
         assert "gravity_1 is" in said[0] and "in a.csv and" in said[0] and "in b.csv" in said[0]

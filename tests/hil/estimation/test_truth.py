@@ -1,4 +1,4 @@
-"""True values of a fake arm in the torque that the file's constants imply, which is what a result is in."""
+"""True values of a fake arm, scaled like a result to the torque constants of the file."""
 
 import dataclasses
 import shutil

@@ -439,7 +439,7 @@ def test_a_current_behind_its_goal_near_no_load_speed_is_the_supplys(
 def not_followed(
     guard: Guard, carried: float, velocity: float, *, volt: float = nan, held: float | None = None
 ) -> SafetyStop:
-    """The stop because joint 2 carries another current than its goal, 0.3 A."""
+    """The stop because joint 2 carries a current other than its goal, 0.3 A."""
     turning = STILL._replace(goal_current=(0.0, 0.3), current=(0.0, carried), velocity=(0.0, velocity))
     guard.look(STILL._replace(slow=NOTHING_SLOW._replace(voltage=(volt, volt))))
     goal = 0.3 if held is None else held

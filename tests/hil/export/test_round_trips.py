@@ -36,7 +36,7 @@ def test_parameters(run: Path, name: str) -> None:
 
 def test_an_export_never_replaces_a_file_of_the_run(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = (run / "result.json").read_bytes()
-    with pytest.raises(ExportError, match=r"result\.json belongs to the run"):
+    with pytest.raises(ExportError, match=r"result\.json is one of the run's own files"):
         export(run, "json", run / "result.json")
     assert (run / "result.json").read_bytes() == before
     own = RunFolder(run).own_files()

@@ -185,7 +185,7 @@ def test_where_little_of_a_path_is_safe_another_one_with_more_reserve_is_tried(
 def test_an_arm_too_heavy_for_any_path_is_refused_with_the_reason_and_what_helps() -> None:
     config = chain_config(load_config(LEG))
     search = search_of(config, heavier(ChainBelief.prior(config), 20.0), [])
-    with pytest.raises(NoSafeTorque, match=r"not even 90 % of the designed path: .*needs about.*known better.*larger"):
+    with pytest.raises(NoSafeTorque, match=r"not even 90 % of the designed path: .*needs about.*More accurate.*larger"):
         search.safe(step_config(search.config), (1.0, 0.9))
 
 
