@@ -211,7 +211,9 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
     time = record["time"][:, 0]
     interval = 1.0 / config.experiment.rate
     joints = range(len(config.joints))
-    holds = np.asarray(record["torque"].any(axis=1))  # while servos are set up, nobody needs to be heard regularly
+    # While servos are set up, before the first goals of a servo with torque, nobody needs to be heard regularly.
+    holds = np.asarray(record["torque"].any(axis=1))
+    holds &= time > told.first_goal(float(time[np.argmax(holds)]))
     found: list[Reason | None] = []
     for joint in joints:
         own = record[:, joint]
@@ -295,6 +297,10 @@ class Told:
             elif request is not None and data and time >= start - 0.2:
                 pending += data
                 self._keep_answers(time, pending, request, index)
+
+    def first_goal(self, since: float) -> float:
+        """Time of the first goal sent after `since` [s]; infinite if there is none."""
+        return min((time for sent in self.sent for time, _ in sent if time > since), default=np.inf)
 
     def _keep_goals(self, time: float, packets: Sequence[Packet], index: dict[int, int]) -> None:
         for packet in packets:
