@@ -36,7 +36,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Refined:
-    """Results with fine integration steps, weighted by the residual of the best one."""
+    """The best fit with fine integration steps, its samples weighted according to its residual."""
 
     weighted: Objective
     outliers: int

@@ -3,7 +3,7 @@
 The planar arm's equations, integrated once, are linear in its parameters and contain only angles, velocities and
 torques:
 
-    torque = d/dt momentum(q, v) theta + rest(q, v) theta
+    torque = d/dt momentum(q, v) theta + remainder(q, v) theta
 
 After a first-order low-pass filter both sides become sums over the past (generalised momentum: A. De Luca and R.
 Mattone, "Sensorless robot collision detection and hybrid force/motion control", ICRA 2005; J.-J. Slotine and W. Li, "On
@@ -11,8 +11,8 @@ the adaptive control of robot manipulators", 1987). The parameters are given as 
 ensemble of arms, and are updated with each sample (recursive least squares, that is, a Kalman filter on constants that
 drift slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as it moves.
 
-An alarm is raised if the torque missing at a joint exceeds three thresholds for `HOLD_S` (a shorter time if it exceeds
-them by far): `TIMES` standard deviations of the uncertainty due to parameters and noise, what friction can hold while
+An alarm is raised if a joint's residual torque, which the motion does not account for, exceeds three thresholds for
+`HOLD_S` (a shorter time if it exceeds them by far): `TIMES` standard deviations of the uncertainty due to parameters and noise, what friction can hold while
 the joint stands still, and a fraction of the largest planned torque. The noise is estimated as well: effects that the
 model lacks (Stribeck friction, backlash, flexibility) widen the admissible range. A deviation that may become an alarm
 enters that estimate only once it has ended without one; otherwise a joint that is held for long would widen the range
@@ -44,11 +44,11 @@ NAMES = (
 
 FILTER_S = 0.02
 HOLD_S = 0.05
-"""Time for which the missing torque must exceed its thresholds [s]: longer than a gear takes to cross its backlash."""
+"""Time for which the residual torque must exceed its thresholds [s]: longer than a gear takes to cross its backlash."""
 
 TIMES = 4.0
 FLOOR_SHARE = 0.25
-"""Fraction of the largest planned torque below which a missing torque never raises an alarm."""
+"""Fraction of the largest planned torque below which a residual torque never raises an alarm."""
 
 _COUNT = len(NAMES)
 _STANDING = 0.05  # rad/s below which dry friction may hold a joint
@@ -64,7 +64,7 @@ _STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, t
 _LESSONS = 2.0  # number of successive updates that share an error of the model
 _STANDING_LESSONS = 28.0  # the same, for the rounding of velocities that stay below a tick while a joint hardly moves
 _DRIFT, _LEAST_DRIFT = 0.03, 1e-3  # drift of a parameter per second, relative to its value and to its initial deviation
-_MOST_WEIGHT = 6.0  # maximum weight of a sample whose missing torque exceeds the threshold by far
+_MOST_WEIGHT = 6.0  # maximum weight of a sample whose residual torque exceeds the threshold by far
 _OBVIOUS = 3.0  # multiple of the threshold at which one sample is enough at slow rates
 _WARM_S = 3 * FILTER_S
 _LONGEST_GAP = 3.0  # number of intervals between two samples after which the observer restarts
@@ -74,7 +74,7 @@ _LONGEST_GAP = 3.0  # number of intervals between two samples after which the ob
 _MOMENTUM, _REST, _FORMER, _THETA, _SINGLE, _COVARIANCE = 0, 2, 4, 6, 7, 8
 _PENDING = _COVARIANCE + _COUNT
 # Scalars: per joint filtered torque, noise variance, fraction of time at standstill, duration and sample count of a
-# possible alarm, missing torque; then the time since the last parameter update and since the start.
+# possible alarm, residual torque; then the time since the last parameter update and since the start.
 _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
 # Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration; mean square velocity.
 _TAUGHT, _TEACHES, _SQUARED = 0, 2, 4
@@ -196,7 +196,7 @@ def _filter(m: Any, j: int, momentum: Any, rest: Any, torque: float, fallen: flo
 
 
 def _lacks(m: Any, j: int, row: Any, gain: Any) -> tuple[float, float]:
-    """Return the missing torque, and its variance due to the parameters; set `gain` to covariance times `row`."""
+    """Return the residual torque, and its variance due to the parameters; set `gain` to covariance times `row`."""
     lacking = m[_SINGLE, _TORQUE + j]
     left_open = 0.0
     for i in range(_COUNT):
@@ -247,7 +247,7 @@ def _is_blocked(
     """Return whether joint j stands still under a range of torques that friction cannot hold.
 
     distance: result of `standstill.look`. held: torque that certainly acts on it now. floor: smallest tolerance.
-    noise, rounding: variances of one sample's missing torque at standstill. All in SI units.
+    noise, rounding: variances of one sample's residual torque at standstill. All in SI units.
     """
     if distance == 0.0:
         return False
@@ -272,7 +272,7 @@ def _second_moment(m: Any, weight_1: float, coupling: float, weight_2: float, ar
 
 
 def _of_rounding(m: Any, j: int, slope: float, cos_2: float) -> float:
-    """Return the variance of the missing torque due to the rounding of both velocities to ticks.
+    """Return the variance of the residual torque due to the rounding of both velocities to ticks.
 
     As long as the inertias are unknown, each counts with its largest possible value.
     """
@@ -283,9 +283,9 @@ def _of_rounding(m: Any, j: int, slope: float, cos_2: float) -> float:
 
 
 def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
-    """Return whether the missing torque exceeds its threshold long enough; a larger excess needs less time.
+    """Return whether the residual torque exceeds its threshold long enough; a larger excess needs less time.
 
-    share: missing torque relative to the threshold. dt: time since the previous sample [s].
+    share: residual torque relative to the threshold. dt: time since the previous sample [s].
     """
     if share <= 1.0:
         single[_HELD + j] = single[_SAMPLES + j] = 0.0

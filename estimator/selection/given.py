@@ -77,5 +77,5 @@ def _with_wave(
         if left_over(period, fits[-1]) < options.presliding_residual**2:
             break
     if not fits:
-        raise ConvergenceError(f"no period of the {wave} leads to a minimum: try a simpler model")
+        raise ConvergenceError(f"the fit did not converge for any period of the {wave}: try a simpler model")
     return min(fits, key=lambda each: left_over(period, each))

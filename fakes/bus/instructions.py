@@ -8,8 +8,8 @@ and the reply to a fast read ends in the middle (source: ROBOTIS in DynamixelSDK
 - Servos reply to a broadcast Ping one directly after the other, in ascending order of ID.
 - If two servos have the same ID and reply at once, the host receives nothing; both execute the instruction.
 - The status of a write to ID or Baud Rate, and of a Factory Reset, is still sent with the old ID at the old baud rate;
-that of a Reboot no longer has the alert that it ends: ROBOTIS' easy SDK and hardware interface treat any error as a
-failed reboot, although they reboot servos because of alerts.
+that of a Reboot no longer carries the Alert bit, which the reboot clears: ROBOTIS' easy SDK and hardware interface
+reboot servos because of alerts, yet treat any error in this status as a failed reboot.
 - A servo executes what is addressed to its Secondary ID but does not reply to it; its EEPROM is not written.
 - In a fast read, a servo that refuses sends its error and zeros.
 """

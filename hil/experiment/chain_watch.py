@@ -2,10 +2,10 @@
 
 Prior knowledge is the ensemble's mean and inflated covariance. The ensemble is drawn around the description, and
 updated after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
-A joint that stands at its rest angle is only judged by torques that would move it to where it has been: on the way home
-it may reach the stop on which it rests before the others. One that has been on both sides of that angle has no stop
-there. One that has not left it yet may lie on a stop on the side to which gravity pulls it: unless it is commanded to
-that side, nothing is expected of it.
+A joint at a standstill at its rest angle is judged only by torques that would move it towards the side on which it has
+been: on the way home it may reach its end stop before the other joints reach theirs. A joint that has been on both
+sides of its rest angle has no stop there. A joint that has not left its rest angle yet may rest against a stop on the
+side to which gravity pulls it: it is judged only while it is commanded to that side.
 """
 
 import math

@@ -66,8 +66,9 @@ def convert(table: Table, columns: Columns) -> Converted:
         notes.append(f"{table.source}: {len(parts) - len(long)} pieces shorter than a segment were left out.")
     if not long:
         raise CsvError(
-            f"{table.source}: no piece without a gap of more than {LONGEST_GAP:g} s is as long as a segment, "
-            f"{whole.segment:g} s: record for longer, or set columns.segment."
+            f"{table.source}: gaps of more than {LONGEST_GAP:g} s split the recording into pieces that are all shorter "
+            f"than a segment ({whole.segment:g} s). Record for longer without gaps, or choose shorter segments "
+            "(columns.segment)."
         )
     try:
         recordings = tuple(Recording(each.time, each.torque, each.position, step, whole.between) for each in long)

@@ -113,10 +113,15 @@ def _check_begun(out: Path, then: dict[str, Any], now: dict[str, Any]) -> None:
         ("recordings_sha256", "the recordings have changed"),
     ):
         if then.get(key) != now[key]:
-            raise ConfigError(f"{out} was started differently: {what} since. Choose another folder with --out.")
+            raise ConfigError(
+                f"The study in {out} cannot be resumed: {what} since it was started. Choose another folder with --out."
+            )
     before = then.get("versions", {})
     other = [
         f"{name} {before.get(name)} (now {new})" for name, new in now["versions"].items() if before.get(name) != new
     ]
     if other:
-        raise ConfigError(f"{out} was started with {', '.join(other)}: use those, or choose another folder with --out.")
+        raise ConfigError(
+            f"The study in {out} was started with {', '.join(other)}: use those versions, or choose another folder with "
+            "--out."
+        )

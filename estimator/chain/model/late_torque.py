@@ -107,7 +107,9 @@ def losses(base: BaseParameters, parameters: Mapping[str, float], names: tuple[s
 
 
 def complete(lost: Losses, derivative: Array) -> None:
-    """Convert derivatives (samples, joints, causes) of the arm of `as_moving` to those of the arm itself, in place."""
+    """Convert derivatives of positions (samples, joints, parameters) in place, from those with respect to the
+    parameters of the arm of `as_moving` to those with respect to the actual arm's. lost: the result of `losses`.
+    """
     for rotor_, changes in lost:
         by_rotor = derivative[:, :, : rotor_.size] @ rotor_
         for index, change in changes.items():

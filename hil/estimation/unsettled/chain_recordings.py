@@ -113,8 +113,8 @@ def _described(config: RecordingConfig, joints: int) -> ArmDescription:
     names = config.joint_names
     if names is None:
         raise ConfigError(
-            f"{config.arm.urdf} describes the arm, but its joints are not named: give one [[joints]] with name = "
-            "per column of columns.position, from the base outwards."
+            f"{config.arm.urdf} describes the arm, but its joints are not named: for each column in "
+            "columns.position, add a [[joints]] table with that joint's name, in order from the base outwards."
         )
     if len(names) != joints:
         raise ConfigError(f"{len(names)} [[joints]], but {joints} columns of positions: give one per joint.")
