@@ -12,11 +12,12 @@ ensemble of arms, and are updated with each sample (recursive least squares, tha
 drift slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as it moves.
 
 An alarm is raised if a joint's residual torque, which the motion does not account for, exceeds three thresholds for
-`HOLD_S` (a shorter time if it exceeds them by far): `TIMES` standard deviations of the uncertainty due to parameters and noise, what friction can hold while
-the joint stands still, and a fraction of the largest planned torque. The noise is estimated as well: effects that the
-model lacks (Stribeck friction, backlash, flexibility) widen the admissible range. A deviation that may become an alarm
-enters that estimate only once it has ended without one; otherwise a joint that is held for long would widen the range
-until nothing exceeds it. While a joint stands still its noise is lower, since most of it needs motion.
+`HOLD_S` (a shorter time if it exceeds them by far): `TIMES` standard deviations of the uncertainty due to parameters
+and noise, what friction can hold while the joint stands still, and a fraction of the largest planned torque. The noise
+is estimated as well: effects that the model lacks (Stribeck friction, backlash, flexibility) widen the admissible
+range. A deviation that may become an alarm enters that estimate only once it has ended without one; otherwise a joint
+that is held for long would widen the range until nothing exceeds it. While a joint stands still its noise is lower,
+since most of it needs motion.
 
 What friction can hold includes the viscous friction at the speeds of the usual motion: over a small motion, in which
 the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once it stands.

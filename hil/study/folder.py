@@ -122,6 +122,6 @@ def _check_begun(out: Path, then: dict[str, Any], now: dict[str, Any]) -> None:
     ]
     if other:
         raise ConfigError(
-            f"The study in {out} was started with {', '.join(other)}: use those versions, or choose another folder with "
-            "--out."
+            f"The study in {out} was started with {', '.join(other)}: use those versions, or choose another folder "
+            "with --out."
         )
