@@ -256,8 +256,8 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: even the fastest of many replies arrives {bus.port.latency * 1e3:.0f} ms "
             f"later than its transmission takes. This latency allows at most {1 / slowest:.0f} Hz. If other programs "
-            "keep this computer busy, close them and start again. Otherwise the adapter is slow: lower the rate, or use "
-            "a wired adapter with a short latency, such as a U2D2."
+            "keep this computer busy, close them and start again. Otherwise the adapter is slow: lower the rate, or "
+            "use a wired adapter with a short latency, such as a U2D2."
         )
 
 
