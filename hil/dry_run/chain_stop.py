@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from hil.clearance.space import LYING_RAD, Nearest, Space
 from hil.config.schema import Config
 from hil.dry_run.resting_stops import resting_stops
-from hil.estimator.chain.simulation.rollout import ChainArms, Loop, roll_out
+from hil.estimator.chain.simulation.rollout import ChainArms, Loop, Pull, roll_out
 from hil.estimator.progress import Tell, counted
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan
-from hil.plan.way_home import WayHome
+from hil.plan.way_home import PULL_PER_S, PULL_SHARE, WayHome
 
 Array = NDArray[np.float64]
 
@@ -166,7 +166,8 @@ def _lowered(
     for _, position, velocity in starts:
         home = way.path(position, velocity)
         goal = segment.thought.of(home).T + stiffness * (home.position.T - rest) + damping * home.velocity.T
-        loop = Loop(plan.rate, goal, stiffness, damping, rest, torque_limits(config), stops)
+        pull = Pull(home.position.T, PULL_PER_S, PULL_SHARE)
+        loop = Loop(plan.rate, goal, stiffness, damping, rest, torque_limits(config), stops, pull)
         motions = roll_out(arms, loop, position, velocity)
         longest = max(longest, len(goal) / plan.rate)
         for arm in range(arms.size):
