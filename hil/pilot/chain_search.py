@@ -15,6 +15,7 @@ import numpy as np
 from hil.config.schema import Config
 from hil.dry_run.prediction import peaks_of
 from hil.errors import DidNotMove, ExperimentError, NotSettled
+from hil.estimation.after_a_stop import can_be_estimated
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.experiment.stop_request import StopRequest
@@ -192,7 +193,10 @@ def identify_chain_in_steps(
 
 
 def _full(search: ChainSearch) -> str:
-    """Play the full run; repeat it with a smaller amplitude if it exceeds a limit or never settles."""
+    """Play the full run; repeat it with a smaller amplitude if it exceeds a limit or never settles.
+
+    If the last one fails only in its second path, which serves to validate the result, the first is enough.
+    """
     tries = 3
     for number in range(1, tries + 1):
         config = search.config
@@ -202,6 +206,9 @@ def _full(search: ChainSearch) -> str:
         if error is None:
             return search.torque
         if number == tries:
+            if isinstance(error, NotSettled | DidNotMove) and can_be_estimated(search.run.path):
+                search.say("The path to identify was recorded before; the estimate uses it without a second path.")
+                return search.torque
             raise error
         search.learn(config, search.run)
         before = search.cap
