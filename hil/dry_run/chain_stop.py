@@ -88,10 +88,16 @@ class ChainStops:
         return ""
 
 
-def foreseen_stops(config: Config, plan: Plan, arms: ChainArms, tell: Tell | None = None) -> ChainStops:
+def foreseen_stops(
+    config: Config,
+    plan: Plan,
+    arms: ChainArms,
+    tell: Tell | None = None,
+    passed: NDArray[np.bool_] | None = None,
+) -> ChainStops:
     """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError.
 
-    tell: called with the number of simulations done and their total.
+    tell: called with the number of simulations done and their total. passed: as in `resting_stops`.
     """
     segment = plan.segments[0]
     assert isinstance(segment, PathSegment)
@@ -102,7 +108,8 @@ def foreseen_stops(config: Config, plan: Plan, arms: ChainArms, tell: Tell | Non
     starts = [(each / plan.rate, path.position[:, each], path.velocity[:, each]) for each in moments]
     told = counted(tell, 2 * len(starts) * few.size)
     return ChainStops(
-        _hardest(config, plan.rate, few, starts, told), _lowered(config, plan, segment, few, starts, told)
+        _hardest(config, plan.rate, few, starts, told),
+        _lowered(config, plan, few, starts, told, resting_stops(config, few, passed)),
     )
 
 
@@ -165,15 +172,16 @@ def _helps(config: Config, at: int, longest: float, used: float, needed: float) 
 def _lowered(
     config: Config,
     plan: Plan,
-    segment: PathSegment,
     arms: ChainArms,
     starts: list[tuple[float, Array, Array]],
     told: Callable[[], None],
+    stops: Array,
 ) -> LoweringForeseen:
+    segment = plan.segments[0]
+    assert isinstance(segment, PathSegment)
     assert config.stabiliser is not None  # checked with the configuration
     way, space, rest = WayHome(config, plan), Space.of(config), np.array(config.arm.rest_pose)
     stiffness, damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
-    stops = resting_stops(config, arms)
     longest, lies, worst = 0.0, [], None
     away, used, needed = (np.zeros(len(rest)) for _ in range(3))
     for _, position, velocity in starts:

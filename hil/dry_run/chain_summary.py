@@ -25,7 +25,8 @@ class ChainDryRun:
     config: with the path and stabiliser that would be used. share: fraction of the designed path's amplitude; 1 if
     [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of links with parts
     that are closer than the margin in nearly every pose and are not checked. refused: why the pilot has no safe first
-    step; "" if it has one, None without a pilot, whose decision counts.
+    step; "" if it has one, None without a pilot, whose decision counts. on_stops: which joints are assumed to lie on
+    their own stops.
     """
 
     config: Config
@@ -38,6 +39,7 @@ class ChainDryRun:
     as_built: tuple[tuple[str, str], ...]
     servos: tuple[str, ...]
     refused: str | None = None
+    on_stops: str = ""
 
     @property
     def prediction(self) -> Prediction:
@@ -122,6 +124,7 @@ def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
             "beyond_limits_rad": [round(float(value), 3) for value in fall.beyond],
         },
         "joints": joints_json(config, peaks),
+        "assumed_on_own_stops": run.on_stops or None,
         "servos": list(run.servos),
     }
 
@@ -168,6 +171,8 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         f"at {fall.speed:.1f} m/s.",
     ]
     lines += near_by_design(Space.of(run.config))
+    if run.on_stops:
+        lines.append(run.on_stops)
     lines += [f"Warning: {doubt}" for doubt in doubts(run.config)]
     if run.share < 1.0:
         lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which is shown here.")

@@ -14,6 +14,7 @@ import numpy as np
 
 from hil.config.schema import Config
 from hil.dry_run.prediction import peaks_of
+from hil.dry_run.resting_stops import passed_rest
 from hil.errors import DidNotMove, ExperimentError, NotSettled
 from hil.estimation.after_a_stop import can_be_estimated
 from hil.estimation.settled_estimate import estimate_run
@@ -140,8 +141,11 @@ class ChainSearch(SafeShares):
         return error
 
     def learn(self, config: Config, folder: RunFolder) -> None:
-        """Update the belief with the recording in a folder."""
-        self.belief = self.belief.learn(config, load_samples(folder.samples_path, len(config.joints)))
+        """Update the belief, and which joints lie on their own stops, with the recording in a folder."""
+        samples = load_samples(folder.samples_path, len(config.joints))
+        self.belief = self.belief.learn(config, samples)
+        found = passed_rest(config, samples["position"])
+        self.passed = found if self.passed is None else self.passed | found
 
     def _compare(
         self, config: Config, folder: RunFolder, name: str, found: Found, error: ExperimentError | None

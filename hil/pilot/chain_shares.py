@@ -63,7 +63,8 @@ class SafeShares:
 
     last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are shares of `paths`,
     and are converted when these are replaced. tell: called with the progress of each simulation of the arms, designing:
-    with that of each path's design.
+    with that of each path's design. passed: whether each joint was beyond its rest pose in a run, as in
+    `resting_stops`.
     """
 
     given: Config
@@ -74,6 +75,7 @@ class SafeShares:
     last: float = np.inf
     tell: Tell | None = None
     designing: Tell | None = None
+    passed: NDArray[np.bool_] | None = None
 
     @property
     def config(self) -> Config:
@@ -163,7 +165,7 @@ class SafeShares:
                 why = f"{error} {_better_known(config)}"
                 continue
             for count in (SEARCH_ARMS, ARMS):
-                foreseen = predict_chain(config, plan, self.belief.arms.first(count), self.tell)
+                foreseen = predict_chain(config, plan, self.belief.arms.first(count), self.tell, passed=self.passed)
                 not_safe = unsafe(config, foreseen)
                 shortage = max(shortage, -float(foreseen.rooms.min()))
                 if not_safe:
@@ -184,7 +186,7 @@ class SafeShares:
         """Explain why a stop would not lower the arm safely; "" if it would."""
         if config.safety.stop == "cut":
             return ""
-        return foreseen_stops(config, plan, self.belief.arms.first(ARMS), self.tell).unsafe
+        return foreseen_stops(config, plan, self.belief.arms.first(ARMS), self.tell, self.passed).unsafe
 
 
 def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:

@@ -3,6 +3,7 @@
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 from unittest.mock import MagicMock, Mock
 
@@ -20,7 +21,7 @@ from hil.dry_run.chain_summary import chain_dry_run_json, chain_dry_run_lines, u
 from hil.errors import Cause, ConfigError, DidNotMove, NoSafeTorque, NotSettled, SafetyStop
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.estimator.chain.excitation.path_design import Design
-from hil.pilot import chain_search
+from hil.pilot import chain_search, chain_shares
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import RESERVE, Paths, Reserve, chain_config
 from hil.pilot.chain_rehearsal import rehearse
@@ -153,6 +154,33 @@ def test_a_second_path_in_which_a_joint_does_not_move_is_done_without(
     search.play.return_value = SafetyStop("knee is beyond its limit", Cause.POSITION)
     with pytest.raises(SafetyStop):
         chain_search._full(search)
+
+
+def test_a_joint_that_a_run_saw_beyond_its_rest_pose_is_not_said_to_lie_on_its_stop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config, belief = load_config(LEG), Mock()
+    belief.learn.return_value = belief
+    search, seen = searching(config, belief, cast("Any", None), print), []
+
+    def predicted(*_: object, passed: Any) -> Any:
+        seen.append(passed)
+        return Mock(rooms=np.ones(3))
+
+    def stopped(*given: Any) -> Any:
+        seen.append(given[-1])
+        return SimpleNamespace(unsafe="")
+
+    monkeypatch.setattr(chain_shares, "predict_chain", predicted)
+    monkeypatch.setattr(chain_shares, "foreseen_stops", stopped)
+    monkeypatch.setattr(chain_shares, "unsafe", lambda *_: "")
+    search.paths = Mock()
+    for joint, way in ((1, -0.1), (2, 0.1)):
+        samples = {"position": np.add(config.arm.rest_pose, [np.zeros(3), way * np.eye(3)[joint]])}
+        monkeypatch.setattr(chain_search, "load_samples", lambda *_, samples=samples: samples)
+        search.learn(config, cast("Any", Mock()))
+    assert search._largest(config, (0.3,))[0] is not None
+    assert [passed.tolist() for passed in seen] == 3 * [[[False, True, False], [False, False, True]]]
 
 
 def searching(config: Config, belief: ChainBelief, paths: Paths, say: Say) -> ChainSearch:
