@@ -82,16 +82,26 @@ class ChainBelief:
         """Add stabiliser gains suited to the ensemble, unless the configuration has its own."""
         if given.stabiliser is not None:
             return given
+        damping, share = self._damping(given)
+        stiffness = 2.0 * np.pi * FREQUENCY / (2.0 * DAMPING_RATIO) * damping
+        gains = StabiliserConfig(stiffness=_rounded(share * stiffness), damping=_rounded(share * damping))
+        return given.model_copy(update={"stabiliser": gains})
+
+    def stiffness_share(self, given: Config) -> Array:
+        """Stiffness of each joint's stabiliser at this rate, relative to that at a high rate (joints,); 1 if it is
+        configured.
+        """
+        return np.ones(len(given.joints)) if given.stabiliser is not None else self._damping(given)[1]
+
+    def _damping(self, given: Config) -> tuple[Array, Array]:
+        """Damping of each joint's stabiliser at a high rate (joints,) [N m s/rad], and the fraction of it that this
+        rate allows.
+        """
         held, free = inertias(self.arms.first(SIMULATED), _poses(given))
         # A damper acts one sample late: a larger gain would make a light joint oscillate.
-        turn = 2.0 * np.pi * FREQUENCY
-        damping = 2.0 * DAMPING_RATIO * turn * np.median(held, axis=0)
+        damping = 2.0 * DAMPING_RATIO * 2.0 * np.pi * FREQUENCY * np.median(held, axis=0)
         most = MOST_DAMPING * given.experiment.rate * np.maximum(free.min(axis=0), 0.0)
-        share = np.minimum(1.0, most / damping)
-        damping = share * damping
-        stiffness = share * turn**2 * np.median(held, axis=0)
-        gains = StabiliserConfig(stiffness=_rounded(stiffness), damping=_rounded(damping))
-        return given.model_copy(update={"stabiliser": gains})
+        return damping, np.minimum(1.0, most / damping)
 
     def learn(self, config: Config, samples: NDArray[np.void]) -> "ChainBelief":
         """Update the ensemble with a recording; return it unchanged if the recording is too short."""
