@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config.schema import Config, StabiliserConfig
+from hil.config.schema import Config
 from hil.dry_run.chain_prior import prior_arms
 from hil.estimator.chain.model.dynamics import TERMS
 from hil.estimator.chain.model.prior import spread_of
 from hil.estimator.chain.simulation.rollout import ChainArms, inertias, is_physical
 from hil.experiment.chain_watch import linear_parameters
+from hil.pilot.chain_gains import ChainGains
 from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
 from hil.runs.recording import Phase
 
@@ -23,12 +24,6 @@ Array = NDArray[np.float64]
 
 DRAWN = 400
 TAUGHT_HZ = 25.0  # rows of the regression per second of recording
-FREQUENCY, DAMPING_RATIO = 3.0, 0.7
-"""Natural frequency [Hz] and damping ratio of each joint on the stabiliser's spring."""
-
-MOST_DAMPING = 0.2
-"""Largest fraction of a joint's velocity that the damper may remove per sample, with the other joints free."""
-
 _CUT_OFF_TIMES = 6.0  # times the path's highest frequency
 _WIDTH = 0.05  # rad/s
 _LYING_RAD = 0.08
@@ -82,16 +77,12 @@ class ChainBelief:
         """Add stabiliser gains suited to the ensemble, unless the configuration has its own."""
         if given.stabiliser is not None:
             return given
-        held, free = inertias(self.arms.first(SIMULATED), _poses(given))
-        # A damper acts one sample late: a larger gain would make a light joint oscillate.
-        turn = 2.0 * np.pi * FREQUENCY
-        damping = 2.0 * DAMPING_RATIO * turn * np.median(held, axis=0)
-        most = MOST_DAMPING * given.experiment.rate * np.maximum(free.min(axis=0), 0.0)
-        share = np.minimum(1.0, most / damping)
-        damping = share * damping
-        stiffness = share * turn**2 * np.median(held, axis=0)
-        gains = StabiliserConfig(stiffness=_rounded(stiffness), damping=_rounded(damping))
+        gains = self.gains(given).at(given.experiment.rate)
         return given.model_copy(update={"stabiliser": gains})
+
+    def gains(self, given: Config) -> ChainGains:
+        """Limits of the stabiliser's gains for the ensemble."""
+        return ChainGains.of(given, self.arms.first(SIMULATED), _poses(given))
 
     def learn(self, config: Config, samples: NDArray[np.void]) -> "ChainBelief":
         """Update the ensemble with a recording; return it unchanged if the recording is too short."""
@@ -228,7 +219,3 @@ def _filled(position: Array) -> Array:
         if missing.any() and not missing.all():
             column[missing] = np.interp(at[missing], at[~missing], column[~missing])
     return filled
-
-
-def _rounded(values: Array) -> list[float]:
-    return [float(f"{value:.3g}") for value in values]
