@@ -26,11 +26,23 @@ def doubts(config: Config) -> Iterator[str]:
     space = Space.of(config)
     for doubt in space.shapes.doubts:
         yield f"{arm.path.name}: {doubt}"
+    yield from unchecked(space)
+
+
+def unchecked(space: Space) -> Iterator[str]:
+    """Yield one sentence per pair of links with parts whose distance is not checked."""
     for first, second in space.as_built:
         yield (
             f"Some parts of {first!r} and {second!r} are closer than clearance.margin in nearly every pose, as if by "
             "design. The distance between these parts is not checked; that between all other parts is."
         )
+
+
+def near_by_design(space: Space) -> Iterator[str]:
+    """Yield a sentence that lists the pairs of links with parts that need no margin, if there are any."""
+    if space.near:
+        pairs = ", ".join(f"{first} and {second}" for first, second in space.near)
+        yield f"Parts of these links are near each other by design: they must not touch, but need no margin: {pairs}."
 
 
 def _same_direction(config: Config, joint: JointConfig) -> str:

@@ -57,15 +57,21 @@ class ChainPrediction:
 
 
 def predict_chain(
-    config: Config, plan: Plan, arms: ChainArms, tell: Tell | None = None, shown: int = 0
+    config: Config,
+    plan: Plan,
+    arms: ChainArms,
+    tell: Tell | None = None,
+    shown: int = 0,
+    passed: NDArray[np.bool_] | None = None,
 ) -> ChainPrediction:
     """Simulate `plan` on every arm. Raises ArmFileError, ConfigError.
 
-    tell: called with the number of simulations done and their total. shown: number of motions to store.
+    tell: called with the number of simulations done and their total. shown: number of motions to store. passed: as in
+    `resting_stops`.
     """
     space = Space.of(config)
     limits, rest = limits_of(config), np.array(config.arm.rest_pose)
-    stops = resting_stops(config, arms)
+    stops = resting_stops(config, arms, passed)
     values = np.zeros((arms.size, *limits.shape))
     rooms = np.full(arms.size, np.inf)
     worst: tuple[float, Nearest, str, float] | None = None

@@ -13,17 +13,18 @@ from numpy.typing import NDArray
 from hil.clearance.space import LYING_RAD, Nearest, Space
 from hil.config.schema import Config
 from hil.dry_run.resting_stops import resting_stops
-from hil.estimator.chain.simulation.rollout import ChainArms, Loop, roll_out
+from hil.estimator.chain.simulation.rollout import COULOMB, SCALE, ChainArms, Loop, Pull, roll_out, weights
 from hil.estimator.progress import Tell, counted
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import PathSegment
 from hil.plan.plan import Plan
-from hil.plan.way_home import WayHome
+from hil.plan.way_home import PULL_PER_S, PULL_SHARE, WayHome
 
 Array = NDArray[np.float64]
 
 MOMENTS, ARMS = 16, 6
 FALL_S = 1.5
+SATURATED = 0.98
 LAID_DOWN = 0.95
 """Share of the simulated stops that must end in the rest pose."""
 
@@ -50,8 +51,7 @@ class LoweringForeseen:
     """Predicted lowering.
 
     seconds: longest duration [s]. nearest: least clearance. lies: fraction of simulations that end in the rest pose.
-    joint: name of the joint that ends farthest from it, `away` [rad]. limit: name of the setting that limits its
-    torque. slower: the change of settings that makes the lowering slower.
+    joint: name of the joint that ends farthest from it, `away` [rad]. helps: what to do about that joint.
     """
 
     seconds: float
@@ -59,8 +59,7 @@ class LoweringForeseen:
     lies: float
     joint: str
     away: float
-    limit: str
-    slower: str
+    helps: str
 
 
 @dataclass(frozen=True)
@@ -77,22 +76,28 @@ class ChainStops:
         if down.nearest.room < 0.0:
             return (
                 f"too little clearance when a stop lowers the arm, {down.nearest}, at least "
-                f"{1e3 * down.nearest.needed:.0f} mm required"
+                f"{1e3 * down.nearest.needed:.0f} mm required. A lower safety.lower_speed, a rest_pose farther from "
+                "obstacles and masses that are given more accurately help"
             )
         if down.lies < LAID_DOWN:
             return (
                 f"only {100 * down.lies:.0f} % of the simulated stops bring the arm to the rest pose, but at least "
-                f"{100 * LAID_DOWN:.0f} % must: {down.joint!r} ends up to {down.away:.2g} rad away. Raise its "
-                f"{down.limit}, {down.slower}, choose a rest_pose in which gravity pulls it less or farther from its "
-                "limits, or give the masses more accurately"
+                f"{100 * LAID_DOWN:.0f} % must: {down.joint!r} ends up to {down.away:.2g} rad away. "
+                f"{down.helps}"
             )
         return ""
 
 
-def foreseen_stops(config: Config, plan: Plan, arms: ChainArms, tell: Tell | None = None) -> ChainStops:
+def foreseen_stops(
+    config: Config,
+    plan: Plan,
+    arms: ChainArms,
+    tell: Tell | None = None,
+    passed: NDArray[np.bool_] | None = None,
+) -> ChainStops:
     """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError.
 
-    tell: called with the number of simulations done and their total.
+    tell: called with the number of simulations done and their total. passed: as in `resting_stops`.
     """
     segment = plan.segments[0]
     assert isinstance(segment, PathSegment)
@@ -103,7 +108,8 @@ def foreseen_stops(config: Config, plan: Plan, arms: ChainArms, tell: Tell | Non
     starts = [(each / plan.rate, path.position[:, each], path.velocity[:, each]) for each in moments]
     told = counted(tell, 2 * len(starts) * few.size)
     return ChainStops(
-        _hardest(config, plan.rate, few, starts, told), _lowered(config, plan, segment, few, starts, told)
+        _hardest(config, plan.rate, few, starts, told),
+        _lowered(config, plan, few, starts, told, resting_stops(config, few, passed)),
     )
 
 
@@ -145,30 +151,48 @@ def _dropped(space: Space, first: Array, before: Array, last: Array, rate: float
     return float(((top - bottom) @ up).max()), float(np.linalg.norm(bottom - former, axis=-1).max() * rate)
 
 
-def _slower(config: Config, longest: float) -> str:
-    """Return how to slow down a lowering whose path takes at most `longest` [s]."""
-    return "raise safety.lower_time" if longest >= config.safety.lower_time else "lower safety.lower_speed"
+def _helps(config: Config, at: int, longest: float, used: float, needed: float) -> str:
+    """Return what to do about a joint that a lowering leaves away from the rest pose.
+
+    longest: duration of the longest path [s]. used: largest torque, relative to the limit. needed: the largest that
+    the simulated arms need to move slowly [N m].
+    """
+    joint = config.joints[at]
+    slower = "raise safety.lower_time" if longest >= config.safety.lower_time else "lower safety.lower_speed"
+    if needed > joint.goal_limit * joint.torque_per_goal:
+        wanted = f"{1.1 * needed / joint.torque_per_goal:.2g} {joint.drive_mode.goal_unit}"
+        first = f"Raise its {joint.goal_limit_name} to {wanted} if it bears that, "
+    elif used > SATURATED:
+        first = f"Raise its {joint.goal_limit_name}, {slower}, "
+    else:  # what is left is friction, or an error of the masses, against a spring that is soft at a low rate
+        first = f"Raise experiment.rate above {config.experiment.rate:g}, with which its stabiliser gets stiffer, "
+    return f"{first}choose a rest_pose in which gravity pulls it less, or give the masses more accurately"
 
 
 def _lowered(
     config: Config,
     plan: Plan,
-    segment: PathSegment,
     arms: ChainArms,
     starts: list[tuple[float, Array, Array]],
     told: Callable[[], None],
+    stops: Array,
 ) -> LoweringForeseen:
+    segment = plan.segments[0]
+    assert isinstance(segment, PathSegment)
     assert config.stabiliser is not None  # checked with the configuration
     way, space, rest = WayHome(config, plan), Space.of(config), np.array(config.arm.rest_pose)
     stiffness, damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
-    stops = resting_stops(config, arms)
-    longest, lies, worst, away = 0.0, [], None, np.zeros(len(rest))
+    longest, lies, worst = 0.0, [], None
+    away, used, needed = (np.zeros(len(rest)) for _ in range(3))
     for _, position, velocity in starts:
         home = way.path(position, velocity)
         goal = segment.thought.of(home).T + stiffness * (home.position.T - rest) + damping * home.velocity.T
-        loop = Loop(plan.rate, goal, stiffness, damping, rest, torque_limits(config), stops)
+        pull = Pull(home.position.T, PULL_PER_S, PULL_SHARE)
+        loop = Loop(plan.rate, goal, stiffness, damping, rest, torque_limits(config), stops, pull)
         motions = roll_out(arms, loop, position, velocity)
         longest = max(longest, len(goal) / plan.rate)
+        used = np.maximum(used, np.nanmax(np.abs(motions.torque), axis=(0, 1)) / torque_limits(config))
+        needed = np.maximum(needed, _needed(arms, position))
         for arm in range(arms.size):
             q = np.nan_to_num(motions.position[arm].T, nan=1e3)
             off = np.abs(q[:, -1] - rest)
@@ -187,6 +211,12 @@ def _lowered(
         float(np.mean(lies)),
         config.joints[farthest].name,
         float(min(away[farthest], np.pi)),
-        config.joints[farthest].goal_limit_name,
-        _slower(config, longest),
+        _helps(config, farthest, longest, float(used[farthest]), float(needed[farthest])),
     )
+
+
+def _needed(arms: ChainArms, pose: Array) -> Array:
+    """Torque with which each joint moves slowly in this pose, of the arm that needs most (joints,) [N m]."""
+    each = (np.abs(weights(arms, pose)) + arms.drive[:, COULOMB]) / arms.drive[:, SCALE]
+    most: Array = each.max(axis=0)
+    return most

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from hil.clearance.doubts import doubts
+from hil.clearance.doubts import doubts, near_by_design
 from hil.clearance.space import Space
 from hil.config.schema import Config
 from hil.dry_run.chain_prediction import ChainPrediction
@@ -25,7 +25,8 @@ class ChainDryRun:
     config: with the path and stabiliser that would be used. share: fraction of the designed path's amplitude; 1 if
     [joint_path] gives the path. shapes_guessed: links without readable geometry. as_built: pairs of links with parts
     that are closer than the margin in nearly every pose and are not checked. refused: why the pilot has no safe first
-    step; "" if it has one, None without a pilot, whose decision counts.
+    step; "" if it has one, None without a pilot, whose decision counts. on_stops: which joints are assumed to lie on
+    their own stops.
     """
 
     config: Config
@@ -38,6 +39,7 @@ class ChainDryRun:
     as_built: tuple[tuple[str, str], ...]
     servos: tuple[str, ...]
     refused: str | None = None
+    on_stops: str = ""
 
     @property
     def prediction(self) -> Prediction:
@@ -105,6 +107,7 @@ def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
             "time_s": round(run.foreseen.moment, 2),
             "shapes_guessed": list(run.shapes_guessed),
             "touch_as_built": [list(pair) for pair in run.as_built],
+            "near_as_built": [list(pair) for pair in Space.of(config).near],
         },
         "lowering": {
             "longest_s": round(lowering.seconds, 2),
@@ -121,6 +124,7 @@ def chain_dry_run_json(run: ChainDryRun) -> dict[str, Any]:
             "beyond_limits_rad": [round(float(value), 3) for value in fall.beyond],
         },
         "joints": joints_json(config, peaks),
+        "assumed_on_own_stops": run.on_stops or None,
         "servos": list(run.servos),
     }
 
@@ -166,11 +170,9 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         f"{fall.moment:.1f} s into the path: {hit} {when} {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, "
         f"at {fall.speed:.1f} m/s.",
     ]
-    if near := Space.of(run.config).near:
-        pairs = ", ".join(f"{a} and {b}" for a, b in near)
-        lines.append(
-            f"Parts of these links are near each other by design: they must not touch, but need no margin: {pairs}."
-        )
+    lines += near_by_design(Space.of(run.config))
+    if run.on_stops:
+        lines.append(run.on_stops)
     lines += [f"Warning: {doubt}" for doubt in doubts(run.config)]
     if run.share < 1.0:
         lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which is shown here.")

@@ -19,11 +19,17 @@ NEAR_STOP_RAD = 0.14
 """A joint that lies on its stop is at most this far from the end of its range, as configured or described [rad]."""
 
 
-def resting_stops(config: Config, arms: ChainArms) -> Array:
+PASSED_RAD = 0.05
+"""A joint that was this far beyond its rest pose does not lie on its stop there: no stop gives way as much [rad]."""
+
+
+def resting_stops(config: Config, arms: ChainArms, passed: NDArray[np.bool_] | None = None) -> Array:
     """Side on which each joint lies on its stop (joints,): -1 at its smallest angle, 1 at its largest, 0 if on neither.
 
     It does if its rest pose is near the end of its range, nothing else touches the part of the arm that it moves, and
-    gravity does not pull it away from there. Raises ArmFileError.
+    gravity does not pull it away from there. A support that the description lacks looks the same until the joint has
+    moved beyond its rest pose. passed: whether each joint has (-, + side; joints), as `passed_rest` returns it. Raises
+    ArmFileError.
     """
     rest = np.array(config.arm.rest_pose)
     low, high = _ends(config, rest)
@@ -32,7 +38,33 @@ def resting_stops(config: Config, arms: ChainArms) -> Array:
     side[Space.of(config).is_touched] = 0.0
     pulled = side * weights(arms, rest).mean(axis=0)
     side[pulled > PRESSED_SHARE * torque_limits(config)] = 0.0
+    if passed is not None:
+        side[np.where(side < 0.0, passed[0], passed[1])] = 0.0
     return side
+
+
+def passed_rest(config: Config, position: Array) -> NDArray[np.bool_]:
+    """Whether each joint was below and above its rest pose (2, joints) in a recording (samples, joints) [rad]."""
+    away = position - np.array(config.arm.rest_pose)
+    away = np.where(np.isfinite(away), away, 0.0)
+    found: NDArray[np.bool_] = np.stack((away.min(axis=0) < -PASSED_RAD, away.max(axis=0) > PASSED_RAD))
+    return found
+
+
+def said_of_stops(config: Config, side: Array) -> str:
+    """Say which joints are assumed to lie on their own stops, and what follows if they do not; "" if none are."""
+    found = []
+    for joint, each, rest in zip(config.joints, side.tolist(), config.arm.rest_pose, strict=True):
+        if each:
+            room = max(0.0, each * (joint.position_limit[each > 0.0] - rest))
+            found.append(f"{joint.name!r} ({room:.2f} rad)")
+    if not found:
+        return ""
+    return (
+        f"Assumed to lie on their own mechanical stops in the rest pose, since nothing described touches them: "
+        f"{', '.join(found)}. If something else carries them there, name it in [clearance] (floor, boxes): otherwise "
+        "they may sag further than foreseen, by what is given in brackets, before position_limit stops the arm."
+    )
 
 
 def _ends(config: Config, rest: Array) -> tuple[Array, Array]:

@@ -1,8 +1,9 @@
 """Stop of an arm that cannot hang freely: brake, then lower it to its rest pose while its servos accept commands.
 
 The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the path
-home. Lowering is monitored like the experiment: a missing reply, an alert, a current that does not follow its goal or a
-joint that leaves the path ends it, and torque is cut. The damper acts on velocities that the positions confirm.
+home; where a joint stays off the path, further torque towards it grows. Lowering is monitored like the experiment: a
+missing reply, an alert, a current that does not follow its goal or a joint that leaves the path ends it, and torque is
+cut. The damper acts on velocities that the positions confirm.
 """
 
 import numpy as np
@@ -13,10 +14,11 @@ from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.errors import Cause, ExperimentError, SafetyStop
 from hil.experiment.guard import Guard
+from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import SETTLE_IN, PathSegment
 from hil.plan.plan import Plan
 from hil.plan.recent_motion import RecentMotion
-from hil.plan.way_home import WayHome
+from hil.plan.way_home import PULL_PER_S, PULL_SHARE, WayHome
 
 LEAVES_RAD = 0.35
 """Largest accepted tracking error: a joint with a larger one does not follow its path home."""
@@ -52,6 +54,8 @@ class Lowering:
         self._planned = [float(peak) for peak in np.max([each.peak_goal for each in plan.segments], axis=0)]
         self._stiffness, self._damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
         self._constants = np.array([joint.torque_per_goal for joint in config.joints])
+        self._growth = PULL_PER_S / plan.rate * self._stiffness
+        self._most_pull = PULL_SHARE * torque_limits(config)
         self._fade = max(1, round(SETTLE_IN * plan.rate))
         self._rest = np.array(config.arm.rest_pose)
         self._thought.of(self._way.path(self._rest, np.zeros_like(self._rest)))  # compile in advance
@@ -84,8 +88,9 @@ class Lowering:
         self._path = self._way.path(position, velocity)
         torque = self._thought.of(self._path)
         count = torque.shape[1]
-        share = np.clip((count - np.arange(count)) / self._fade, 0.0, 1.0)
-        self._feed = (share * torque).T
+        self._share = np.clip((count - np.arange(count)) / self._fade, 0.0, 1.0)
+        self._feed = (self._share * torque).T
+        self._pull = np.zeros_like(position)
         self._position, self._velocity = self._path.position.T.copy(), self._path.velocity.T.copy()
         self._guard = _guard_of(self._config, self._planned, self._path.position, velocity, self._interval, recent)
         self._guard.holding(goal)
@@ -95,8 +100,12 @@ class Lowering:
         """Goals [A or V] of one sample, from the previous sample's state. Raises SafetyStop."""
         velocity = np.array(self._recent.believed(state))
         ahead = self._position[index] - np.array(state.position), self._velocity[index] - velocity
-        held = np.where(np.array(state.missing), 0.0, self._stiffness * ahead[0] + self._damping * ahead[1])
-        return self._guard.clamp(((self._feed[index] + held) / self._constants).tolist())
+        missing = np.array(state.missing)
+        held = np.where(missing, 0.0, self._stiffness * ahead[0] + self._damping * ahead[1])
+        more = np.where(missing, 0.0, self._growth * ahead[0])
+        self._pull = np.clip(self._pull + more, -self._most_pull, self._most_pull)
+        torque = self._feed[index] + self._share[index] * self._pull + held
+        return self._guard.clamp((torque / self._constants).tolist())
 
     def look(self, index: int, state: State, gap: float, *, between: bool = False) -> None:
         """Process an exchange. Raises SafetyStop if the arm leaves its path home or a servo is faulty."""

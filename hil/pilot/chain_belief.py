@@ -80,6 +80,16 @@ class ChainBelief:
         gains = self.gains(given).at(given.experiment.rate)
         return given.model_copy(update={"stabiliser": gains})
 
+    def stiffness_share(self, given: Config) -> Array:
+        """Stiffness of each joint's stabiliser at this rate, relative to that at a high rate (joints,); 1 if it is
+        configured.
+        """
+        if given.stabiliser is not None:
+            return np.ones(len(given.joints))
+        gains = self.gains(given)
+        share: Array = gains.stiffness_at(given.experiment.rate) / gains.stiffness
+        return share
+
     def gains(self, given: Config) -> ChainGains:
         """Limits of the stabiliser's gains for the ensemble."""
         return ChainGains.of(given, self.arms.first(SIMULATED), _poses(given))

@@ -57,12 +57,15 @@ class ChainGains:
 
     def at(self, rate: float) -> StabiliserConfig:
         """Return the gains for a rate [Hz]."""
-        damping = np.minimum(self.damping, MOST_DAMPING * rate * self.lightest)
-        most = MOST_DRIVING * rate / DELAY_SAMPLES * (damping + self.friction)
-        return StabiliserConfig(
-            stiffness=_rounded(np.minimum(self.stiffness, most)),
-            damping=_rounded(damping),
-        )
+        return StabiliserConfig(stiffness=_rounded(self.stiffness_at(rate)), damping=_rounded(self._damping_at(rate)))
+
+    def stiffness_at(self, rate: float) -> Array:
+        """Stiffness of each joint (joints,) at a rate [Hz], before rounding [N m/rad]."""
+        most: Array = MOST_DRIVING * rate / DELAY_SAMPLES * (self._damping_at(rate) + self.friction)
+        return np.minimum(self.stiffness, most)
+
+    def _damping_at(self, rate: float) -> Array:
+        return np.minimum(self.damping, MOST_DAMPING * rate * self.lightest)
 
     @property
     def sufficient_rate(self) -> float:

@@ -6,6 +6,7 @@ from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import ChainDryRun
+from hil.dry_run.resting_stops import resting_stops, said_of_stops
 from hil.dry_run.supply_speed import lowered, within_supply
 from hil.errors import NoSafeTorque
 from hil.estimator.chain.simulation.rollout import ChainArms
@@ -68,4 +69,5 @@ def _simulated(
     foreseen = predict_chain(config, plan, arms, tell, SHOWN)
     stops, space = foreseen_stops(config, plan, arms, tell), Space.of(config)
     guessed, built = space.shapes.guessed, space.as_built
-    return ChainDryRun(config, "prior", arms.size, share, foreseen, stops, guessed, built, servos, refused)
+    on_stops = said_of_stops(config, resting_stops(config, arms))
+    return ChainDryRun(config, "prior", arms.size, share, foreseen, stops, guessed, built, servos, refused, on_stops)

@@ -14,7 +14,9 @@ import numpy as np
 
 from hil.config.schema import Config
 from hil.dry_run.prediction import peaks_of
+from hil.dry_run.resting_stops import passed_rest
 from hil.errors import DidNotMove, ExperimentError, NotSettled
+from hil.estimation.after_a_stop import can_be_estimated
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.experiment.stop_request import StopRequest
@@ -148,8 +150,11 @@ class ChainSearch(SafeShares):
         return error
 
     def learn(self, config: Config, folder: RunFolder) -> None:
-        """Update the belief with the recording in a folder."""
-        self.belief = self.belief.learn(config, load_samples(folder.samples_path, len(config.joints)))
+        """Update the belief, and which joints lie on their own stops, with the recording in a folder."""
+        samples = load_samples(folder.samples_path, len(config.joints))
+        self.belief = self.belief.learn(config, samples)
+        found = passed_rest(config, samples["position"])
+        self.passed = found if self.passed is None else self.passed | found
 
     def _compare(
         self, config: Config, folder: RunFolder, name: str, found: Found, error: ExperimentError | None
@@ -201,7 +206,10 @@ def identify_chain_in_steps(
 
 
 def _full(search: ChainSearch) -> str:
-    """Play the full run; repeat it with a smaller amplitude if it exceeds a limit or never settles."""
+    """Play the full run; repeat it with a smaller amplitude if it exceeds a limit or never settles.
+
+    If the last one fails only in its second path, which serves to validate the result, the first is enough.
+    """
     tries = 3
     for number in range(1, tries + 1):
         config = search.config
@@ -211,6 +219,9 @@ def _full(search: ChainSearch) -> str:
         if error is None:
             return search.torque
         if number == tries:
+            if isinstance(error, NotSettled | DidNotMove) and can_be_estimated(search.run.path):
+                search.say("The path to identify was recorded before; the estimate uses it without a second path.")
+                return search.torque
             raise error
         search.learn(config, search.run)
         before = search.cap

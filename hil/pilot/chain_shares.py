@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hil.config.schema import Config
+from hil.config.schema import Config, PriorConfig
 from hil.dry_run.chain_prediction import ChainPrediction, predict_chain, simulated_seconds
 from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import nearest_limit, unsafe
-from hil.dry_run.prediction import QUANTITIES
+from hil.dry_run.prediction import GUARDED, QUANTITIES, Prediction
 from hil.errors import NoSafeTorque
 from hil.estimator.progress import Tell
 from hil.pilot.chain_belief import ChainBelief
@@ -22,6 +23,8 @@ from hil.pilot.steps import Say
 from hil.plan.chain_model import limit_names
 from hil.plan.chain_plan import NoHeadroom
 from hil.plan.plan import Plan
+
+Array = NDArray[np.float64]
 
 SEARCH_ARMS, ARMS = 24, 72
 """Number of arms simulated while searching for a share, and to confirm the one found."""
@@ -49,6 +52,13 @@ STOPPED_SHARE = 0.5
 RAISED_RATE = 1.6
 """Ratio of the first higher rate that is tried, for advice, to the configured one."""
 
+ROOM = 1.2
+"""Advised room beyond a limit, relative to how far the simulated arms exceed it."""
+
+SATURATED = 0.98
+LEAST_SPREAD_SHARE = 0.1
+"""Advised spread of the masses, relative to the present one, below which no spread is advised."""
+
 
 @dataclass(frozen=True)
 class Found:
@@ -66,7 +76,8 @@ class SafeShares:
     last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are shares of `paths`,
     and are converted when these are replaced. tell: called with the progress of each simulation of the arms, designing:
     with that of each path's design, trying: with a description of each path and amplitude before it is simulated.
-    simulated: motion simulated so far [s].
+    simulated: motion simulated so far [s]. passed: whether each joint was beyond its rest pose in a run, as in
+    `resting_stops`.
     """
 
     given: Config
@@ -79,6 +90,7 @@ class SafeShares:
     designing: Tell | None = None
     trying: Callable[[str], None] | None = None
     simulated: float = 0.0
+    passed: NDArray[np.bool_] | None = None
     _path: int = 0
 
     @property
@@ -239,10 +251,11 @@ class SafeShares:
             plan = self.paths.plan(config, self.belief.torque, share)
         except NoHeadroom as error:  # the arm is heavier than the paths were designed for
             return None, f"{error} {_better_known(config)}", 0.0
-        foreseen = predict_chain(config, plan, self.belief.arms.first(count), self.tell)
+        foreseen = predict_chain(config, plan, self.belief.arms.first(count), self.tell, passed=self.passed)
         self.simulated += count * simulated_seconds(plan)
         not_safe = unsafe(config, foreseen)
-        why = f"{not_safe}. {_remedy(config, foreseen)}" if not_safe else ""
+        stiffness = self.belief.stiffness_share(self.given)
+        why = f"{not_safe}. {_remedy(config, foreseen, stiffness)}" if not_safe else ""
         return Found(share, plan, foreseen), why, -float(foreseen.rooms.min())
 
     def _worth(self, paths: Paths, found: Found) -> float:
@@ -254,7 +267,7 @@ class SafeShares:
         if config.safety.stop == "cut":
             return ""
         self.simulated += STOPPED_SHARE * ARMS * simulated_seconds(plan)
-        return foreseen_stops(config, plan, self.belief.arms.first(ARMS), self.tell).unsafe
+        return foreseen_stops(config, plan, self.belief.arms.first(ARMS), self.tell, self.passed).unsafe
 
 
 def _round_rate(rate: float, period: float) -> float:
@@ -274,22 +287,70 @@ def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(min(1.0, most / shares[0]) * share for share in shares)
 
 
-def _remedy(config: Config, foreseen: ChainPrediction) -> str:
+def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
     """Return the changes with which a user may make a path safe that `unsafe` rejects."""
     if not foreseen.is_clear:
         helps = "A rest_pose farther from obstacles, or more room in [clearance] (floor, boxes, margin)"
+        return f"{helps}, if the arm allows it, helps. {_better_known(config)}"
+    return limit_remedy(config, foreseen.peaks, stiffness)
+
+
+def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
+    """Return what to change, and by how much, so that a joint no longer exceeds a limit in some of the arms.
+
+    stiffness: of each joint's stabiliser at this rate, relative to that at a high rate (joints,).
+    """
+    row, at = nearest_limit(peaks)
+    joint, limit, rate = config.joints[at], float(peaks.limits[row, at]), config.experiment.rate
+    typical, reached = float(peaks.median[row, at]), float(peaks.quantile[row, at])
+    share = (limit - typical) / (reached - typical) if reached != typical else 0.0
+    has_room = LEAST_SPREAD_SHARE < share < 1.0
+    helps = []
+    if stiffness[at] < 1.0:
+        wanted = min(1.0 / stiffness[at], ROOM * _too_soft(peaks))
+        helps.append(
+            f"a rate of about {float(f'{wanted * rate:.2g}'):g} Hz instead of {rate:g} (at {rate:g} Hz the stabiliser "
+            f"of {joint.name!r} has {100 * stiffness[at]:.0f} % of its stiffness at a high rate)"
+        )
+    wanted = limit + ROOM * (reached - limit)
+    if QUANTITIES[row] == "velocity":
+        helps.append(f"a velocity_limit of at least {wanted:.2g} rad/s for {joint.name!r}, if the arm allows it")
     else:
-        is_speed = QUANTITIES[nearest_limit(foreseen.peaks)[0]] == "velocity"
-        helps = "A larger velocity_limit" if is_speed else "A wider position_limit, or a rest_pose farther from it"
-    return f"{helps}, if the arm allows it, helps. {_better_known(config)}"
+        side = "lower" if QUANTITIES[row] == "lowest position" else "upper"
+        helps.append(
+            f"a position_limit of {joint.name!r} whose {side} end is {wanted:.2f} rad, if the arm allows it, or a "
+            f"rest_pose {abs(wanted - limit):.2f} rad farther from that end"
+        )
+    torque = QUANTITIES.index("torque")
+    if peaks.quantile[torque, at] > SATURATED * peaks.limits[torque, at]:
+        helps.append(f"a larger {joint.goal_limit_name} of {joint.name!r}, all of which some arms need")
+    if has_room:
+        spread = _spread(config)
+        helps.append(
+            f"masses in the URDF that are known better ([arm.prior] spread = {share * spread:.2g} instead of "
+            f"{spread:g})"
+        )
+    return f"What helps: {'; '.join(helps)}"
+
+
+def _too_soft(peaks: Prediction) -> float:
+    """Factor by which a stiffer stabiliser would keep all joints within their limits, infinite if none would."""
+    middle, reached = (peaks.median[:GUARDED], peaks.quantile[:GUARDED])
+    room, way = (np.abs(each - middle) for each in (peaks.limits[:GUARDED], reached))
+    is_typical = (peaks.limits[:GUARDED] - middle) * (reached - middle) < 0.0
+    with np.errstate(divide="ignore"):
+        return float(np.where(is_typical & (way > 0.0), np.inf, way / room).max())
 
 
 def _better_known(config: Config) -> str:
-    spread = 0.3 if config.arm.prior is None else config.arm.prior.spread
     return (
-        f"Masses in the URDF that are known better ([arm.prior] spread below {spread:g}) help too, as does a larger "
-        f"{limit_names(config)}"
+        f"Masses in the URDF that are known better ([arm.prior] spread below {_spread(config):g}) help too, as does a "
+        f"larger {limit_names(config)}"
     )
+
+
+def _spread(config: Config) -> float:
+    return (config.arm.prior or PriorConfig()).spread
 
 
 def step_config(config: Config) -> Config:

@@ -18,6 +18,14 @@ Array = NDArray[np.float64]
 STATIONS = 16
 """Number of poses of the planned transition at which an arm may join it."""
 
+PULL_PER_S, PULL_SHARE = 2.0, 0.25
+"""Growth of a further torque towards the path, relative to the spring's [1/s], and its largest value, relative to the
+joint's largest torque.
+
+The spring alone is too weak for the friction of a light joint at a low rate, where it must be soft to be stable: its
+joint would stop tenths of a radian from the rest pose.
+"""
+
 LOOKED_AT = 25  # poses of a straight line that are checked
 PEAK = 1.875  # ratio of a fifth-order polynomial's peak speed to its mean speed
 SHORTEST_S = 0.6

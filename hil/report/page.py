@@ -15,6 +15,7 @@ from hil.errors import RunFolderError
 from hil.report.chart import Chart, Figure
 from hil.report.run_data import RunData
 from hil.report.section import Section
+from hil.report.sections.clearance import clearance
 from hil.report.sections.correlation import correlation
 from hil.report.sections.friction import friction
 from hil.report.sections.limits import limits
@@ -43,6 +44,7 @@ SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
     spectra,
     correlation,
     limits,
+    clearance,
     stabiliser,
     steps,
     timing,

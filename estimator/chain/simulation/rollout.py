@@ -78,6 +78,7 @@ class Loop:
     stops: side on which a joint lies on its own stop in the rest pose (joints,), -1, 1, or 0 if it does not; None if
     none does. A stop supports its joint instead of the surface, and wherever the other joints are. Nothing supports a
     joint whose largest torque is 0.
+    pull: added to the spring and damper; None if they act alone.
     """
 
     rate: float
@@ -87,6 +88,20 @@ class Loop:
     pose: Array
     limit: Array
     stops: Array | None = None
+    pull: "Pull | None" = None
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Torque that grows while a joint is off its path, so that friction and unknown weights do not hold it there.
+
+    path: positions (samples, joints) [rad]. per_second: growth relative to the spring's torque [1/s]. share: largest
+    value, as a fraction of the joint's largest torque.
+    """
+
+    path: Array
+    per_second: float
+    share: float
 
 
 @dataclass(frozen=True)
@@ -118,7 +133,7 @@ def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = No
     pressed = np.where(is_carried, -np.sign(pressed), 0.0)
     software = tuple(
         np.ascontiguousarray(each, dtype=np.float64)
-        for each in (loop.goal, loop.stiffness, loop.damping, loop.pose, loop.limit, stops)
+        for each in (loop.goal, loop.stiffness, loop.damping, loop.pose, loop.limit, stops, *_pull_of(loop))
     )
     for arm in range(arms.size):
         link, armature = _split(arms, arm)
@@ -128,6 +143,13 @@ def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = No
             *(room(n), position[arm], velocity[arm], torque[arm]),
         )
     return Motions(position, velocity, torque)
+
+
+def _pull_of(loop: Loop) -> tuple[Array, Array, Array]:
+    """Path (samples, joints), empty if there is none, growth per sample and rad (joints,), largest torque (joints,)."""
+    if loop.pull is None:
+        return np.empty((0, len(loop.limit))), np.zeros_like(loop.limit), np.zeros_like(loop.limit)
+    return loop.pull.path, loop.pull.per_second / loop.rate * loop.stiffness, loop.pull.share * loop.limit
 
 
 def weights(arms: ChainArms, pose: Array) -> Array:
@@ -205,15 +227,17 @@ def _roll_loop(  # noqa: PLR0912
     torque: Any,
 ) -> None:
     rotation, translation, axis, gravity = chain
-    goal, stiffness, damping, pose, limit, stops = software
+    goal, stiffness, damping, pose, limit, stops, path, growth, most_pull = software
     n = q.size
-    still, real = np.zeros(n), np.zeros(n)
+    still, real, pull = np.zeros(n), np.zeros(n), np.zeros(n)
     seen_q, seen_v = q.copy(), v.copy()
     A, inverse, factor = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
     b, u = np.zeros(n), np.zeros(n)
     for k in range(goal.shape[0]):
         for j in range(n):
-            wanted = goal[k, j] + stiffness[j] * (pose[j] - seen_q[j]) - damping[j] * seen_v[j]
+            if path.shape[0] > 0:
+                pull[j] = min(max(pull[j] + growth[j] * (path[k, j] - seen_q[j]), -most_pull[j]), most_pull[j])
+            wanted = goal[k, j] + pull[j] + stiffness[j] * (pose[j] - seen_q[j]) - damping[j] * seen_v[j]
             u[j] = min(max(wanted, -limit[j]), limit[j])
             seen_q[j], seen_v[j] = q[j], v[j]
             position[k, j], velocity[k, j], torque[k, j] = q[j], v[j], u[j]

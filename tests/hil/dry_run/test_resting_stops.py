@@ -4,7 +4,7 @@ import numpy as np
 
 from hil.config.schema import Config, load_config
 from hil.dry_run.chain_prior import prior_arms
-from hil.dry_run.resting_stops import resting_stops
+from hil.dry_run.resting_stops import passed_rest, resting_stops, said_of_stops
 from hil.estimator.chain.simulation.rollout import OFFSET
 from hil.plan.chain_model import known_chain
 from tests.support.paths import CONFIGS
@@ -38,3 +38,20 @@ def test_an_arm_folded_onto_itself_may_be_carried_by_itself() -> None:
     rest = np.array(config.arm.rest_pose)
     assert (np.minimum(rest - low, high - rest) < 0.1).sum() >= 3
     assert stops_of(config) == [0] * 5
+
+
+def test_a_joint_that_was_beyond_its_rest_pose_was_carried_by_something_else() -> None:
+    config = load_config(CONFIGS / "wx250s.toml")
+    arms, rest = prior_arms(config, known_chain(config), 6), np.array(config.arm.rest_pose)
+    for sagged, side in ((0.1, 0.0), (0.02, 1.0), (-0.1, 1.0)):  # the last one moves away from the stop
+        motion = np.tile(rest, (3, 1))
+        motion[1, 2] += sagged
+        motion[2] = np.nan
+        assert resting_stops(config, arms, passed_rest(config, motion))[2] == side
+
+
+def test_what_is_assumed_is_said_with_how_far_a_joint_may_sag_if_it_is_wrong() -> None:
+    config = load_config(CONFIGS / "wx250s.toml")
+    room = config.joints[2].position_limit[1] - config.arm.rest_pose[2]
+    assert f"{config.joints[2].name!r} ({room:.2f} rad)" in said_of_stops(config, np.array([0, 0, 1, 0, 0, 0]))
+    assert said_of_stops(config, np.zeros(6)) == ""

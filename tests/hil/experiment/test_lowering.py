@@ -106,6 +106,34 @@ def test_a_false_velocity_does_not_drive_the_arm_on_its_way_down() -> None:
     assert max(torque) - min(torque) < 0.1 * config.stabiliser.damping[0] * 4.0
 
 
+def test_torque_towards_the_path_grows_where_a_joint_stays_off_it() -> None:
+    """Friction holds a light joint against a soft spring, but never a joint whose position is unknown."""
+    config = load_config(CONFIGS / NAME)
+    rest, none = np.array(config.arm.rest_pose), (0.0,) * 4
+    off = State(0.0, 0.001, none, none, none, tuple(rest - [0.0, 0.0, 0.0, 0.1]), (0,) * 4, (False,) * 4)
+    lowering = Lowering(config, make_chain_plan(config))
+    count = lowering.begin(off, list(none), seen_moving(config, off))
+    lowering._feed[:], lowering._position[:], lowering._velocity[:] = 0.0, rest, 0.0
+    assert config.stabiliser is not None
+    joint, rate = config.joints[3], config.experiment.rate
+    spring = 0.1 * config.stabiliser.stiffness[3]
+
+    def torque(index: int, state: State) -> float:
+        return lowering.goals(index, state)[3] * joint.torque_per_goal
+
+    assert torque(0, off) == pytest.approx(spring, rel=0.02)
+    unseen = off._replace(position=(*rest[:3], float("nan")), missing=(False, False, False, True))
+    for index in range(round(0.5 * rate)):
+        torque(0, off if index % 2 else unseen)
+    assert torque(0, off) == pytest.approx(1.5 * spring, rel=0.02)
+    for _ in range(round(60 * rate)):
+        last = torque(0, off)
+    assert last == pytest.approx(spring + 0.25 * joint.goal_limit * joint.torque_per_goal, rel=0.02)
+    for index in range(count):
+        last = torque(index, off)
+    assert last == pytest.approx(spring, rel=0.1)  # the joint is let down softly before torque is cut
+
+
 def test_a_second_signal_cuts_torque_on_the_way_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     look, seen = Lowering.look, []
 

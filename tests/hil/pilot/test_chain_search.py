@@ -1,7 +1,9 @@
 """Spatial arms from description, limits and rest pose to the result, on the fake bus; here the smallest one."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 from unittest.mock import MagicMock, Mock
 
@@ -15,11 +17,11 @@ from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_stop import ARMS as STOPPED
 from hil.dry_run.chain_stop import MOMENTS
-from hil.dry_run.chain_summary import chain_dry_run_lines, unsafe
+from hil.dry_run.chain_summary import chain_dry_run_json, chain_dry_run_lines, unsafe
 from hil.errors import Cause, ConfigError, DidNotMove, NoSafeTorque, NotSettled, SafetyStop
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.estimator.chain.excitation.path_design import Design
-from hil.pilot import chain_search
+from hil.pilot import chain_search, chain_shares
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import RESERVE, Paths, Reserve, chain_config
 from hil.pilot.chain_rehearsal import rehearse
@@ -136,6 +138,49 @@ def test_only_a_limit_takes_amplitude_away_not_a_joint_that_friction_holds() -> 
     assert search.cap == 1.0
     search.limit_after(SafetyStop("knee is beyond its limit", Cause.POSITION), played)
     assert search.cap == pytest.approx(0.21)
+
+
+@pytest.mark.parametrize("is_enough", [True, False])
+def test_a_second_path_in_which_a_joint_does_not_move_is_done_without(
+    monkeypatch: pytest.MonkeyPatch, is_enough: bool
+) -> None:
+    stuck, played, said = DidNotMove("knee moved by 0 rad"), Found(0.3, cast("Any", None), cast("Any", None)), Mock()
+    search: Any = Mock(last=0.3, cap=1.0, torque="Torque is off.", say=said)
+    search.safe.return_value, search.play.return_value = played, stuck
+    monkeypatch.setattr(chain_search, "can_be_estimated", lambda _: is_enough)
+    with nullcontext() if is_enough else pytest.raises(DidNotMove, match="knee"):
+        assert chain_search._full(search) == "Torque is off."
+    assert search.play.call_count == 3 and ("second path" in str(said.call_args)) is is_enough
+    search.play.return_value = SafetyStop("knee is beyond its limit", Cause.POSITION)
+    with pytest.raises(SafetyStop):
+        chain_search._full(search)
+
+
+def test_a_joint_that_a_run_saw_beyond_its_rest_pose_is_not_said_to_lie_on_its_stop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config, belief = load_config(LEG), Mock()
+    belief.learn.return_value = belief
+    search, seen = searching(config, belief, cast("Any", None), print), []
+
+    def predicted(*_: object, passed: Any) -> Any:
+        seen.append(passed)
+        return Mock(rooms=np.ones(3))
+
+    def stopped(*given: Any) -> Any:
+        seen.append(given[-1])
+        return SimpleNamespace(unsafe="")
+
+    monkeypatch.setattr(chain_shares, "predict_chain", predicted)
+    monkeypatch.setattr(chain_shares, "foreseen_stops", stopped)
+    monkeypatch.setattr(chain_shares, "unsafe", lambda *_: "")
+    search.paths = Mock()
+    for joint, way in ((1, -0.1), (2, 0.1)):
+        samples = {"position": np.add(config.arm.rest_pose, [np.zeros(3), way * np.eye(3)[joint]])}
+        monkeypatch.setattr(chain_search, "load_samples", lambda *_, samples=samples: samples)
+        search.learn(config, cast("Any", Mock()))
+    assert search._largest(config, (0.3,))[0] is not None
+    assert [passed.tolist() for passed in seen] == 3 * [[[False, True, False], [False, False, True]]]
 
 
 def searching(config: Config, belief: ChainBelief, paths: Paths, say: Say) -> ChainSearch:
@@ -315,6 +360,7 @@ def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) ->
     found = pilot.safe(step_config(pilot.config), PILOT_SHARES)
     assert (first.share, first.is_safe(first.config)) == (found.share, True)
     np.testing.assert_array_equal(first.prediction.values[:12], found.foreseen.peaks.values)
+    assert chain_dry_run_json(first)["clearance"]["near_as_built"] == [["body", "thigh"]]
 
     # More arms than the pilot looks at may add a doubt, which the dry run tells but does not decide by.
     with monkeypatch.context() as patch:

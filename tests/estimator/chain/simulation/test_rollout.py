@@ -4,7 +4,7 @@ import numpy as np
 
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import inverse_dynamics, mass_matrix
-from hil.estimator.chain.simulation.rollout import ChainArms, Loop, is_physical, roll_out, weights
+from hil.estimator.chain.simulation.rollout import ChainArms, Loop, Pull, is_physical, roll_out, weights
 from tests.support.chains import random_chain, random_parameters
 
 RATE = 400.0
@@ -62,6 +62,20 @@ def test_a_joint_on_its_stop_stays_on_it_while_another_moves_away() -> None:
         sagged.append((side[1] * (roll_out(arms, loop, pose).position[0, :, 1] - pose[1])).max())
     assert sagged[0] > 0.2
     assert sagged[1] < 0.02
+
+
+def test_a_pull_that_grows_overcomes_friction_that_a_soft_spring_does_not() -> None:
+    arms, _ = arms_of(3, 5, viscous=0.1)
+    arms.drive[:, 1] = 2.0  # dry friction
+    pose = np.array([0.2, 0.1, -0.3])
+    goal = np.tile(weights(arms, pose)[0], (1200, 1))
+    path = np.tile(pose, (1200, 1))
+    ends = []
+    for pull in (None, Pull(path, 8.0, 1.0), Pull(path, 8.0, 1e-3)):
+        loop = Loop(RATE, goal, np.full(3, 2.0), np.full(3, 0.3), pose, np.full(3, 50.0), pull=pull)
+        ends.append(np.abs(roll_out(arms, loop, pose + 0.2).position[0] - pose).max(axis=1).min())
+    assert ends[0] > 0.15 and ends[2] > 0.15  # the last one's largest value is smaller than the friction
+    assert ends[1] < 0.05
 
 
 def test_an_arm_of_no_mass_distribution_is_told() -> None:
