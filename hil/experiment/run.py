@@ -29,7 +29,7 @@ from hil.runs.timing import lateness_histogram
 from hil.setup.changed_settings import EXPLAINED, WRITTEN, Settings, changed_settings, settings_now
 from hil.setup.lying import from_where_it_lies, said_of_the_rest, tolerance_now, wait_for_rest
 from hil.setup.realtime import on_time
-from hil.setup.servo_session import REBOOT_S, has_moved, servo_session, settings_at_start
+from hil.setup.servo_session import REBOOT_S, confirmed_later, has_moved, servo_session, settings_at_start
 
 __all__ = ["run_experiment"]
 
@@ -151,10 +151,13 @@ def _play(
         note(f"stopped: {cause or 'end of the run.'} {bus.torque_off_report}")
         if isinstance(error, TorqueNotOff):
             _try_again(bus, note)
-            error.args = (str(bus.torque_off_report),)
         if (who := _who_was_silent(bus, cause)) and isinstance(cause, SafetyStop):
             cause.args = (str(cause).partition(NONE_HEARD)[0] + who,)
             note(who)
+        if isinstance(error, TorqueNotOff) and (instead := confirmed_later(bus, error)):
+            if isinstance(instead, DriverError | HilError):
+                instead.last_samples = error.last_samples
+            raise instead from None
         raise
     return changed_settings(settings, settings_now(bus))
 
