@@ -254,8 +254,7 @@ class SafeShares:
         foreseen = predict_chain(config, plan, self.belief.arms.first(count), self.tell, passed=self.passed)
         self.simulated += count * simulated_seconds(plan)
         not_safe = unsafe(config, foreseen)
-        stiffness = self.belief.stiffness_share(self.given)
-        why = f"{not_safe}. {_remedy(config, foreseen, stiffness)}" if not_safe else ""
+        why = f"{not_safe}. {_remedy(config, foreseen, self.belief.stiffness_share(self.given))}" if not_safe else ""
         return Found(share, plan, foreseen), why, -float(foreseen.rooms.min())
 
     def _worth(self, paths: Paths, found: Found) -> float:
