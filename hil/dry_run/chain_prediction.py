@@ -114,6 +114,12 @@ def predict_chain(
     return ChainPrediction(prediction, *worst[1:], rooms, np.median(tracking, axis=0), plan.segments[0].ramp_samples)
 
 
+def simulated_seconds(plan: Plan) -> float:
+    """Motion of one arm that `predict_chain` simulates [s]."""
+    samples = sum(2 * each.ramp_samples + PERIODS * len(each.period_current) for each in plan.segments)
+    return samples / plan.rate
+
+
 def loop_of(config: Config, segment: PathSegment, rate: float, stops: Array | None = None) -> Loop:
     """Commands and feedback of the control loop during a segment. stops: as in `Loop`."""
     assert config.stabiliser is not None  # checked with the configuration

@@ -27,9 +27,9 @@ from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
 from hil.setup.changed_settings import EXPLAINED, WRITTEN, Settings, changed_settings, settings_now
-from hil.setup.lying import from_where_it_lies, said_of_the_rest, tolerance_now, wait_for_rest
+from hil.setup.lying import from_where_it_lies, moved_without_torque, said_of_the_rest, tolerance_now, wait_for_rest
 from hil.setup.realtime import on_time
-from hil.setup.servo_session import REBOOT_S, has_moved, servo_session, settings_at_start
+from hil.setup.servo_session import REBOOT_S, confirmed_later, has_moved, servo_session, settings_at_start
 
 __all__ = ["run_experiment"]
 
@@ -126,7 +126,8 @@ def _play(
 ) -> str:
     """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event.
 
-    Returns a sentence about settings that another program changed meanwhile; "" if there are none.
+    Returns sentences about settings that another program changed meanwhile, and about an arm that does not stay in its
+    rest pose without torque; "" if there are none.
     """
     stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
     settings: Settings = {}
@@ -147,16 +148,29 @@ def _play(
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):
             error.add_note(str(bus.torque_off_report))
+            if moved := _moved_without_torque(config, bus, stream.state):
+                error.add_note(moved)
         cause = error.__context__ if isinstance(error, TorqueNotOff) else error
         note(f"stopped: {cause or 'end of the run.'} {bus.torque_off_report}")
         if isinstance(error, TorqueNotOff):
             _try_again(bus, note)
-            error.args = (str(bus.torque_off_report),)
         if (who := _who_was_silent(bus, cause)) and isinstance(cause, SafetyStop):
             cause.args = (str(cause).partition(NONE_HEARD)[0] + who,)
             note(who)
+        if isinstance(error, TorqueNotOff) and (instead := confirmed_later(bus, error)):
+            if isinstance(instead, DriverError | HilError):
+                instead.last_samples = error.last_samples
+            raise instead from None
         raise
-    return changed_settings(settings, settings_now(bus))
+    said = changed_settings(settings, settings_now(bus)), _moved_without_torque(config, bus, stream.state)
+    return " ".join(each for each in said if each)
+
+
+def _moved_without_torque(config: Config, bus: ServoBus, state: State | None) -> str:
+    """What an arm has done without torque since this state, in which torque was cut; "" if nothing is known."""
+    if state is None or any(state.missing) or bus.torque_off_report is None:
+        return ""
+    return moved_without_torque(config, bus, state.position)
 
 
 def _try_again(bus: ServoBus, note: Note) -> None:

@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.config.schema import Config, StabiliserConfig
+from hil.config.schema import Config
 from hil.dry_run.chain_prior import prior_arms
 from hil.estimator.chain.model.dynamics import TERMS
 from hil.estimator.chain.model.prior import spread_of
 from hil.estimator.chain.simulation.rollout import ChainArms, inertias, is_physical
 from hil.experiment.chain_watch import linear_parameters
+from hil.pilot.chain_gains import ChainGains
 from hil.plan.chain_model import ChainTorque, known_chain, torque_limits
 from hil.runs.recording import Phase
 
@@ -23,12 +24,6 @@ Array = NDArray[np.float64]
 
 DRAWN = 400
 TAUGHT_HZ = 25.0  # rows of the regression per second of recording
-FREQUENCY, DAMPING_RATIO = 3.0, 0.7
-"""Natural frequency [Hz] and damping ratio of each joint on the stabiliser's spring."""
-
-MOST_DAMPING = 0.2
-"""Largest fraction of a joint's velocity that the damper may remove per sample, with the other joints free."""
-
 _CUT_OFF_TIMES = 6.0  # times the path's highest frequency
 _WIDTH = 0.05  # rad/s
 _LYING_RAD = 0.08
@@ -82,26 +77,22 @@ class ChainBelief:
         """Add stabiliser gains suited to the ensemble, unless the configuration has its own."""
         if given.stabiliser is not None:
             return given
-        damping, share = self._damping(given)
-        stiffness = 2.0 * np.pi * FREQUENCY / (2.0 * DAMPING_RATIO) * damping
-        gains = StabiliserConfig(stiffness=_rounded(share * stiffness), damping=_rounded(share * damping))
+        gains = self.gains(given).at(given.experiment.rate)
         return given.model_copy(update={"stabiliser": gains})
 
     def stiffness_share(self, given: Config) -> Array:
         """Stiffness of each joint's stabiliser at this rate, relative to that at a high rate (joints,); 1 if it is
         configured.
         """
-        return np.ones(len(given.joints)) if given.stabiliser is not None else self._damping(given)[1]
+        if given.stabiliser is not None:
+            return np.ones(len(given.joints))
+        gains = self.gains(given)
+        share: Array = gains.stiffness_at(given.experiment.rate) / gains.stiffness
+        return share
 
-    def _damping(self, given: Config) -> tuple[Array, Array]:
-        """Damping of each joint's stabiliser at a high rate (joints,) [N m s/rad], and the fraction of it that this
-        rate allows.
-        """
-        held, free = inertias(self.arms.first(SIMULATED), _poses(given))
-        # A damper acts one sample late: a larger gain would make a light joint oscillate.
-        damping = 2.0 * DAMPING_RATIO * 2.0 * np.pi * FREQUENCY * np.median(held, axis=0)
-        most = MOST_DAMPING * given.experiment.rate * np.maximum(free.min(axis=0), 0.0)
-        return damping, np.minimum(1.0, most / damping)
+    def gains(self, given: Config) -> ChainGains:
+        """Limits of the stabiliser's gains for the ensemble."""
+        return ChainGains.of(given, self.arms.first(SIMULATED), _poses(given))
 
     def learn(self, config: Config, samples: NDArray[np.void]) -> "ChainBelief":
         """Update the ensemble with a recording; return it unchanged if the recording is too short."""
@@ -238,7 +229,3 @@ def _filled(position: Array) -> Array:
         if missing.any() and not missing.all():
             column[missing] = np.interp(at[missing], at[~missing], column[~missing])
     return filled
-
-
-def _rounded(values: Array) -> list[float]:
-    return [float(f"{value:.3g}") for value in values]

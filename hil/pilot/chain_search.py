@@ -53,6 +53,11 @@ class Said:
     def __init__(self, say: Say, now: Callable[[], float] = time.monotonic) -> None:
         self._say, self._now = say, now
         self._at = now()
+        self._trying = ""
+
+    def trying(self, which: str) -> None:
+        """Take down which path and amplitude is simulated next."""
+        self._trying = which
 
     def say(self, text: str) -> None:
         """Pass a message on."""
@@ -61,7 +66,10 @@ class Said:
 
     def tell(self, done: int, total: int) -> None:
         """Report the progress of simulations after every SILENT_S of silence."""
-        self._after_silence(f"Still looking for a motion safe for all arms: {done} of {total} simulations of this one.")
+        which = f"{self._trying}, " if self._trying else ""
+        self._after_silence(
+            f"Still looking for a motion safe for all arms: {which}{done} of {total} simulations of this one."
+        )
 
     def designing(self, done: int, total: int) -> None:
         """Report the progress of a path's design after every SILENT_S of silence."""
@@ -96,6 +104,7 @@ class ChainSearch(SafeShares):
             *(config, belief, paths, said.say),
             tell=said.tell,
             designing=said.designing,
+            trying=said.trying,
             run=run,
             shown_path=shown_path,
             watch=watch,
@@ -181,7 +190,7 @@ def identify_chain_in_steps(
             say(said_of_the_rest(config, lies))
         search = ChainSearch.of(lies, run, shown_path, watch, say)
         search.step("Pilot", "pilot", PILOT_SHARES)
-        while len(search.steps) < MOST_STEPS:
+        while len(search.steps) < MOST_STEPS and not search.is_exhausted:
             wanted = search.safe(step_config(search.config), SHARES)
             if wanted.share <= RAISED * search.last and search.cap == 1.0:
                 break

@@ -3,14 +3,15 @@
 `hil identify` and `hil dry-run` both decide in this way, on the same arms, so that they agree.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config, PriorConfig
-from hil.dry_run.chain_prediction import ChainPrediction, predict_chain
+from hil.dry_run.chain_prediction import ChainPrediction, predict_chain, simulated_seconds
 from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import nearest_limit, unsafe
 from hil.dry_run.prediction import GUARDED, QUANTITIES, Prediction
@@ -40,6 +41,17 @@ OTHER_SEEDS = 2
 
 _NEXT_SEED = 100
 
+MOST_SIMULATED_S = 60_000.0
+"""Motion that a search may simulate before it tries no further paths [s], all arms together: about a minute of
+processor time with six joints.
+"""
+
+STOPPED_SHARE = 0.5
+"""Effort of simulated stops, relative to that of as many arms on one path and its transitions."""
+
+RAISED_RATE = 1.6
+"""Ratio of the first higher rate that is tried, for advice, to the configured one."""
+
 ROOM = 1.2
 """Advised room beyond a limit, relative to how far the simulated arms exceed it."""
 
@@ -63,7 +75,8 @@ class SafeShares:
 
     last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are shares of `paths`,
     and are converted when these are replaced. tell: called with the progress of each simulation of the arms, designing:
-    with that of each path's design. passed: whether each joint was beyond its rest pose in a run, as in
+    with that of each path's design, trying: with a description of each path and amplitude before it is simulated.
+    simulated: motion simulated so far [s]. passed: whether each joint was beyond its rest pose in a run, as in
     `resting_stops`.
     """
 
@@ -75,7 +88,15 @@ class SafeShares:
     last: float = np.inf
     tell: Tell | None = None
     designing: Tell | None = None
+    trying: Callable[[str], None] | None = None
+    simulated: float = 0.0
     passed: NDArray[np.bool_] | None = None
+    _path: int = 0
+
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether so much was simulated that no further paths are tried."""
+        return self.simulated > MOST_SIMULATED_S
 
     @property
     def config(self) -> Config:
@@ -90,11 +111,14 @@ class SafeShares:
         If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
         kept. If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.
         """
+        self._path = 0
         found, why = self._safe_of_these(config, shares, most)
         first = self.given, self.paths, self.cap, self.last
         for number in range(OTHER_SEEDS):
             if found is not None:
                 return found
+            if self.is_exhausted:
+                break
             times = self._other_seed()
             if times is None:
                 break
@@ -110,8 +134,37 @@ class SafeShares:
             raise NoSafeTorque(
                 f"{config.path}: no motion is safe for all arms consistent with what is known, not even "
                 f"{100 * shares[-1]:.0f} % of the designed path: {why}."
+                f"{self._ended_early()}{self._helped_by_rate(config, shares)}"
             )
         return found
+
+    def _ended_early(self) -> str:
+        if not self.is_exhausted:
+            return ""
+        return (
+            f" The search ended early, after {self.simulated / 3600.0:.0f} h of simulated motion: another "
+            "experiment.seed starts with other paths."
+        )
+
+    def _helped_by_rate(self, config: Config, shares: tuple[float, ...]) -> str:
+        """Name a higher rate at which a path would be safe, since the spring would be stiffer; "" if there is none."""
+        experiment = self.given.experiment
+        gains = self.belief.gains(self.given)
+        for wanted in sorted({min(RAISED_RATE * experiment.rate, gains.sufficient_rate), gains.sufficient_rate}):
+            rate = _round_rate(wanted, experiment.period)
+            if self.given.stabiliser is not None or wanted <= experiment.rate:
+                continue
+            faster = _at_rate(config, rate).model_copy(update={"stabiliser": gains.at(rate)})
+            try:
+                paths = Paths.of(_at_rate(self.given, rate), self.belief.torque, tell=self.designing)
+            except NoSafeTorque:
+                continue
+            if replace(self, given=faster, paths=paths)._largest(faster, shares)[0] is not None:
+                return (
+                    f" At experiment.rate = {rate:g}, a motion is safe: at {experiment.rate:g} Hz, the stabiliser must "
+                    "be softer than these arms need, or its delay would make it oscillate."
+                )
+        return ""
 
     def _other_seed(self) -> float | None:
         """Design paths from another seed; return the ratio of their amplitude to the former, None if there are none."""
@@ -138,7 +191,7 @@ class SafeShares:
         found, why, shortage = self._largest(config, _up_to(most, shares))
         reserve = self.paths.reserve
         for _ in range(REDESIGNS):
-            if found is not None and found.share >= SMALL * min(most, shares[0]):
+            if self.is_exhausted or (found is not None and found.share >= SMALL * min(most, shares[0])):
                 break
             former, reserve = self.paths, reserve.larger(shortage)
             try:
@@ -156,27 +209,53 @@ class SafeShares:
         return found, why
 
     def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
-        """The first safe share of the paths, why a larger one is not, and how much clearance that one lacks [m]."""
-        why, shortage = "", 0.0
-        for share in shares:
-            try:
-                plan = self.paths.plan(config, self.belief.torque, share)
-            except NoHeadroom as error:  # the arm is heavier than the paths were designed for
-                why = f"{error} {_better_known(config)}"
+        """The first safe share of the paths, why a larger one is not, and how much clearance that one lacks [m].
+
+        If neither the first share nor, on few arms, the last one is safe, those between them are not tried.
+        """
+        self._path += 1
+        found, why, shortage = self._found(config, shares[0], f"amplitude 1 of at most {len(shares)}")
+        if found is not None or len(shares) == 1:
+            return found, why, shortage
+        last_why, last_shortage = self._unsafe(config, shares[-1], SEARCH_ARMS, "the least amplitude")[1:]
+        if last_why:
+            return None, last_why, max(shortage, last_shortage)
+        for number, share in enumerate(shares[1:], 2):
+            if self.is_exhausted and share != shares[-1]:
                 continue
-            for count in (SEARCH_ARMS, ARMS):
-                foreseen = predict_chain(config, plan, self.belief.arms.first(count), self.tell, passed=self.passed)
-                not_safe = unsafe(config, foreseen)
-                shortage = max(shortage, -float(foreseen.rooms.min()))
-                if not_safe:
-                    break
-            if not_safe:
-                why = f"{not_safe}. {_remedy(config, foreseen, self.belief.stiffness_share(self.given))}"
-            elif not_safe := self._unsafe_stop(config, plan):
-                why = not_safe
-            else:
-                return Found(share, plan, foreseen), why, shortage
-        return None, why, shortage
+            found, not_safe, lacking = self._found(config, share, f"amplitude {number} of at most {len(shares)}")
+            shortage = max(shortage, lacking)
+            if found is not None:
+                break
+            why = not_safe
+        return found, why, shortage
+
+    def _found(self, config: Config, share: float, which: str) -> tuple[Found | None, str, float]:
+        """This share if it is safe, else why it is not, and how much clearance it lacks [m]."""
+        shortage = 0.0
+        for count in (SEARCH_ARMS, ARMS):
+            found, why, lacking = self._unsafe(config, share, count, which)
+            shortage = max(shortage, lacking)
+            if why:
+                return None, why, shortage
+        assert found is not None  # otherwise there is a reason
+        why = self._unsafe_stop(config, found.plan)
+        return (None if why else found), why, shortage
+
+    def _unsafe(self, config: Config, share: float, count: int, which: str) -> tuple[Found | None, str, float]:
+        """Simulate a share on some arms: the prediction, why it is not safe, how much clearance is lacking [m]."""
+        if self.trying is not None:
+            most = (1 + OTHER_SEEDS) * (1 + REDESIGNS)
+            self.trying(f"path {self._path} of at most {most}, {which}")
+        try:
+            plan = self.paths.plan(config, self.belief.torque, share)
+        except NoHeadroom as error:  # the arm is heavier than the paths were designed for
+            return None, f"{error} {_better_known(config)}", 0.0
+        foreseen = predict_chain(config, plan, self.belief.arms.first(count), self.tell, passed=self.passed)
+        self.simulated += count * simulated_seconds(plan)
+        not_safe = unsafe(config, foreseen)
+        why = f"{not_safe}. {_remedy(config, foreseen, self.belief.stiffness_share(self.given))}" if not_safe else ""
+        return Found(share, plan, foreseen), why, -float(foreseen.rooms.min())
 
     def _worth(self, paths: Paths, found: Found) -> float:
         """Worst relative standard error of the base parameters after the found share of a path."""
@@ -186,7 +265,20 @@ class SafeShares:
         """Explain why a stop would not lower the arm safely; "" if it would."""
         if config.safety.stop == "cut":
             return ""
+        self.simulated += STOPPED_SHARE * ARMS * simulated_seconds(plan)
         return foreseen_stops(config, plan, self.belief.arms.first(ARMS), self.tell, self.passed).unsafe
+
+
+def _round_rate(rate: float, period: float) -> float:
+    """Return the next rate of whole tens [Hz] with a whole number of samples per period, if there is one, or as good a
+    rate.
+    """
+    tens = 10.0 * np.ceil(rate / 10.0)
+    return float(tens if (tens * period).is_integer() else np.ceil(rate * period) / period)
+
+
+def _at_rate(config: Config, rate: float) -> Config:
+    return config.model_copy(update={"experiment": config.experiment.model_copy(update={"rate": rate})})
 
 
 def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:

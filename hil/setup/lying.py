@@ -9,6 +9,8 @@ import numpy as np
 
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
+from hil.drivers.errors import DriverError
+from hil.drivers.torque_off import and_list
 from hil.rest_pose_hint import within_limits
 from hil.setup.servo_session import has_moved
 
@@ -17,6 +19,11 @@ AFTER_A_RUN = 2.0
 
 NEAR_RAD = 0.02
 """Deviation from the rest pose that makes no difference [rad]."""
+
+SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
+"""Motion after torque off that is reported, and largest deviation from the rest pose before it [rad]."""
+
+_LONGEST_SAG_S = 3.0  # wait for an arm that moves after torque off
 
 _LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
 """Longest wait for an arm to come to rest, interval between checks, and largest change in between [rad]."""
@@ -27,13 +34,13 @@ def tolerance_now(config: Config) -> float:
     return config.rest_tolerance * (AFTER_A_RUN if has_moved() else 1.0)
 
 
-def wait_for_rest(bus: ServoBus) -> str:
-    """Wait at most _LONGEST_REST_S for an arm that is still swinging or falling after an earlier run.
+def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
+    """Wait at most `longest` [s] for an arm that is still swinging or falling after an earlier run.
 
     Returns a sentence about a joint that is still moving then, "" if none is.
     """
     clock = bus.port.clock
-    former, end = bus.read_positions(), clock.now() + _LONGEST_REST_S
+    former, end = bus.read_positions(), clock.now() + longest
     while True:
         clock.wait_until(clock.now() + _REST_EVERY_S)
         latest = bus.read_positions()
@@ -42,10 +49,33 @@ def wait_for_rest(bus: ServoBus) -> str:
             return ""
         if clock.now() >= end:
             return (
-                f"{bus.joints[away.index(max(away))]} is still moving after {_LONGEST_REST_S:.0f} s without torque: "
+                f"{bus.joints[away.index(max(away))]} is still moving after {longest:.0f} s without torque: "
                 f"{max(away):.3f} rad in {_REST_EVERY_S:g} s. Bring the arm to rest, then start again."
             )
         former = latest
+
+
+def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float]) -> str:
+    """Say how far a spatial arm that was in its rest pose (joints,) [rad] has moved since torque was cut, and which
+    rest pose to configure; "" if it stayed, was elsewhere, or its servos do not answer.
+    """
+    at, rest = np.array(before), np.array(config.arm.rest_pose)
+    if not config.is_chain or not np.abs(at - rest).max() < FROM_REST_RAD:
+        return ""
+    try:
+        moving, after = wait_for_rest(bus, _LONGEST_SAG_S), np.array(bus.read_positions())
+    except DriverError:
+        return ""
+    moved = [
+        f"{joint.name!r} by {by:+.2f} rad"
+        for joint, by in zip(config.joints, (after - at).tolist(), strict=True)
+        if abs(by) > SAGGED_RAD
+    ]
+    if not moved:
+        return ""
+    pose = ", ".join(f"{each:.2f}" for each in after.tolist())
+    now = moving or f"If it lies there safely, set arm.rest_pose = [{pose}]; otherwise choose a pose in which it does."
+    return f"Once torque was off, the arm moved: {and_list(moved)}. It does not stay in its rest pose. {now}"
 
 
 def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:

@@ -232,7 +232,8 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
 
     Raises ExperimentError at the end if a setting is not as it was and nothing else has ended the block.
 
-    A TorqueNotOff that leaves the block reports the final state: servos that answer again are read back.
+    A TorqueNotOff that leaves the block reports the final state: servos that answer again are read back. If all have,
+    what ended the block before is raised in its place.
 
     folder: run folder that receives a copy of the settings. say: receives messages for the user. Same
     errors as `ServoBus.open`, and RunFolderError.
@@ -265,13 +266,30 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             _outermost.reset(token)
             with signals_held_back():
                 left = session.end()
-            if isinstance(stopped, TorqueNotOff):  # a servo may have started to answer again
-                stopped.args = (str(bus.torque_off_report),)
-            if stopped is not None:
+            instead = confirmed_later(bus, stopped) if isinstance(stopped, TorqueNotOff) else None
+            if ended := instead or stopped:
                 for line in left:  # after what stopped the arm and the state of its torque, which matter more
-                    stopped.add_note(line)
+                    ended.add_note(line)
             elif left:
                 raise ExperimentError(" ".join(left))
+            if instead is not None:
+                raise instead from None
+
+
+def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
+    """What to raise in place of `error` if torque is off on all servos by now; None if it is not.
+
+    That is what cut torque, with a note about torque, or an ExperimentError if nothing but the silence of servos did.
+    """
+    report = bus.torque_off_report
+    error.args = (str(report),)
+    if report is None or report.unconfirmed:
+        return None
+    cause = error.__context__
+    if cause is None:
+        return ExperimentError(str(report))
+    cause.add_note(str(report))
+    return cause
 
 
 @contextmanager

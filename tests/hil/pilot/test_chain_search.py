@@ -174,6 +174,7 @@ def test_a_joint_that_a_run_saw_beyond_its_rest_pose_is_not_said_to_lie_on_its_s
     monkeypatch.setattr(chain_shares, "predict_chain", predicted)
     monkeypatch.setattr(chain_shares, "foreseen_stops", stopped)
     monkeypatch.setattr(chain_shares, "unsafe", lambda *_: "")
+    monkeypatch.setattr(chain_shares, "simulated_seconds", lambda _: 1.0)
     search.paths = Mock()
     for joint, way in ((1, -0.1), (2, 0.1)):
         samples = {"position": np.add(config.arm.rest_pose, [np.zeros(3), way * np.eye(3)[joint]])}
@@ -259,7 +260,7 @@ def test_paths_from_other_seeds_are_tried_before_a_refusal(monkeypatch: pytest.M
 def test_a_pilot_starts_where_the_arm_lies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = LEG.read_text(encoding="utf-8")
     (tmp_path / "leg.urdf").write_bytes((CONFIGS / "leg.urdf").read_bytes())
-    (tmp_path / "leg.toml").write_text(text.replace("start = [0.0, 0.0, 0.0]", "start = [0.0, 0.0, 0.1]"), "utf-8")
+    (tmp_path / "leg.toml").write_text(text.replace("start = [-0.24, 0.0, 0.0]", "start = [-0.24, 0.0, 0.1]"), "utf-8")
     lay: list[list[float]] = []
 
     def of(config: Config, *_: object) -> ChainSearch:
@@ -428,3 +429,80 @@ def test_a_long_design_is_not_silent() -> None:
     said.designing(1, 9)
     said.designing(2, 9)
     assert lines == ["Still designing a path: 2 of 9 steps."]
+
+
+def test_a_long_search_says_which_of_how_many_paths_and_amplitudes_it_simulates() -> None:
+    lines = list[str]()
+    said = Said(lines.append, Mock(side_effect=[0.0, 31.0, 31.0]))
+    said.trying("path 2 of at most 9, amplitude 3 of at most 4")
+    said.tell(46, 72)
+    (line,) = lines
+    assert line.endswith("path 2 of at most 9, amplitude 3 of at most 4, 46 of 72 simulations of this one.")
+
+
+def counting(monkeypatch: pytest.MonkeyPatch, unsafe_above: float) -> tuple[ChainSearch, list[tuple[float, str]]]:
+    """A search whose shares are safe up to this one, and what it has simulated."""
+    config = load_config(LEG)
+    search, tried = searching(config, Mock(), Mock(), print), list[tuple[float, str]]()
+
+    def simulated(_: object, share: float, __: int, which: str) -> tuple[Any, str, float]:
+        tried.append((share, which))
+        return Mock(share=share), "shank hits floor" if share > unsafe_above else "", 0.0
+
+    monkeypatch.setattr(search, "_unsafe", simulated)
+    monkeypatch.setattr(search, "_unsafe_stop", lambda *_: "")
+    return search, tried
+
+
+def test_where_the_least_amplitude_is_not_safe_those_between_are_not_simulated(monkeypatch: pytest.MonkeyPatch) -> None:
+    search, tried = counting(monkeypatch, 0.0)
+    assert search._largest(search.given, (1.0, 0.8, 0.6, 0.4))[:2] == (None, "shank hits floor")
+    assert [share for share, _ in tried] == [1.0, 0.4]
+    search, tried = counting(monkeypatch, 0.7)
+    found = search._largest(search.given, (1.0, 0.8, 0.6, 0.4))[0]
+    assert found is not None and found.share == 0.6
+    assert tried[-1] == (0.6, "amplitude 3 of at most 4")
+
+
+def test_a_search_that_has_simulated_enough_tries_the_least_amplitude_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    search, tried = counting(monkeypatch, 0.7)
+    search.simulated = 2.0 * chain_shares.MOST_SIMULATED_S
+    found = search._largest(search.given, (1.0, 0.8, 0.6, 0.4))[0]
+    assert found is not None and found.share == 0.4
+    assert {share for share, _ in tried} == {1.0, 0.4}
+
+
+def test_a_search_is_bounded_and_a_refusal_says_that_it_ended_early(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = chain_config(load_config(LEG))
+    said: list[str] = []
+    search = search_of(config, ChainBelief.prior(config), said)
+    monkeypatch.setattr(search, "_largest", lambda *_: (None, "shank hits floor", 0.0))
+    designed = Mock(side_effect=AssertionError)
+    monkeypatch.setattr(Paths, "of", designed)
+    search.simulated = 2.0 * chain_shares.MOST_SIMULATED_S
+    with pytest.raises(NoSafeTorque, match=r"hits floor\. The search ended early, after 33 h of simulated motion"):
+        search.safe(search.config, (1.0, 0.18))
+    assert said == [] and not designed.called
+
+
+@pytest.mark.parametrize(("enough", "named"), [(80.0, "80"), (100.0, "140"), (1000.0, "")])
+def test_a_refusal_names_a_rate_only_if_a_motion_is_safe_at_it(
+    monkeypatch: pytest.MonkeyPatch, enough: float, named: str
+) -> None:
+    config = chain_config(parse_config(LEG.read_text(encoding="utf-8").replace("rate = 400.0", "rate = 50.0"), LEG))
+    belief = ChainBelief.prior(config)
+    search, paths, tried = search_of(config, belief, []), None, list[Config]()
+
+    def largest(_: object, config: Config, __: object) -> tuple[Any, str, float]:
+        tried.append(config)
+        return (Mock() if config.experiment.rate >= enough else None), "shank hits floor", 0.0
+
+    monkeypatch.setattr(SafeShares, "_largest", largest)
+    monkeypatch.setattr(Paths, "of", lambda *_, **__: paths)
+    monkeypatch.setattr(chain_shares, "REDESIGNS", 0)
+    monkeypatch.setattr(chain_shares, "OTHER_SEEDS", 0)
+    with pytest.raises(NoSafeTorque) as refused:
+        search.safe(search.config, (1.0, 0.18))
+    assert (f"At experiment.rate = {named}, a motion is safe: at 50 Hz, the " in str(refused.value)) is bool(named)
+    assert tried[-1].stabiliser == belief.gains(config).at(tried[-1].experiment.rate)
+    assert search.given.experiment.rate == 50.0 and search.paths is not None

@@ -1,0 +1,81 @@
+"""Gains of the software spring and damper that hold a spatial arm to its path: as stiff as the sample rate allows.
+
+Both act on a state that is `DELAY_SAMPLES` old. The damper must be weak enough for the lightest joint not to oscillate.
+A delayed spring drives the motion like a negative damper, so that damping limits stiffness: at a low rate, and not by
+more, since a softer spring lets friction and unknown weights carry the arm away from its path.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.schema import Config, StabiliserConfig
+from hil.drivers.servo_prior import servo_prior
+from hil.estimator.chain.simulation.rollout import ChainArms, inertias
+from hil.plan.stabiliser import DELAY_SAMPLES
+
+Array = NDArray[np.float64]
+
+FREQUENCY, DAMPING_RATIO = 3.0, 0.7
+"""Natural frequency [Hz] and damping ratio of each joint on the stabiliser's spring, unless the rate is too low."""
+
+MOST_DAMPING = 0.3
+"""Largest fraction of a joint's velocity that the damper may remove per sample, with the other joints free; from 1 on,
+a single joint would oscillate.
+"""
+
+MOST_DRIVING = 0.3
+"""Largest fraction of a joint's damping that its spring's delay may undo."""
+
+
+@dataclass(frozen=True)
+class ChainGains:
+    """Limits of the gains, of each joint (joints,).
+
+    stiffness, damping: gains at a high rate [N m/rad, N m s/rad]. friction: least viscous friction [N m s/rad].
+    lightest: smallest inertia with the other joints free [kg m^2].
+    """
+
+    stiffness: Array
+    damping: Array
+    friction: Array
+    lightest: Array
+
+    @classmethod
+    def of(cls, config: Config, arms: ChainArms, poses: Array) -> "ChainGains":
+        """Compute the limits for any of these arms in any of these poses (poses, joints)."""
+        held, free = inertias(arms, poses)
+        middle, turn = np.median(held, axis=0), 2.0 * np.pi * FREQUENCY
+        usual = [len(joint.ids) * servo_prior(joint.joint.servo).viscous.median for joint in config.joints]
+        return cls(
+            turn**2 * middle,
+            2.0 * DAMPING_RATIO * turn * middle,
+            np.minimum(usual, arms.drive[:, 0].min(axis=0)),
+            np.maximum(free.min(axis=0), 0.0),
+        )
+
+    def at(self, rate: float) -> StabiliserConfig:
+        """Return the gains for a rate [Hz]."""
+        return StabiliserConfig(stiffness=_rounded(self.stiffness_at(rate)), damping=_rounded(self._damping_at(rate)))
+
+    def stiffness_at(self, rate: float) -> Array:
+        """Stiffness of each joint (joints,) at a rate [Hz], before rounding [N m/rad]."""
+        most: Array = MOST_DRIVING * rate / DELAY_SAMPLES * (self._damping_at(rate) + self.friction)
+        return np.minimum(self.stiffness, most)
+
+    def _damping_at(self, rate: float) -> Array:
+        return np.minimum(self.damping, MOST_DAMPING * rate * self.lightest)
+
+    @property
+    def sufficient_rate(self) -> float:
+        """Lowest rate at which no joint's spring is softened [Hz]."""
+        product = DELAY_SAMPLES * self.stiffness / MOST_DRIVING  # of rate and damping
+        grown = MOST_DAMPING * np.maximum(self.lightest, 1e-12)  # damping per rate, up to `damping`
+        root = np.sqrt(self.friction**2 + 4.0 * grown * product)
+        slow, fast = (root - self.friction) / (2.0 * grown), product / (self.damping + self.friction)
+        return float(np.where(grown * slow <= self.damping, slow, fast).max())
+
+
+def _rounded(values: Array) -> list[float]:
+    return [float(f"{value:.3g}") for value in values]
