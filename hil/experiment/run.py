@@ -20,6 +20,7 @@ from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
 from hil.plan.chain_plan import check_clearance, plan_of
 from hil.plan.plan import Plan
+from hil.plan.stabiliser import must_balance
 from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.runs.background import Background
 from hil.runs.event_log import EventLog
@@ -29,7 +30,8 @@ from hil.runs.timing import lateness_histogram
 from hil.setup.changed_settings import EXPLAINED, WRITTEN, Settings, changed_settings, settings_now
 from hil.setup.lying import from_where_it_lies, said_of_the_rest, tolerance_now, wait_for_rest
 from hil.setup.realtime import on_time
-from hil.setup.servo_session import REBOOT_S, has_moved, servo_session, settings_at_start
+from hil.setup.servo_session import REBOOT_S, has_moved, lay_at_start, servo_session, settings_at_start
+from hil.setup.unmoved import Lies, has_stirred, refuse_moved, where_it_lies
 
 __all__ = ["run_experiment"]
 
@@ -38,6 +40,12 @@ _LAST_SAMPLES = 100
 
 _MOST_UNSEEN = 20
 """Number of progress reports that may be queued for the observer; about one second."""
+
+_LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
+"""Said if every servo has answered in the end, and nothing else is wrong."""
+
+_REPEAT_S = 0.05
+"""Time after which torque off is sent again to a servo that does not answer [s]."""
 
 _PATIENCE_S = 0.2
 """Time for which the end of a run waits for the observer [s]."""
@@ -78,8 +86,7 @@ def run_experiment(
             note("spatial arms have not been tested on hardware yet: keep a hand on the supply's switch")
         note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
-        if (moving := wait_for_rest(bus) if has_moved() or config.is_chain else "") and config.is_chain:
-            raise ExperimentError(moving)
+        lies = _wait_for_rest(config, bus)
         _check_pose(config, bus)
         if config.is_chain and not is_given:
             config, plan = _from_where_it_lies(config, plan, bus, run, note)
@@ -87,7 +94,7 @@ def run_experiment(
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
             # Signals are deferred from before torque comes on until the servos' settings are restored.
             with stop.only_noted(), servo_limits(config, bus, note):
-                changed = _play(config, plan, bus, recorder, stop, shown, note, arms)
+                changed = _play(config, plan, bus, recorder, stop, shown, note, arms, lies)
             torque = str(bus.torque_off_report)
             note(torque)
             if changed:
@@ -123,9 +130,11 @@ def _play(
     watch: Watch,
     note: Note,
     arms: Ensemble | ChainArms | None,
+    lay: Lies,
 ) -> str:
     """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event.
 
+    lay: where the servos were when the arm's pose was checked.
     Returns a sentence about settings that another program changed meanwhile; "" if there are none.
     """
     stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
@@ -134,6 +143,7 @@ def _play(
         # In this order, because on_time takes longer than the watchdog's timeout.
         with on_time(bus.port.clock) as granted:
             settings = _check_unchanged(bus)
+            refuse_moved(lay, where_it_lies(bus))
             stream.begins_at(bus.read_positions())
             with bus.torque(config.safety.watchdog):
                 if granted:
@@ -152,6 +162,8 @@ def _play(
         if isinstance(error, TorqueNotOff):
             _try_again(bus, note)
             error.args = (str(bus.torque_off_report),)
+            if cause is None and bus.torque_off_report is not None and not bus.torque_off_report.unconfirmed:
+                error.args = (f"{_LATE_CONFIRMED} {bus.torque_off_report}",)
         if (who := _who_was_silent(bus, cause)) and isinstance(cause, SafetyStop):
             cause.args = (str(cause).partition(NONE_HEARD)[0] + who,)
             note(who)
@@ -160,8 +172,15 @@ def _play(
 
 
 def _try_again(bus: ServoBus, note: Note) -> None:
-    """Cut the torque of servos that did not answer, once more after the time in which a servo boots."""
-    bus.port.clock.wait_until(bus.port.clock.now() + REBOOT_S)
+    """Cut the torque of servos that did not answer, again and again in the time in which a servo boots.
+
+    Their watchdogs have acted by now, if they were still armed, so that packets cannot delay them any more.
+    """
+    clock = bus.port.clock
+    end = clock.now() + REBOOT_S
+    while clock.now() < end:
+        clock.wait_until(min(end, clock.now() + _REPEAT_S))
+        bus.repeat_torque_off()
     for drive in bus.drives:
         with suppress(DriverError):
             if bus.confirm_later(drive):
@@ -233,6 +252,21 @@ def _watched(clock: Clock, watch: Watch) -> Iterator[Watch]:
         yield shown.put
     finally:
         shown.close(_PATIENCE_S)
+
+
+def _wait_for_rest(config: Config, bus: ServoBus) -> Lies:
+    """Wait until an arm that swings has come to rest; return where it lies then.
+
+    Raises ExperimentError if it has moved far since the start, or a spatial arm does not come to rest.
+    """
+    lay, lies = lay_at_start(), where_it_lies(bus)
+    refuse_moved(lay, lies)
+    # An upright arm that nobody holds would only fall farther.
+    if has_moved() or config.is_chain or (has_stirred(lay, lies) and not must_balance(config)):
+        if (moving := wait_for_rest(bus)) and config.is_chain:
+            raise ExperimentError(moving)
+        lies = where_it_lies(bus)
+    return lies
 
 
 def _check_rate(config: Config, bus: ServoBus) -> None:

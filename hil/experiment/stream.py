@@ -217,6 +217,7 @@ class Stream:
         differences = []
         for period in range(1, self._plan.max_settling_periods + 1):
             self._play_period(segment, period)
+            self._check_motion(repetition.moved)
             difference = repetition.difference
             differences.append(difference)
             if difference <= self._plan.settle_within:
@@ -246,7 +247,7 @@ class Stream:
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:
-        """Detect a joint held by friction or an obstacle after one period, before more time is wasted."""
+        """Detect a joint held by friction or an obstacle after a period, before more time is wasted."""
         for joint, way in zip(self._bus.joints, moved, strict=True):
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
                 against = f" Or {opposed(joint)}" if joint.seconds else ""

@@ -27,12 +27,14 @@ from hil.setup.changed_settings import Settings, settings_now
 from hil.setup.current_limit import current_limit_ticks
 from hil.setup.others import others_on_the_bus
 from hil.setup.settings_file import Kept
+from hil.setup.unmoved import Lies, where_it_lies
 
 __all__ = [
     "SETTINGS_NAME",
     "Say",
     "ServoSession",
     "has_moved",
+    "lay_at_start",
     "left_behind",
     "recover",
     "servo_session",
@@ -75,6 +77,8 @@ class ServoSession:
     """Return Delay Time of each servo at the beginning [2 us]."""
     settings: Settings = field(default_factory=dict)
     """What `settings_now` found at the beginning."""
+    lay: Lies = field(default_factory=dict)
+    """Where the servos were at the beginning."""
     _left: set[Joint] = field(default_factory=set)
     """Servos whose settings an earlier run had left; a goal that a lowered limit cuts is tried once more, not for ever.
     """
@@ -95,6 +99,7 @@ class ServoSession:
         bus.check_identity()
         left = {joint: kept for joint in bus.drives if (kept := left_behind(bus.port.url, joint)) is not None}
         bus.release_held(ours=left)
+        self.lay = where_it_lies(bus)
         if others := others_on_the_bus(bus):
             self._say(f"Also on this bus (left alone): {'; '.join(others)}.")
         described = {
@@ -263,9 +268,10 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             raise
         finally:
             _outermost.reset(token)
+            was_off = bus.torque_off_report is not None and not bus.torque_off_report.unconfirmed
             with signals_held_back():
                 left = session.end()
-            if isinstance(stopped, TorqueNotOff):  # a servo may have started to answer again
+            if isinstance(stopped, TorqueNotOff) and not was_off:  # a servo may have started to answer again
                 stopped.args = (str(bus.torque_off_report),)
             if stopped is not None:
                 for line in left:  # after what stopped the arm and the state of its torque, which matter more
@@ -315,6 +321,12 @@ def settings_at_start() -> Settings:
     """The servos' settings at the beginning of this session (`changed_settings.settings_now`)."""
     outer = _outermost.get()
     return {} if outer is None else outer.settings
+
+
+def lay_at_start() -> Lies:
+    """Where the servos were at the beginning of this session; empty if a run may have moved the arm since."""
+    outer = _outermost.get()
+    return {} if outer is None or outer.shared > 1 else outer.lay
 
 
 def left_behind(port: str, joint: Joint) -> Kept | None:

@@ -15,7 +15,7 @@ import serial
 
 from hil.config.schema import Config, parse_config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import TorqueNotOff, WrongModel, WrongSetting
+from hil.drivers.errors import BusShared, TorqueNotOff, WrongModel, WrongSetting
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
 from hil.experiment import run, work
 from hil.experiment.model_watch import ModelWatch
@@ -25,6 +25,7 @@ from hil.fakes.bus.faults import Fault, FaultKind
 from hil.plan.plan import Plan, make_plan
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
+from hil.setup import servo_session
 from tests.support.paths import CONFIGS
 from tests.support.spied_plant import SpiedPlant, Spy, call_at
 
@@ -147,6 +148,19 @@ def test_settings_that_another_program_changed_are_the_cause_that_is_named(
     assert_stopped(ports[0])
 
 
+@pytest.mark.parametrize(("register", "value"), [("Drive Mode", 1), ("Homing Offset", 40)])
+def test_a_setting_that_hardly_shows_in_the_motion_is_read_back(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
+) -> None:
+    def change() -> None:
+        ports[0].bus.servos[2].memory.set(register, value)
+
+    config, begun = arm(), once(change)
+    with pytest.raises(BusShared, match=rf"'elbow'.* is changed by another program: its {register} reads {value}, and"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, begun, plan)
+    assert_stopped(ports[0])
+
+
 @pytest.mark.parametrize(("register", "value"), [("PWM Limit", 5), ("Current Limit", 20)])
 def test_a_limit_that_another_program_lowered_is_the_cause_that_is_named(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
@@ -211,6 +225,18 @@ def test_settings_changed_before_torque_comes_on_are_refused(
     monkeypatch.setattr(run, "_write_facts", shift)
     config = arm()
     with pytest.raises(WrongSetting, match=r"'elbow'.*Homing Offset is 30 and was 0\)\. Torque has not been switched"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
+    assert_stopped(ports[0])
+
+
+@pytest.mark.parametrize(("where", "after"), [(servo_session, "others_on_the_bus"), (run, "_check_pose")])
+def test_a_joint_that_turns_before_torque_comes_on_is_refused(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch, where: Any, after: str
+) -> None:
+    """Its horn slips, or another servo answers: every angle would be off, by less than the rest pose's tolerance."""
+    monkeypatch.setattr(where, after, lambda *_: fault(ports, FaultKind.ENCODER_JUMP, servo=2, amount=60))
+    config = arm()
+    with pytest.raises(ExperimentError, match=r"'elbow'.* has turned by \+0\.092 rad since .* before torque was"):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
     assert_stopped(ports[0])
 
