@@ -260,7 +260,11 @@ def _wait_for_rest(config: Config, bus: ServoBus) -> Lies:
     Raises ExperimentError if it has moved far since the start, or a spatial arm does not come to rest.
     """
     lay, lies = lay_at_start(), where_it_lies(bus)
-    refuse_moved(lay, lies)
+    try:
+        refuse_moved(lay, lies)
+    except ExperimentError:
+        _check_unchanged(bus)  # which names another program that shifted the angles
+        raise
     # An upright arm that nobody holds would only fall farther.
     if has_moved() or config.is_chain or (has_stirred(lay, lies) and not must_balance(config)):
         if (moving := wait_for_rest(bus)) and config.is_chain:

@@ -224,6 +224,7 @@ class Stream:
                 self._note(f"{segment.role}: period {period} is settled, {difference:.2%} from the one before")
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
+                    self._check_motion(repetition.moved)
                 return
         if difference <= self._plan.drift_within:
             self._note(f"{segment.role}: still drifts slowly: {difference:.2%} per period; using the last periods")

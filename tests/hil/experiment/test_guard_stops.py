@@ -229,6 +229,16 @@ def test_settings_changed_before_torque_comes_on_are_refused(
     assert_stopped(ports[0])
 
 
+def test_an_offset_changed_before_the_pose_is_checked_is_named_not_its_effect(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "_check_rate", lambda *_: ports[0].bus.servos[2].memory.set("Homing Offset", 60))
+    config = arm()
+    with pytest.raises(WrongSetting, match=r"'elbow'.*Homing Offset is 60 and was 0\)\. Torque has not been switched"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
+    assert_stopped(ports[0])
+
+
 @pytest.mark.parametrize(("where", "after"), [(servo_session, "others_on_the_bus"), (run, "_check_pose")])
 def test_a_joint_that_turns_before_torque_comes_on_is_refused(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch, where: Any, after: str
@@ -334,6 +344,52 @@ def test_commands_too_far_apart_for_the_watchdogs(arm: Arm, tmp_path: Path, port
         stop.cause is Cause.WATCHDOG and "received nothing for 20 ms" in str(stop)
     )
     assert len(samples) <= 2
+    assert_stopped(ports[0])
+
+
+def test_torque_off_is_repeated_until_a_deaf_servo_hears_it(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its watchdog does not act, because another program has switched it off."""
+    deaf_s = 0.5
+    begun: list[float] = []
+    ends: list[float] = []
+    repeat = ServoBus.repeat_torque_off
+
+    def deafen() -> None:
+        servo = ports[0].bus.servos[2]
+        servo.memory.set("Bus Watchdog", 0)
+        servo._derive()
+        fault(ports, FaultKind.LOST_INSTRUCTION, servo=2, duration=deaf_s)
+        begun.append(ports[0].bus.time)
+
+    def note(bus: ServoBus) -> None:
+        repeat(bus)
+        bus.port.clock.wait_until(bus.port.clock.now() + 1e-3)
+        ports[0].bus.advance(bus.port.clock.now())
+        if not ports[0].bus.servos[2].torque_enabled and not ends:
+            ends.append(bus.port.clock.now() - begun[0])
+
+    monkeypatch.setattr(ServoBus, "repeat_torque_off", note)
+    config = arm()
+    with pytest.raises(TorqueNotOff):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, once(deafen), plan)
+    assert deaf_s < ends[0] < deaf_s + 0.06
+
+
+def test_replies_lost_only_while_torque_is_cut_at_the_end_are_named(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut = ServoBus.torque_off
+
+    def behind_a_loss(bus: ServoBus) -> Any:
+        fault(ports, FaultKind.LOST_REPLY, servo=2, duration=0.4)
+        return cut(bus)
+
+    monkeypatch.setattr(ServoBus, "torque_off", behind_a_loss)
+    config = arm()
+    with pytest.raises(TorqueNotOff, match=r"^Replies were missing when torque was cut.* Torque is off on both servos"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
     assert_stopped(ports[0])
 
 
