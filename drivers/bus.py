@@ -24,9 +24,17 @@ from hil.drivers.preparation.prepare import (
 )
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode, with_article
-from hil.drivers.state import NAN, Converter, State, fold, read_back_spans, spans
+from hil.drivers.state import NAN, SETTINGS, Converter, State, fold, read_back_spans, spans
 from hil.drivers.sync_read import Answer
-from hil.drivers.torque_off import TorqueOff, cut_again, cut_torque, disarm_watchdogs, signals_held_back, was_rebooted
+from hil.drivers.torque_off import (
+    TorqueOff,
+    cut_again,
+    cut_torque,
+    disarm_watchdogs,
+    signals_held_back,
+    tell_torque_off,
+    was_rebooted,
+)
 
 __all__ = ["CHECK_S", "BusConfig", "ServoBus"]
 
@@ -216,7 +224,8 @@ class ServoBus:
         if fast and all(None in exchange.cycle(nothing).servos for _ in range(_PROBES)):
             exchange = self.make_exchange(fast=False, one_write=one_write)
         modes = [drive.mode for drive in self._drives]
-        exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in self._servos.values()]), modes)
+        settings = [[servo.read(name) for name in SETTINGS] for servo in self._servos.values()]
+        exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in self._servos.values()]), settings)
         self._exchange = exchange
 
     def knows_fast_sync_read(self) -> bool:
@@ -451,6 +460,10 @@ class ServoBus:
         if interrupts:
             raise interrupts[0]
         return self.torque_off_report
+
+    def repeat_torque_off(self) -> None:
+        """Send torque off to all servos once more, without waiting for an answer, for one that does not answer yet."""
+        tell_torque_off(self.port, self._servos)
 
     def confirm_later(self, drive: Joint) -> bool:
         """Cut the torque of a servo (a key of `drives`) that `torque_off` could not confirm as off, and read it back.

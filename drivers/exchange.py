@@ -43,6 +43,7 @@ cycles late is recognised by its length.
 """
 
 _NEVER = 1 << 62
+_LONGEST_REPLY = 1024
 _DOUBTS = 3
 
 _crc = crc16.umts
@@ -137,6 +138,8 @@ class Exchange:
         self._slow = 0
         self._late_possible = False
         self._after_loss = 0
+        self._cut_off = b""
+        """What had been received of a reply when time was up in the latest exchange."""
         self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
         self._off_wire = math.inf
         """Duration of the latest cycle without its wire time [s]."""
@@ -168,9 +171,11 @@ class Exchange:
         if self._status_every < _NEVER:
             self._until_status = min(self._until_status, 1)
 
-    def add_read_back(self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[int]) -> None:
-        """Prepare `overruled`. goal, mode: spans that end with the goal and with Operating Mode. modes: the operating
-        modes that were set.
+    def add_read_back(
+        self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[Sequence[int]]
+    ) -> None:
+        """Prepare `overruled`. goal, mode: spans that end with the goal and with the settings whose values are `modes`
+        (`ReadBack`).
         """
         back = self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
         self._wire_s |= {read: self._port.wire_time(self._bytes(read)) for read in back.reads}
@@ -193,7 +198,7 @@ class Exchange:
         return self._read_back.lost if self._read_back is not None else None
 
     def overruled(self, due: float) -> Overruled | None:
-        """Read goals or operating modes back if there is time before the next cycle, which is due at `due` [s].
+        """Read goals or settings back if there is time before the next cycle, which is due at `due` [s].
 
         The next cycle overwrites another master's goals before its own replies are sampled, so only what the servos
         hold right before a cycle shows who commands them. Missing replies are ignored here; the next cycle detects
@@ -216,7 +221,7 @@ class Exchange:
 
     def _takes(self, read: GroupRead, back: ReadBack) -> float:
         """Longest time that a read-back is expected to take [s]."""
-        return max(self._off_wire + self._wire_s[read], back.longest)
+        return self._wire_s[read] + max(self._off_wire, back.longest)
 
     def _held(self, back: ReadBack, due: float) -> Overruled | None:
         """Read back once if that is possible before `due` [s]."""
@@ -247,7 +252,7 @@ class Exchange:
             if not self.is_in_doubt:
                 self.read_back_at = now + TRY_AGAIN_S  # a late reply costs the next cycle time
         else:
-            back.took(min(now - before, 2.0 * takes))
+            back.took(min(now - before, 2.0 * takes) - self._wire_s[read])
         found = back.look(servos, self._sent, now)
         if back.is_unexpected:
             self.read_status_next()  # it distinguishes lost goals from another master's
@@ -348,11 +353,17 @@ class Exchange:
             # One byte at a time, since the length of a stuffed packet is not known in advance.
             received += self._port.read(1, remaining)
         self.heard.instead(read, received, answers, self._now(), echoes=self._echoes)
+        if self._cut_off:
+            self.heard.continued(self._cut_off, received, self._now())
+        self._cut_off = b"" if over else received
         return answers
 
     def _overhear(self) -> None:
         """Examine bytes that were pending before the request."""
         self.heard.pending(self._port.overheard, self._now(), echoes=self._echoes)
+        if self._cut_off:
+            self.heard.continued(self._cut_off, self._port.overheard, self._now())
+            self._cut_off = (self._cut_off + self._port.overheard)[-_LONGEST_REPLY:]
         self._port.overheard = b""
 
     def _ask_behind_echo(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:

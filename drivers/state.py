@@ -129,15 +129,21 @@ def _status_names(mode: Mode) -> tuple[str, ...]:
     return "Bus Watchdog", goal, "Realtime Tick", _DRIVE[mode], "Present Velocity", "Present Position"
 
 
+SETTINGS = ("Drive Mode", "Operating Mode", "Homing Offset")
+"""Settings that another program may change while torque is on, or with a reboot, and that change what goals and angles
+mean.
+"""
+
+
 def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans]:
-    """Return the registers that end with the goal, and those that end with Operating Mode.
+    """Return the registers that end with the goal, and those that end with SETTINGS.
 
     They begin earlier, so that answers differ in length from those that other programs usually ask for.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
     goals = [_status_names(own)[:2] for own in modes]
     goal = Span.of(tables, goals[0]) if len(set(modes)) == 1 else Span.each(tables, goals)
-    return goal, Span.of(tables, ("ID", "Baud Rate", "Return Delay Time", "Drive Mode", "Operating Mode"))
+    return goal, Span.of(tables, ("ID", "Baud Rate", "Return Delay Time", *SETTINGS))
 
 
 class Converter:

@@ -21,11 +21,14 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks.fault_campaign.arms import Setting, make_document, names
 from benchmarks.fault_campaign.campaign import DoesNotRun, prepare
+from hil.fakes.plants.arm import Arm
+from hil.fakes.plants.plant import make_plant
 
 RATES = (100, 400)
 PERIOD_S = 1.2
 MASSES, TORQUES, FRICTION = 2.2, 1.5, 2.5
 WIDE_RAD, WIDE_RAD_S = 3.1, 25.0
+RESTS_S = 5.0
 
 _SKIPPED = frozenset({"fake_inverted", "paper_two_link"})
 """Arms whose motion only their own description keeps bounded, and one that hangs from a third joint's limits."""
@@ -60,7 +63,15 @@ def draw(seed: int, setting: Setting, period: float, *, described: bool) -> dict
     document["arm"].pop("prior", None)
     if described:
         document["arm"]["link_lengths"] = [link["length"] for link in fake["links"]]
+    fake["start"] = come_to_rest(fake)
     return document
+
+
+def come_to_rest(fake: dict[str, Any]) -> list[float]:
+    """Where the arm hangs at rest [rad]: cogging and cables may pull it away from its rest pose."""
+    plant = make_plant(Arm.model_validate(fake))
+    plant.advance(RESTS_S, (0.0,) * plant.joints)
+    return list(plant.position)
 
 
 def stopped(seed: int, *, described: bool) -> tuple[str, str]:

@@ -58,9 +58,20 @@ class Heard:
         self._count_strangers(_packets_within(received), echoes=echoes)
         if not echoes:
             self.strangers += sum(self._is_anothers(*front) for front in _fronts_of_instructions(received))
+        if any(front in self._expected - read.expected for front in _fronts_of_replies(received)):
+            self.late_at = now  # the beginning of a reply to an earlier request
         complete = sum(answer is not None for answer in answers) / len(answers)
         if complete < 1.0 and len(received) > complete * read.reply_size + _PART_OF_A_REPLY:
             self.damaged_at, self.senders = now, read.senders(received)
+
+    def continued(self, before: bytes, received: bytes, now: float) -> None:
+        """Examine bytes that follow those received until time was up: the rest of a reply that came too late.
+
+        before: what had been received until then.
+        """
+        whole = [packet for packet in _packets_within(before + received) if packet.is_status]
+        if len(whole) > len(_packets_within(before)) + len(_packets_within(received)):
+            self.late_at = now
 
     def advice(self, now: float, url: str) -> str:
         """What was received in the last 0.1 s instead of complete and timely replies, and what to do about it; "" if
@@ -115,6 +126,16 @@ def _packets_within(received: bytes) -> list[Packet]:
         found += packets
         at = received.find(HEADER, end if packets else at + 1)
     return found
+
+
+def _fronts_of_replies(received: bytes) -> Iterator[tuple[int, int]]:
+    """ID and number of data bytes of each status packet, whether it is complete or not."""
+    at = received.find(HEADER)
+    while at >= 0:
+        front = received[at : at + _FRONT_SIZE]
+        if len(front) == _FRONT_SIZE and front[-1] == Instruction.STATUS:
+            yield front[4], int.from_bytes(front[5:7], "little") - _BESIDE_DATA
+        at = received.find(HEADER, at + 1)
 
 
 def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:

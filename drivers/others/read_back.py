@@ -1,4 +1,4 @@
-"""Read-backs of goals and operating modes: what a servo holds right before a cycle shows who commands it."""
+"""Read-backs of goals, operating modes and settings: what a servo holds right before a cycle shows who commands it."""
 
 import math
 from collections import deque
@@ -57,7 +57,7 @@ _Sightings = deque[tuple[float, int]]
 
 
 class Overruled(NamedTuple):
-    """A servo (by its place among the IDs) that holds a goal or an operating mode that this program did not write."""
+    """A servo (by its place among the IDs) that holds a goal, or another setting, that this program did not write."""
 
     place: int
     register: str
@@ -66,7 +66,10 @@ class Overruled(NamedTuple):
 
 
 class ReadBack:
-    """Reads back the goals that the servos hold right before a cycle, and occasionally their operating modes instead.
+    """Reads back the goals that the servos hold right before a cycle, and occasionally their settings instead.
+
+    mode: a span that ends with the registers whose values are `modes`, as many for each servo. A change of one of these
+    reverses the motor, shifts every angle, or gives goals another meaning.
 
     Every cycle overwrites the goals of another master, so one that writes less often than this program is seen only if
     the goals are read before every cycle.
@@ -77,18 +80,19 @@ class ReadBack:
         ids: Sequence[int],
         goal: Span | Sequence[Span],
         mode: Span | Sequence[Span],
-        modes: Sequence[int],
+        modes: Sequence[Sequence[int]],
         *,
         fast: bool,
     ) -> None:
         kind = FastSyncRead if fast else SyncRead
         self.reads: tuple[GroupRead, GroupRead] = kind(ids, goal), kind(ids, mode)
         self.longest = 0.0
-        """Duration of the longest recent read-back [s]; decays from one read-back to the next."""
+        """Duration of the longest recent read-back, without its wire time [s]; decays from one to the next."""
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
-        self._modes = tuple(modes)
+        self._modes = tuple(map(tuple, modes))
+        self._settings = one_each(mode, len(ids))[0].registers[-len(self._modes[0]) :]
         self.is_of_modes = True
-        """Whether the next read-back is of the operating modes, instead of the goals."""
+        """Whether the next read-back is of the operating modes and other settings, instead of the goals."""
         self._modes_due = -math.inf
         self._goals_since = 0
         self._draw = Random(1)
@@ -117,15 +121,12 @@ class ReadBack:
         """Compare the answers with what was written; return what only another master can have written."""
         of_modes = self.is_of_modes
         is_nearly_sure = False
-        for place, value in self._foreign(servos, sent):
+        for place, register, value, written in self._foreign(servos, sent):
             seen = (self._modes_sighted if of_modes else self._goals_sighted)[place]
             while seen and now - seen[0][0] > _SIGHTED_S:
                 seen.popleft()
             seen.append((now, value))
-            if of_modes:
-                self.sighted = Overruled(place, "Operating Mode", value, self._modes[place])
-            else:
-                self.sighted = Overruled(place, self._goals[place], value, sent[-1][place])
+            self.sighted = Overruled(place, register, value, written)
             is_ours = not of_modes and (value == 0 or any(value in each for each in sent))
             times = [when for when, other in seen if other == value or not is_ours]
             most, least_s = (_UNSURE_SIGHTINGS, _UNSURE_S) if is_ours else (_SIGHTINGS, 0.0)
@@ -146,28 +147,37 @@ class ReadBack:
         enough = _GOALS_PER_MODE_IN_DOUBT if now < self.doubts_until else 1
         self.is_of_modes = now >= self._modes_due and self._goals_since >= enough
 
-    def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
-        """Place and value of each servo that holds a value that this program did not write."""
-        self.is_unexpected = False
-        self._looks += not self.is_of_modes
+    def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[Overruled]:
+        """What each servo holds that this program did not write."""
         servos = [answer if answer is not None and len(answer) > 1 else None for answer in servos]  # not the refusals
-        for answer, value in zip(servos, self._modes if self.is_of_modes else sent[-1], strict=True):
-            if answer is not None and answer[-1] != value:
-                self.is_unexpected = True
+        if self.is_of_modes:
+            found = self._other_settings(servos)
+            self.is_unexpected = bool(found)
+            return found
+        self._looks += 1
+        self.is_unexpected = any(
+            answer is not None and answer[-1] != value for answer, value in zip(servos, sent[-1], strict=True)
+        )
         if not self.is_unexpected:
             return []
-        if self.is_of_modes:
-            return [
-                (place, answer[-1])
-                for place, (answer, mode) in enumerate(zip(servos, self._modes, strict=True))
-                if answer is not None and answer[-1] != mode
-            ]
         self._count_missed(servos, sent)
         # A servo that received its neighbour's goal is not commanded by another master.
         own = set().union(*islice(reversed(sent), _RECENT))
         return [
-            (place, answer[-1]) for place, answer in enumerate(servos) if answer is not None and answer[-1] not in own
+            Overruled(place, self._goals[place], answer[-1], sent[-1][place])
+            for place, answer in enumerate(servos)
+            if answer is not None and answer[-1] not in own
         ]
+
+    def _other_settings(self, servos: Sequence[Answer]) -> list[Overruled]:
+        """The first setting of each servo that is not as this program left it."""
+        found = []
+        for place, (answer, modes) in enumerate(zip(servos, self._modes, strict=True)):
+            if answer is None or answer[-len(modes) :] == modes:
+                continue
+            held = zip(self._settings, answer[-len(modes) :], modes, strict=True)
+            found.append(next(Overruled(place, *each) for each in held if each[1] != each[2]))
+        return found
 
     def _count_missed(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> None:
         """Count the goals that did not arrive: the servo still holds an earlier goal of this program."""

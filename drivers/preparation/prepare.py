@@ -10,6 +10,7 @@ from hil.drivers.port import Port
 from hil.drivers.preparation.settings import arms_itself
 from hil.drivers.servo import NO_ERROR, Servo, describe_error
 from hil.drivers.servo_model import Mode
+from hil.drivers.state import SETTINGS
 
 LISTEN_S = 0.05
 """How long the bus must be quiet before this program starts to use it [s]."""
@@ -84,10 +85,13 @@ def shared(what: str) -> BusShared:
 
 
 def overruled(joint: Joint, found: Overruled) -> BusShared:
-    """Return the error for a servo that holds a goal or a mode that this program did not write."""
+    """Return the error for a servo that holds a goal or a setting that this program did not write."""
+    by, before = "commanded", f"but {found.written} was written"
+    if found.register in SETTINGS and found.register != "Operating Mode":
+        by, before = "changed", f"and read {found.written} before the start"
     return BusShared(
-        f"{joint.title[0].upper()}{joint.title[1:]} is commanded by another program: its {found.register} reads "
-        f"{found.value}, but {found.written} was written. End that program, or unplug its controller."
+        f"{joint.title[0].upper()}{joint.title[1:]} is {by} by another program: its {found.register} reads "
+        f"{found.value}, {before}. End that program, or unplug its controller."
     )
 
 

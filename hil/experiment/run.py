@@ -20,6 +20,7 @@ from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
 from hil.plan.chain_plan import check_clearance, plan_of
 from hil.plan.plan import Plan
+from hil.plan.stabiliser import must_balance
 from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.runs.background import Background
 from hil.runs.event_log import EventLog
@@ -29,7 +30,15 @@ from hil.runs.timing import lateness_histogram
 from hil.setup.changed_settings import EXPLAINED, WRITTEN, Settings, changed_settings, settings_now
 from hil.setup.lying import from_where_it_lies, moved_without_torque, said_of_the_rest, tolerance_now, wait_for_rest
 from hil.setup.realtime import on_time
-from hil.setup.servo_session import REBOOT_S, confirmed_later, has_moved, servo_session, settings_at_start
+from hil.setup.servo_session import (
+    REBOOT_S,
+    confirmed_later,
+    has_moved,
+    lay_at_start,
+    servo_session,
+    settings_at_start,
+)
+from hil.setup.unmoved import Lies, has_stirred, refuse_moved, where_it_lies
 
 __all__ = ["run_experiment"]
 
@@ -38,6 +47,9 @@ _LAST_SAMPLES = 100
 
 _MOST_UNSEEN = 20
 """Number of progress reports that may be queued for the observer; about one second."""
+
+_REPEAT_S = 0.05
+"""Time after which torque off is sent again to a servo that does not answer [s]."""
 
 _PATIENCE_S = 0.2
 """Time for which the end of a run waits for the observer [s]."""
@@ -78,8 +90,7 @@ def run_experiment(
             note("spatial arms have not been tested on hardware yet: keep a hand on the supply's switch")
         note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
-        if (moving := wait_for_rest(bus) if has_moved() or config.is_chain else "") and config.is_chain:
-            raise ExperimentError(moving)
+        lies = _wait_for_rest(config, bus)
         _check_pose(config, bus)
         if config.is_chain and not is_given:
             config, plan = _from_where_it_lies(config, plan, bus, run, note)
@@ -87,7 +98,7 @@ def run_experiment(
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
             # Signals are deferred from before torque comes on until the servos' settings are restored.
             with stop.only_noted(), servo_limits(config, bus, note):
-                changed = _play(config, plan, bus, recorder, stop, shown, note, arms)
+                changed = _play(config, plan, bus, recorder, stop, shown, note, arms, lies)
             torque = str(bus.torque_off_report)
             note(torque)
             if changed:
@@ -123,8 +134,11 @@ def _play(
     watch: Watch,
     note: Note,
     arms: Ensemble | ChainArms | None,
+    lay: Lies,
 ) -> str:
     """Switch torque on, stream, switch torque off; whatever stops the stream is logged as an event.
+
+    lay: where the servos were when the arm's pose was checked.
 
     Returns sentences about settings that another program changed meanwhile, and about an arm that does not stay in its
     rest pose without torque; "" if there are none.
@@ -135,6 +149,7 @@ def _play(
         # In this order, because on_time takes longer than the watchdog's timeout.
         with on_time(bus.port.clock) as granted:
             settings = _check_unchanged(bus)
+            refuse_moved(lay, where_it_lies(bus))
             stream.begins_at(bus.read_positions())
             with bus.torque(config.safety.watchdog):
                 if granted:
@@ -174,8 +189,15 @@ def _moved_without_torque(config: Config, bus: ServoBus, state: State | None) ->
 
 
 def _try_again(bus: ServoBus, note: Note) -> None:
-    """Cut the torque of servos that did not answer, once more after the time in which a servo boots."""
-    bus.port.clock.wait_until(bus.port.clock.now() + REBOOT_S)
+    """Cut the torque of servos that did not answer, again and again in the time in which a servo boots.
+
+    Their watchdogs have acted by now, if they were still armed, so that packets cannot delay them any more.
+    """
+    clock = bus.port.clock
+    end = clock.now() + REBOOT_S
+    while clock.now() < end:
+        clock.wait_until(min(end, clock.now() + _REPEAT_S))
+        bus.repeat_torque_off()
     for drive in bus.drives:
         with suppress(DriverError):
             if bus.confirm_later(drive):
@@ -247,6 +269,25 @@ def _watched(clock: Clock, watch: Watch) -> Iterator[Watch]:
         yield shown.put
     finally:
         shown.close(_PATIENCE_S)
+
+
+def _wait_for_rest(config: Config, bus: ServoBus) -> Lies:
+    """Wait until an arm that swings has come to rest; return where it lies then.
+
+    Raises ExperimentError if it has moved far since the start, or a spatial arm does not come to rest.
+    """
+    lay, lies = lay_at_start(), where_it_lies(bus)
+    try:
+        refuse_moved(lay, lies)
+    except ExperimentError:
+        _check_unchanged(bus)  # which names another program that shifted the angles
+        raise
+    # An upright arm that nobody holds would only fall farther.
+    if has_moved() or config.is_chain or (has_stirred(lay, lies) and not must_balance(config)):
+        if (moving := wait_for_rest(bus)) and config.is_chain:
+            raise ExperimentError(moving)
+        lies = where_it_lies(bus)
+    return lies
 
 
 def _check_rate(config: Config, bus: ServoBus) -> None:

@@ -217,12 +217,14 @@ class Stream:
         differences = []
         for period in range(1, self._plan.max_settling_periods + 1):
             self._play_period(segment, period)
+            self._check_motion(repetition.moved)
             difference = repetition.difference
             differences.append(difference)
             if difference <= self._plan.settle_within:
                 self._note(f"{segment.role}: period {period} is settled, {difference:.2%} from the one before")
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
+                    self._check_motion(repetition.moved)
                 return
         if difference <= self._plan.drift_within:
             self._note(f"{segment.role}: still drifts slowly: {difference:.2%} per period; using the last periods")
@@ -246,7 +248,7 @@ class Stream:
         )
 
     def _check_motion(self, moved: Sequence[float]) -> None:
-        """Detect a joint held by friction or an obstacle after one period, before more time is wasted."""
+        """Detect a joint held by friction or an obstacle after a period, before more time is wasted."""
         for joint, way in zip(self._bus.joints, moved, strict=True):
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
                 against = f" Or {opposed(joint)}" if joint.seconds else ""

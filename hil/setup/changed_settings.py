@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from contextlib import suppress
+from itertools import permutations
 
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
@@ -71,7 +72,27 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
     ]
     if not changed:
         return ""
-    return f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."
+    said = f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."
+    if (swapped := _swapped(before, after)) is not None:
+        first, second = swapped
+        said += f" {first.title} has what {second} had: their IDs may have been swapped."
+    return said
+
+
+def _swapped(before: Settings, after: Settings) -> tuple[Joint, Joint] | None:
+    """A servo with all the settings of another, which were different before, and that one; None if there are none."""
+    old, new = _by_joint(before), _by_joint(after)
+    for first, second in permutations(old, 2):
+        if old[first] != old[second] == new.get(first):
+            return first, second
+    return None
+
+
+def _by_joint(settings: Settings) -> dict[Joint, dict[str, int]]:
+    found: dict[Joint, dict[str, int]] = {}
+    for (joint, register), value in settings.items():
+        found.setdefault(joint, {})[register] = value
+    return found
 
 
 def _may_explain(register: str, cause: Cause | None) -> bool:

@@ -27,12 +27,14 @@ from hil.setup.changed_settings import Settings, settings_now
 from hil.setup.current_limit import current_limit_ticks
 from hil.setup.others import others_on_the_bus
 from hil.setup.settings_file import Kept
+from hil.setup.unmoved import Lies, where_it_lies
 
 __all__ = [
     "SETTINGS_NAME",
     "Say",
     "ServoSession",
     "has_moved",
+    "lay_at_start",
     "left_behind",
     "recover",
     "servo_session",
@@ -52,6 +54,9 @@ SETTINGS_NAME = "servo_settings.json"
 REBOOT_S = 0.6
 """Time before a servo that does not answer at the end, and may be booting, is tried again [s]."""
 
+
+_LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
+"""Said if every servo has answered in the end, and nothing else is wrong."""
 
 COUNT_DOWN_S = 5.0
 """Time between the warning that an arm will move again after a stopped run and switching torque on [s].
@@ -75,6 +80,8 @@ class ServoSession:
     """Return Delay Time of each servo at the beginning [2 us]."""
     settings: Settings = field(default_factory=dict)
     """What `settings_now` found at the beginning."""
+    lay: Lies = field(default_factory=dict)
+    """Where the servos were at the beginning."""
     _left: set[Joint] = field(default_factory=set)
     """Servos whose settings an earlier run left changed; restoring a goal that a lowered limit cuts is retried only
     once.
@@ -95,6 +102,7 @@ class ServoSession:
         bus.check_identity()
         left = {joint: kept for joint in bus.drives if (kept := left_behind(bus.port.url, joint)) is not None}
         bus.release_held(ours=left)
+        self.lay = where_it_lies(bus)
         if others := others_on_the_bus(bus):
             self._say(f"Also on this bus (left alone): {'; '.join(others)}.")
         described = {
@@ -287,7 +295,7 @@ def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
         return None
     cause = error.__context__
     if cause is None:
-        return ExperimentError(str(report))
+        return ExperimentError(f"{_LATE_CONFIRMED} {report}")
     cause.add_note(str(report))
     return cause
 
@@ -333,6 +341,12 @@ def settings_at_start() -> Settings:
     """The servos' settings at the beginning of this session (`changed_settings.settings_now`)."""
     outer = _outermost.get()
     return {} if outer is None else outer.settings
+
+
+def lay_at_start() -> Lies:
+    """Where the servos were at the beginning of this session; empty if a run may have moved the arm since."""
+    outer = _outermost.get()
+    return {} if outer is None or outer.shared > 1 else outer.lay
 
 
 def left_behind(port: str, joint: Joint) -> Kept | None:

@@ -373,7 +373,7 @@ ONE_READ_BACK_S = 0.004
 def read_back_of(wire: Wire) -> Exchange:
     cycles = exchange(wire)
     modes = [Mode.CURRENT, Mode.CURRENT]
-    cycles.add_read_back(*read_back_spans(modes, [XM430, XM430]), modes)
+    cycles.add_read_back(*read_back_spans(modes, [XM430, XM430]), [(0, mode, 0) for mode in modes])
     return cycles
 
 
@@ -478,7 +478,7 @@ def test_goals_are_compared_with_what_was_sent_though_the_caller_changes_its_lis
         size, held = (goal.size, (7, 8)) if cycles._read_back.read is goals_are_asked_for else (mode.size, (0, 0))
         answers = [bytes(size - 2) + struct.pack("<h", each) for each in held]
         wire.answers = [b"".join(encode_status(servo, 0, each) for servo, each in enumerate(answers, 1))]
-        assert cycles.overruled(wire.now() + 0.9 * HOST_S) is None and not wire.answers
+        assert cycles.overruled(wire.now() + 1.5 * HOST_S) is None and not wire.answers
         assert not cycles._late_possible and not cycles.is_in_doubt
 
 

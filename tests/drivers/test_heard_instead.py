@@ -6,6 +6,7 @@ from typing import Any, cast
 import pytest
 
 from hil.drivers.bus import ServoBus
+from hil.drivers.packet import encode_status
 from tests.drivers.test_exchange import Wire, answer, exchange, fast_answer, state
 
 FINE = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
@@ -55,3 +56,21 @@ def test_nothing_is_said_of_silence_or_of_what_was_long_ago() -> None:
 
 def test_late_replies_are_called_late() -> None:
     assert said(b"", waiting=FINE).startswith("Replies did arrive, but too late or twice")
+
+
+@pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize("kept", [-1, -5])
+def test_a_reply_that_was_still_arriving_when_time_was_up_is_late_not_damaged(kept: int, fast: bool) -> None:
+    fine = both(1, 2, fast=fast)
+    late = "Replies did arrive, but too late or twice"
+    assert said(fine[:kept], waiting=fine[kept:], fast=fast).startswith(late), "its rest waits before the next request"
+    assert said(fine[:kept], fine[kept:], fast=fast).startswith(late), "its rest comes after the next request"
+    longer = [(servo, 0, b"\x00" + state(1, 2, 3)) for servo in (1, 2)]
+    following = fast_answer(*longer) if fast else b"".join(encode_status(*each) for each in longer)
+    assert said(fine[:kept], following[:kept], fast=fast).startswith("Bytes arrived, but damaged or incomplete")
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_so_is_the_beginning_of_a_reply_to_an_earlier_request(fast: bool) -> None:
+    """After a lost reply another number of bytes is asked for."""
+    assert said(b"", both(1, 2, fast=fast)[:-1], fast=fast).startswith("Replies did arrive, but too late or twice")

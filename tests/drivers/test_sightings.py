@@ -19,7 +19,7 @@ LONG_AGO = 55
 
 
 def read_back() -> ReadBack:
-    return ReadBack((1, 2), GOALS, MODES, [MODE, MODE], fast=False)
+    return ReadBack((1, 2), GOALS, MODES, [(MODE,), (MODE,)], fast=False)
 
 
 def reads_modes(back: ReadBack) -> bool:
@@ -42,6 +42,17 @@ def test_the_second_foreign_goal_is_proof_the_third_of_one_that_lost_writes_may_
         now += 0.01
         found = look(back, now, goal=goal)
     assert seen == proof and found == Overruled(1, "Goal Current", goal, OURS)
+
+
+@pytest.mark.parametrize("register", ["Drive Mode", "Operating Mode", "Homing Offset"])
+def test_any_setting_that_changes_what_goals_and_angles_mean_is_compared(register: str) -> None:
+    names = ("Drive Mode", "Operating Mode", "Homing Offset")
+    back = ReadBack((1, 2), GOALS, Span.of([XM430] * 2, ("ID", *names)), [(0, 0, -84), (4, 3, 0)], fast=False)
+    held = {name: value + 7 * (name == register) for name, value in zip(names, (4, 3, 0), strict=True)}
+    for now, found in ((0.0, False), (0.01, True)):
+        assert reads_modes(back)
+        told = back.look([(0, 1, 0, 0, -84), (0, 2, *held.values())], SENT, now)
+        assert told == (Overruled(1, register, held[register], held[register] - 7) if found else None)
 
 
 @pytest.mark.parametrize(("apart", "proof"), [(0.001, 11), (0.004, 4), (0.005, 3)])

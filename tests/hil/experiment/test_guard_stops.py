@@ -15,7 +15,7 @@ import serial
 
 from hil.config.schema import Config, parse_config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import TorqueNotOff, WrongModel, WrongSetting
+from hil.drivers.errors import BusShared, TorqueNotOff, WrongModel, WrongSetting
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
 from hil.experiment import run, work
 from hil.experiment.model_watch import ModelWatch
@@ -25,6 +25,7 @@ from hil.fakes.bus.faults import Fault, FaultKind
 from hil.plan.plan import Plan, make_plan
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
+from hil.setup import servo_session
 from tests.support.paths import CONFIGS
 from tests.support.spied_plant import SpiedPlant, Spy, call_at
 
@@ -147,6 +148,19 @@ def test_settings_that_another_program_changed_are_the_cause_that_is_named(
     assert_stopped(ports[0])
 
 
+@pytest.mark.parametrize(("register", "value"), [("Drive Mode", 1), ("Homing Offset", 40)])
+def test_a_setting_that_hardly_shows_in_the_motion_is_read_back(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
+) -> None:
+    def change() -> None:
+        ports[0].bus.servos[2].memory.set(register, value)
+
+    config, begun = arm(), once(change)
+    with pytest.raises(BusShared, match=rf"'elbow'.* is changed by another program: its {register} reads {value}, and"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, begun, plan)
+    assert_stopped(ports[0])
+
+
 @pytest.mark.parametrize(("register", "value"), [("PWM Limit", 5), ("Current Limit", 20)])
 def test_a_limit_that_another_program_lowered_is_the_cause_that_is_named(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
@@ -211,6 +225,28 @@ def test_settings_changed_before_torque_comes_on_are_refused(
     monkeypatch.setattr(run, "_write_facts", shift)
     config = arm()
     with pytest.raises(WrongSetting, match=r"'elbow'.*Homing Offset is 30 and was 0\)\. Torque has not been switched"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
+    assert_stopped(ports[0])
+
+
+def test_an_offset_changed_before_the_pose_is_checked_is_named_not_its_effect(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "_check_rate", lambda *_: ports[0].bus.servos[2].memory.set("Homing Offset", 60))
+    config = arm()
+    with pytest.raises(WrongSetting, match=r"'elbow'.*Homing Offset is 60 and was 0\)\. Torque has not been switched"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
+    assert_stopped(ports[0])
+
+
+@pytest.mark.parametrize(("where", "after"), [(servo_session, "others_on_the_bus"), (run, "_check_pose")])
+def test_a_joint_that_turns_before_torque_comes_on_is_refused(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch, where: Any, after: str
+) -> None:
+    """Its horn slips, or another servo answers: every angle would be off, by less than the rest pose's tolerance."""
+    monkeypatch.setattr(where, after, lambda *_: fault(ports, FaultKind.ENCODER_JUMP, servo=2, amount=60))
+    config = arm()
+    with pytest.raises(ExperimentError, match=r"'elbow'.* has turned by \+0\.092 rad since .* before torque was"):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
     assert_stopped(ports[0])
 
@@ -308,6 +344,52 @@ def test_commands_too_far_apart_for_the_watchdogs(arm: Arm, tmp_path: Path, port
         stop.cause is Cause.WATCHDOG and "received nothing for 20 ms" in str(stop)
     )
     assert len(samples) <= 2
+    assert_stopped(ports[0])
+
+
+def test_torque_off_is_repeated_until_a_deaf_servo_hears_it(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its watchdog does not act, because another program has switched it off."""
+    deaf_s = 0.5
+    begun: list[float] = []
+    ends: list[float] = []
+    repeat = ServoBus.repeat_torque_off
+
+    def deafen() -> None:
+        servo = ports[0].bus.servos[2]
+        servo.memory.set("Bus Watchdog", 0)
+        servo._derive()
+        fault(ports, FaultKind.LOST_INSTRUCTION, servo=2, duration=deaf_s)
+        begun.append(ports[0].bus.time)
+
+    def note(bus: ServoBus) -> None:
+        repeat(bus)
+        bus.port.clock.wait_until(bus.port.clock.now() + 1e-3)
+        ports[0].bus.advance(bus.port.clock.now())
+        if not ports[0].bus.servos[2].torque_enabled and not ends:
+            ends.append(bus.port.clock.now() - begun[0])
+
+    monkeypatch.setattr(ServoBus, "repeat_torque_off", note)
+    config = arm()
+    with pytest.raises(TorqueNotOff):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, once(deafen), plan)
+    assert deaf_s < ends[0] < deaf_s + 0.06
+
+
+def test_replies_lost_only_while_torque_is_cut_at_the_end_are_named(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut = ServoBus.torque_off
+
+    def behind_a_loss(bus: ServoBus) -> Any:
+        fault(ports, FaultKind.LOST_REPLY, servo=2, duration=0.4)
+        return cut(bus)
+
+    monkeypatch.setattr(ServoBus, "torque_off", behind_a_loss)
+    config = arm()
+    with pytest.raises(TorqueNotOff, match=r"^Replies were missing when torque was cut.* Torque is off on both servos"):
+        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
     assert_stopped(ports[0])
 
 

@@ -101,6 +101,13 @@ def test_two_runs_of_one_seed_are_the_same_to_the_last_bit(arm: Arm, tmp_path: P
     assert first.tobytes() == second.tobytes()
 
 
+def test_an_arm_that_still_swings_is_awaited(arm: Arm, tmp_path: Path) -> None:
+    """Within 0.05 rad before torque comes on, and within much more before it would be at rest."""
+    config = arm(("start = [-1.5707963, 0.0]", "start = [-1.37, 0.0]"))
+    rests = load_samples(run(config, tmp_path / "run").samples_path, 2)["position"]
+    assert rests[0, 0] < -1.45 and np.ptp(rests[:40], axis=0).max() < 0.01
+
+
 def test_a_rest_pose_at_the_encoders_wrap_is_found_on_either_side(arm: Arm) -> None:
     zeros = (("zero_ticks = 3072  ", "zero_ticks = 1024  "), (SERVO_1, SERVO_1.replace("3072", "1024")))
     for off in (-0.003, 0.003):

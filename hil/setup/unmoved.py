@@ -1,0 +1,50 @@
+"""Whether the arm stays where it was first read until torque comes on.
+
+Without torque only a hand or gravity moves it. Otherwise its readings are no longer right: a horn slips, another servo
+answers, or another program changes Homing Offset. From then on every angle would be wrong.
+"""
+
+import math
+from collections.abc import Mapping
+
+from hil.drivers.bus import ServoBus
+from hil.drivers.joint import Joint
+from hil.errors import ExperimentError
+
+__all__ = ["MOST_RAD", "Lies", "has_stirred", "refuse_moved", "where_it_lies"]
+
+MOST_RAD = 0.05
+"""Largest motion before torque is switched on [rad]; the guard allows as much before the start."""
+
+STIRRED_RAD = 0.004
+"""Motion that noise of an encoder does not explain: the arm is not at rest [rad]."""
+
+Lies = Mapping[Joint, int]
+"""Present Position of each servo [ticks]."""
+
+
+def where_it_lies(bus: ServoBus) -> Lies:
+    """Read where each servo is; raises as `Servo.read`."""
+    return {drive: servo.read("Present Position") for drive, servo in bus.drives.items()}
+
+
+def has_stirred(before: Lies, now: Lies) -> bool:
+    """Whether the arm was moving between two readings."""
+    return any(abs(_turned(drive, before, now)) > STIRRED_RAD for drive in now)
+
+
+def refuse_moved(before: Lies, now: Lies) -> None:
+    """Raise ExperimentError if a joint has moved by more than MOST_RAD between two readings."""
+    for drive in now:
+        turned = _turned(drive, before, now)
+        if abs(turned) > MOST_RAD:
+            raise ExperimentError(
+                f"{drive.title} has turned by {turned:+.3f} rad since this command first read it, before torque was "
+                f"switched on; at most {MOST_RAD} is allowed. Let the arm come to rest, then start again; check "
+                "whether a hand or a cable pushes or holds it, its horn slips, or another program changes its settings."
+            )
+
+
+def _turned(drive: Joint, before: Lies, now: Lies) -> float:
+    """Angle between two readings [rad], within half a turn: a servo that was switched off forgets whole turns."""
+    return math.remainder((now[drive] - before.get(drive, now[drive])) * drive.position_unit, math.tau)
