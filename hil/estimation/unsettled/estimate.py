@@ -16,6 +16,7 @@ from hil.estimation.model_from_config import wanted_model
 from hil.estimation.plausibility import torque_scale_std
 from hil.estimation.result_checks import describe_segment_choice, describe_verdict
 from hil.estimation.slips.position_jumps import jump_warnings
+from hil.estimation.torque_constants import Source, contradictions, ratios_of, ratios_said
 from hil.estimation.unsettled.agreement import disagreement
 from hil.estimation.unsettled.plausibility import implausible, undetermined
 from hil.estimation.unsettled.warnings import doubts_of
@@ -61,12 +62,14 @@ class Given:
 
     torque_scale_std: see `hil.estimator.models.conflicts.conflicts`. zeros: whether the encoder zeros are those of a
     configuration. names: of the recordings. jumps: a sentence for each joint of a recording whose position jumped.
+    torque_source: what states the torques.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
     zeros: bool = False
     names: tuple[str, ...] = ()
     jumps: tuple[str, ...] = ()
+    torque_source: Source = "column"
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
@@ -83,7 +86,8 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
         between="held",
         command_to_sample=facts.command_to_sample,
     )
-    given = Given(torque_scale_std(config), zeros=True, jumps=tuple(jump_warnings(config, facts, samples)))
+    jumps = tuple(jump_warnings(config, facts, samples))
+    given = Given(torque_scale_std(config), zeros=True, jumps=jumps, torque_source="constant")
     zeros, gravity = config.model.zeros, config.arm.gravity
     result = estimate_any([recording], config.model, 1.0, zeros, facts.config, gravity, given=given).result
     result = replace(result, warnings=(*result.warnings, *current_findings(config, samples).warnings))
@@ -115,7 +119,10 @@ def estimate_any(
     estimate = considered(recordings, estimate)
     found = doubts_of(recordings, estimate)
     apart = () if given.jumps else disagreement(recordings, given.names, estimate, segment, zeros)
-    odd = (*apart, *implausible(recordings, estimate, gravity), *undetermined(estimate))
+    conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
+    ratios = ratios_of(estimate.names, estimate.value, estimate.std)
+    contradictory = contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
+    odd = (*apart, *contradictory, *implausible(recordings, estimate, gravity), *undetermined(estimate))
     if given.jumps:
         odd = (JUMPED, *odd)
     verdict = judge_segments(
@@ -127,8 +134,9 @@ def estimate_any(
             odd,
             bool(found.faults),
             bool(found.doubts),
-            conflicts_in(estimate, given),
+            conflicts_found,
             bool(given.jumps or apart),
+            ratios_said(joints, ratios, given.torque_source, contradictory),
         ),
     )
     result = _result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3), stepped)
@@ -156,6 +164,11 @@ def conflicts_in(estimate: ShootingEstimate, given: Given) -> tuple[Conflict, ..
             names += [f"zero_{joint}" for joint in range(1, zero.size + 1)]
             value, std = [*value, *zero], [*std, *error]
     return conflicts(names, np.array(value), np.array(std), given.torque_scale_std)
+
+
+def joint_names(count: int) -> tuple[str, ...]:
+    """What `count` joints are called in sentences."""
+    return tuple(f"joint {joint}" for joint in range(1, count + 1))
 
 
 def _start(recordings: Sequence[Recording]) -> NDArray[np.float64]:
