@@ -18,6 +18,7 @@ from hil.estimation.result_checks import describe_segment_choice, describe_verdi
 from hil.estimation.slips.position_jumps import jump_warnings
 from hil.estimation.torque_constants import Source, contradictions, ratios_of, ratios_said
 from hil.estimation.unsettled.agreement import disagreement
+from hil.estimation.unsettled.causes import causes
 from hil.estimation.unsettled.plausibility import implausible, undetermined
 from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.idim import fit_inverse_dynamics
@@ -117,12 +118,14 @@ def estimate_any(
     start = _start(recordings)
     estimate, choice, held_out = _fitted(recordings, wanted, start, segment, zeros)
     estimate = considered(recordings, estimate)
-    found = doubts_of(recordings, estimate)
+    predicted = predicted_positions(recordings, estimate)
     apart = () if given.jumps else disagreement(recordings, given.names, estimate, segment, zeros)
+    why = () if given.jumps or apart else causes(recordings, given.names, predicted, estimate)
+    found = doubts_of(recordings, estimate, bool(why))
     conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
     ratios = ratios_of(estimate.names, estimate.value, estimate.std)
     contradictory = contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
-    odd = (*apart, *contradictory, *implausible(recordings, estimate, gravity), *undetermined(estimate))
+    odd = (*apart, *why, *contradictory, *implausible(recordings, estimate, gravity), *undetermined(estimate))
     if given.jumps:
         odd = (JUMPED, *odd)
     verdict = judge_segments(
@@ -130,12 +133,12 @@ def estimate_any(
         estimate,
         SegmentEvidence(
             held_out,
-            () if given.jumps or apart else missing_terms(recordings, estimate),
+            () if given.jumps or apart or why else missing_terms(recordings, estimate),
             odd,
             bool(found.faults),
             bool(found.doubts),
             conflicts_found,
-            bool(given.jumps or apart),
+            bool(given.jumps or apart or why),
             ratios_said(joints, ratios, given.torque_source, contradictory),
         ),
     )
@@ -153,7 +156,7 @@ def estimate_any(
     log.info("%s: %s, trust this model: %s", shown_path, result.method, verdict.trust)
     for warning in result.warnings:
         log.warning("%s: %s", shown_path, warning)
-    return Estimated(result, predicted_positions(recordings, estimate), estimate)
+    return Estimated(result, predicted, estimate)
 
 
 def conflicts_in(estimate: ShootingEstimate, given: Given) -> tuple[Conflict, ...]:

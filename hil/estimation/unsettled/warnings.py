@@ -17,6 +17,8 @@ LEFT = 0.1  # RMS residual relative to the motion's RMS
 CERTAIN, LEAST_EARLY = 4.0, 0.1  # standard errors and sampling intervals by which a delay is negative
 WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
 
+UNITS_ADVICE = "check the units, signs and zero of position and torque; then try shorter segments"
+
 
 @dataclass(frozen=True)
 class Doubts:
@@ -27,8 +29,11 @@ class Doubts:
     warnings: tuple[str, ...]
 
 
-def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate) -> Doubts:
-    """What looks wrong in the recordings, or in how the estimate explains them."""
+def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate, cause_known: bool = False) -> Doubts:
+    """What looks wrong in the recordings, or in how the estimate explains them.
+
+    cause_known: whether the verdict says why much of the motion is unexplained.
+    """
     faults, doubts, warnings = _signs(recordings), [], []
     for joint in range(estimate.model.joints):
         name = f"Joint {joint + 1}"
@@ -38,11 +43,13 @@ def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate) -> Do
         motion = float(np.sqrt(np.mean([np.var(each.filled()[joint]) for each in recordings])))
         left = float(estimate.residual_rms[joint]) / motion
         if left > LEFT:
+            advice = "the verdict names the cause" if cause_known else UNITS_ADVICE
             faults.append(
                 f"{name}: the fit leaves {100 * left:.2g} % of the motion unexplained, so do not use these numbers: "
-                "check the units, signs and zero of position and torque; then try shorter segments."
+                f"{advice}."
             )
-    return Doubts(tuple(faults), tuple(doubts), (*warnings, *_early(recordings, estimate), *_weak(estimate)))
+    early = [] if cause_known else _early(recordings, estimate)
+    return Doubts(tuple(faults), tuple(doubts), (*warnings, *early, *_weak(estimate)))
 
 
 def _signs(recordings: Sequence[Recording]) -> list[str]:
