@@ -115,8 +115,8 @@ def _constant(time: Array, values: Array) -> list[slice]:
 def _frozen(joint: _Joint) -> list[str]:
     return [
         f"The position of {joint.name} stays at {joint.position[part.start]:.4g} rad {_from_to(joint.time, part)}, "
-        "where the rest of the recording says that the joint should move: a frozen reading, or something held it. Leave that "
-        "part out."
+        "where the rest of the recording says that the joint should move: a frozen reading, or something held it. "
+        "Leave that part out."
         for part in _constant(joint.time, joint.position)
         if joint.is_unexplained(part)
     ]
@@ -181,8 +181,8 @@ def _stop(joint: _Joint) -> list[str]:
             continue
         found.append(
             f"{joint.name[0].upper()}{joint.name[1:]} rebounds at {place:.4g} rad {at.size} times, {_at(time[at])}, "
-            "and never gets beyond: it hits a stop or an object there, which no model includes. Use the part before, or "
-            "record motion that stays away from it."
+            "and never gets beyond: it hits a stop or an object there, which no model includes. Use the part before, "
+            "or record motion that stays away from it."
         )
     return found
 
