@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
 from hil.estimator.data.settled_period import SettledPeriod
@@ -120,7 +121,7 @@ def calibrate(
     samples = sum(int(period.valid.sum()) for period in problem.periods)
     variance = minimum.at.cost / max(1, samples - x.size)
     norm = np.sqrt(np.maximum(np.diag(minimum.at.normal), 1e-300))
-    covariance = variance * np.linalg.pinv(minimum.at.normal / np.outer(norm, norm), rcond=1e-13, hermitian=True)
+    covariance = variance * linalg.pinv(minimum.at.normal / np.outer(norm, norm), rcond=1e-13, hermitian=True)
     covariance /= np.outer(norm, norm)
     factor = np.exp(x[:joints])
     slope = problem.coordinates.slopes(x[joints : joints + problem.size])

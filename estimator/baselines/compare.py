@@ -117,7 +117,7 @@ def _best(
         began = time.perf_counter()
         try:
             result = fit(setting)
-        except (EstimationError, np.linalg.LinAlgError):
+        except EstimationError:
             continue
         seconds = time.perf_counter() - began
         width = setting[1] if name in {"idim_ls", "rls"} else setting[0]

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError, UnidentifiableError
@@ -124,7 +125,7 @@ def _solve(Y: Array, tau: Array, weight: Array) -> tuple[Array, Array]:
     A = (Y * weight[:, None, None]).reshape(-1, Y.shape[2])
     b = (tau * weight[:, None]).reshape(-1)
     norm = np.linalg.norm(A, axis=0)
-    U, size, Vt = np.linalg.svd(A / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
+    U, size, Vt = linalg.svd(A / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
     if size[-1] * WORST_CONDITION < size[0] or np.any(norm == 0.0):
         raise UnidentifiableError(
             "filtered inverse dynamics: the motion does not separate the parameters; move both joints, faster and "

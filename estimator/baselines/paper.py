@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ModelError, ShapeError
 
@@ -93,7 +94,7 @@ def response(arm: PaperArm, excitation: Excitation, order: Order) -> Complex:
     s = 1j * excitation.frequency
     D, K, F = arm.mass_matrix(), arm.stiffness(), np.eye(2) * arm.viscous
     terms = (s * D[:, :, None] if order == 1 else s * s * D[:, :, None] + s * F[:, :, None]) + K[:, :, None]
-    angles = np.linalg.solve(np.moveaxis(terms, 2, 0), excitation.torque.T[:, :, None])[:, :, 0].T
+    angles = linalg.solve(np.moveaxis(terms, 2, 0), excitation.torque.T[:, :, None])[:, :, 0].T
     return np.asarray(angles, dtype=np.complex128)
 
 
@@ -140,9 +141,9 @@ def fit_as_printed(coefficient: Complex, excitation: Excitation, known: PaperArm
         A = np.stack((-s * q, -q, s * u1, u1, s * u2, u2), axis=1)
         goal = s * s * q
         rows = np.concatenate((A.real, A.imag))
-        if np.linalg.matrix_rank(rows / np.linalg.norm(rows, axis=0)) < rows.shape[1]:
+        if linalg.matrix_rank(rows / np.linalg.norm(rows, axis=0)) < rows.shape[1]:
             raise ModelError("both joints have the same torque on the same lines: (33) is singular; give each its own")
-        found = np.linalg.lstsq(rows, np.concatenate((goal.real, goal.imag)), rcond=None)[0]
+        found = linalg.lstsq(rows, np.concatenate((goal.real, goal.imag)), rcond=None)[0]
         masses.append(_nearest_masses(found, joint, known)[joint])
     return masses[0], masses[1]
 
@@ -179,7 +180,7 @@ def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm
     found = least_squares(misfit, start, x_scale=np.maximum(start, 0.1), xtol=1e-14, ftol=1e-14, gtol=1e-14)
     variance = 2.0 * found.cost / (found.fun.size - start.size)
     jacobian = np.asarray(found.jac, dtype=np.float64)
-    std = np.sqrt(variance * np.diag(np.linalg.inv(jacobian.T @ jacobian)))
+    std = np.sqrt(variance * np.diag(linalg.inv(jacobian.T @ jacobian)))
     viscous = float(found.x[2]) if order == 2 else 0.0
     return MassEstimate(float(found.x[0]), float(found.x[1]), (float(std[0]), float(std[1])), viscous)
 
@@ -197,7 +198,7 @@ def _nearest_masses(found: Array, joint: int, known: PaperArm) -> Array:
 
 def _transfer(arm: PaperArm, joint: int) -> Array:
     """Return a1, a0, b11, b10, b21, b20 of one joint of the first-order plant, (25) to (28)."""
-    B = np.linalg.inv(arm.mass_matrix())
+    B = linalg.inv(arm.mass_matrix())
     A = -B @ arm.stiffness()
     adjugate = np.array([[-A[1, 1], A[0, 1]], [A[1, 0], -A[0, 0]]]) @ B
     b = ((B[joint, i], adjugate[joint, i]) for i in range(2))

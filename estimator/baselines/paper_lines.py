@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.data.fourier import cut_off, held_lines, lines_of
 from hil.estimator.data.settled_period import SettledPeriod
@@ -79,7 +80,7 @@ def _solve(A: Array, b: Array) -> tuple[Array, Array]:
     """Solve A x = b (complex) by ordinary least squares; return x and its covariance assuming a white residual."""
     real, goal = np.concatenate((A.real, A.imag)), np.concatenate((b.real, b.imag))
     norm = np.linalg.norm(real, axis=0)
-    x = np.linalg.lstsq(real / norm, goal, rcond=None)[0] / norm
+    x = linalg.lstsq(real / norm, goal, rcond=None)[0] / norm
     left = goal - real @ x
     variance = float(left @ left) / max(1, goal.size - x.size)
-    return x, variance * np.linalg.pinv((real / norm).T @ (real / norm), hermitian=True) / np.outer(norm, norm)
+    return x, variance * linalg.pinv((real / norm).T @ (real / norm), hermitian=True) / np.outer(norm, norm)

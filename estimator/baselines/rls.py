@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.baselines.idim import InverseDynamics, uniform
 from hil.estimator.data.recording import Recording
@@ -71,7 +72,7 @@ def _run(Y: Array, tau: Array, deviation: Array) -> tuple[Array, Array]:
     for k in range(samples):
         y = Y[:, k]
         Py = P @ y.T
-        gain = Py @ np.linalg.solve(y @ Py + R, eye)
+        gain = Py @ linalg.solve(y @ Py + R, eye)
         theta = theta + gain @ (tau[:, k] - y @ theta)
         P = P - gain @ Py.T
         P = 0.5 * (P + P.T)

@@ -14,6 +14,7 @@ from itertools import product
 import numpy as np
 
 from hil.estimator.baselines.idim import InverseDynamics, fit_inverse_dynamics
+from hil.estimator.baselines.zero import turned_zeros
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 
@@ -107,6 +108,20 @@ def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | No
     if recordings[0].joints != 2:
         return None
     return _better_explained(recordings, [replace(each, torque=each.torque[::-1].copy()) for each in recordings])
+
+
+def suspect_order(recordings: Sequence[Recording]) -> tuple[float, float] | None:
+    """Return evidence that both the angles and the torques of two joints are in the opposite order.
+
+    As `suspect_swapped`. The zero of the outer joint's angle may be known only after the exchange.
+    """
+    if recordings[0].joints != 2:
+        return None
+    other = [replace(each, torque=each.torque[::-1].copy(), position=each.position[::-1].copy()) for each in recordings]
+    zeros = turned_zeros(other)
+    if zeros is not None:
+        other = [replace(each, position=each.position + zeros[:, None]) for each in other]
+    return _better_explained(recordings, other)
 
 
 def _better_explained(recordings: Sequence[Recording], changed: Sequence[Recording]) -> tuple[float, float] | None:

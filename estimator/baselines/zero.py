@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.baselines.idim import filtered_rows
 from hil.estimator.data.recording import Recording
@@ -58,5 +59,5 @@ def _turned(recording: Recording) -> Recording:
 
 def _solved(A: Array, b: Array) -> tuple[Array, float]:
     norm = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-    x = np.linalg.lstsq(A / norm, b, rcond=1e-10)[0] / norm
+    x = linalg.lstsq(A / norm, b, rcond=1e-10)[0] / norm
     return x, float(np.sqrt(np.mean((b - A @ x) ** 2)))

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.coordinates import ANGLES, SHAPES, kind_of
 from hil.estimator.chain.model.prior import Prior
@@ -14,7 +15,7 @@ DRIVES = ("back_emf", "lag_ratio")
 def chain_conflicts(names: tuple[str, ...], value: Array, std: Array, prior: Prior) -> tuple[Conflict, ...]:
     """Return the contradictions among the parameters `names`, worst first; `names` begins with the base parameters."""
     precision = prior.scale_precision
-    scales = np.empty(0) if precision is None else np.sqrt(np.diag(np.linalg.inv(precision)))
+    scales = np.empty(0) if precision is None else np.sqrt(np.diag(linalg.inv(precision)))
     found: list[Conflict | None] = []
     for index, (name, each, error) in enumerate(zip(names, value.tolist(), std.tolist(), strict=True)):
         kind = kind_of(name)

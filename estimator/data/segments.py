@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
@@ -152,5 +153,5 @@ def _state_at(recording: Recording, time: float) -> Array:
     window = max(START_WINDOW, 5.0 * recording.interval)
     near = np.abs(recording.time - time) <= window
     filled = recording.filled()[:, near]
-    cubic = np.polynomial.polynomial.polyfit(recording.time[near] - time, filled.T, 3)
+    cubic = linalg.polyfit(recording.time[near] - time, filled.T, 3)
     return np.asarray(cubic[:2])

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
 from hil.estimator.excitation.multisine import Multisine
@@ -94,7 +95,7 @@ class DesignProblem:
         if not seen[: len(self.names)].all() or not np.isfinite(norm).all():
             return np.full(len(self.names), np.inf)
         scaled = columns[:, seen] / norm[seen]
-        inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-14, hermitian=True)
+        inverse = linalg.pinv(scaled.T @ scaled, rcond=1e-14, hermitian=True)
         count = len(self.names)
         deviations: Array = np.sqrt(np.maximum(np.diag(inverse), 0.0))[:count] / norm[seen][:count]
         return deviations

@@ -8,6 +8,7 @@ Numerical Optimization, section 16.5).
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array, Mask
 
 ITERATIONS_PER_COORDINATE = 6
@@ -26,7 +27,7 @@ def bounded_step(matrix: Array, slope: Array, least: Array, most: Array) -> Arra
         least: lower bounds (coordinates,), at most 0.
         most: upper bounds (coordinates,), at least 0; a coordinate with both 0 is fixed.
     """
-    step = np.asarray(-np.linalg.solve(matrix, slope), dtype=np.float64)
+    step = np.asarray(-linalg.solve(matrix, slope), dtype=np.float64)
     if np.all((step >= least) & (step <= most)):
         return step
     movable = least < most
@@ -36,7 +37,7 @@ def bounded_step(matrix: Array, slope: Array, least: Array, most: Array) -> Arra
         direction = np.zeros_like(slope)
         if free.any():
             held = matrix[np.ix_(free, ~free)] @ step[~free]
-            direction[free] = -np.linalg.solve(matrix[np.ix_(free, free)], slope[free] + held) - step[free]
+            direction[free] = -linalg.solve(matrix[np.ix_(free, free)], slope[free] + held) - step[free]
         share, blocking = _share_until_bound(step, direction, least, most)
         step = np.clip(step + share * direction, least, most)
         if blocking is not None:

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.fit.levenberg_marquardt import Quadratic
 from hil.estimator.fit.normal_equations import normal_equations
@@ -120,11 +121,11 @@ def robust_covariance(
     seen, lengths, _, found = _measured(at, scatter, samples, structured, prior)
     covariance = np.zeros_like(at.normal)
     if prior.any():
-        size, directions = np.linalg.eigh(prior[np.ix_(seen, seen)] / lengths)
+        size, directions = linalg.eigh(prior[np.ix_(seen, seen)] / lengths)
         root = directions * np.sqrt(np.maximum(size, 0.0))
         # (found^-1 + prior)^-1 without inverting a matrix that may be nearly singular.
         inner = np.eye(len(found)) + root.T @ found @ root
-        found = found - found @ root @ np.linalg.solve(inner, root.T @ found)
+        found = found - found @ root @ linalg.solve(inner, root.T @ found)
     covariance[np.ix_(seen, seen)] = found / lengths
     hidden = np.flatnonzero(~seen)
     covariance[hidden, hidden] = np.inf
@@ -166,7 +167,7 @@ def _measured(
     seen: Mask = norm > 1e-12 * norm.max()
     lengths = np.outer(norm[seen], norm[seen])
     measured = (at.normal - prior)[np.ix_(seen, seen)] / lengths
-    inverse = np.asarray(np.linalg.pinv(measured, hermitian=True), dtype=np.float64)
+    inverse = np.asarray(linalg.pinv(measured, hermitian=True), dtype=np.float64)
     if scatter is None:
         return seen, lengths, inverse, inverse
     freedom = max(1, samples - int(seen.sum()))
@@ -178,10 +179,10 @@ def _measured(
 
 def larger_covariance(robust: Array, white: Array) -> Array:
     """Return a covariance at least as large as both, along the directions in which they differ."""
-    size, directions = np.linalg.eigh(white)
+    size, directions = linalg.eigh(white)
     root = directions * np.sqrt(np.maximum(size, 1e-300))
-    ratio = np.linalg.solve(root, np.linalg.solve(root, robust).T)
-    factor, turned = np.linalg.eigh(0.5 * (ratio + ratio.T))
+    ratio = linalg.solve(root, linalg.solve(root, robust).T)
+    factor, turned = linalg.eigh(0.5 * (ratio + ratio.T))
     covariance: Array = (root @ (turned * np.maximum(factor, 1.0))) @ (root @ turned).T
     return covariance
 

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.data.fourier import PeriodicMotion, held_lines, lines_of
 from hil.estimator.data.settled_period import SettledPeriod
@@ -33,7 +34,7 @@ def find_waves(periods: Sequence[SettledPeriod], linear: LinearEstimate, wave: W
             _prepared(period, motion, harmonics, joint, linear.delay)
             for period, motion, harmonics in zip(periods, linear.motions, linear.harmonics, strict=True)
         ]
-        Q = np.linalg.qr(np.concatenate([columns for columns, _, _, _ in each]))[0]
+        Q = linalg.qr(np.concatenate([columns for columns, _, _, _ in each]))[0]
         goal = _without(Q, np.concatenate([torque for _, torque, _, _ in each]))
         best: tuple[float, float, Array] = (-1.0, 0.0, np.zeros(2))
         for cycles in CYCLES.tolist():
@@ -42,7 +43,7 @@ def find_waves(periods: Sequence[SettledPeriod], linear: LinearEstimate, wave: W
                 for _, size, torque, angle in _parts(each)
             ]
             extra = _without(Q, np.concatenate(waves))
-            share = np.asarray(np.linalg.lstsq(extra, goal, rcond=None)[0], dtype=np.float64)
+            share = np.asarray(linalg.lstsq(extra, goal, rcond=None)[0], dtype=np.float64)
             explained = float(goal @ goal - np.sum((goal - extra @ share) ** 2))
             best = max(best, (explained, cycles, share), key=lambda trial: trial[0])
         # Torque appears as measured = applied (1 + ripple) + cogging, so the columns explain their negative.

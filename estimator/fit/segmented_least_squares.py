@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.options import SegmentedMinimiserOptions
@@ -117,7 +118,7 @@ def _inverse(matrix: Array) -> tuple[Array, Array]:
 
     Directions without effect on the residual are left out; a coordinate with a component in one is undetermined.
     """
-    size, direction = np.linalg.eigh(matrix)
+    size, direction = linalg.eigh(matrix)
     seen = size > MIN_EIGENVALUE * size[-1]
     inverse: Array = (direction[:, seen] / size[seen]) @ direction[:, seen].T
     part = np.sum(direction[:, ~seen] ** 2, axis=1)
@@ -144,8 +145,8 @@ class _Blocks:
         eye = np.eye(self.own.shape[1])
         scale = np.diagonal(self.own, axis1=1, axis2=2).max(axis=1)[:, None, None] * 1e-14
         damped = self.own + damping * self.own * eye + scale * eye
-        solve = np.linalg.solve(damped, np.swapaxes(self.mixed, 1, 2))
-        known = np.linalg.solve(damped, self.own_gradient[:, :, None])[:, :, 0]
+        solve = linalg.solve(damped, np.swapaxes(self.mixed, 1, 2))
+        known = linalg.solve(damped, self.own_gradient[:, :, None])[:, :, 0]
         information = self.shared.sum(axis=0) - np.einsum("sij,sjk->ik", self.mixed, solve)
         scores = self.shared_gradient - np.einsum("sij,sj->si", self.mixed, known)
         return information, scores, solve, known
@@ -244,7 +245,7 @@ def _stepped(
     full = np.diag(blocks.shared.sum(axis=0)) + prior.precision
     scale = np.sqrt(np.maximum(full, 1e-12 * full.max()))
     matrix = information / np.outer(scale, scale) + damping * np.eye(shared.size)
-    step = -np.linalg.lstsq(matrix, gradient / scale, rcond=1e-13)[0] / scale
+    step = -linalg.lstsq(matrix, gradient / scale, rcond=1e-13)[0] / scale
     step = np.clip(step, -max_step, max_step)
     own_step = -known - np.einsum("sij,j->si", solve, step)
     return shared + step, own + np.clip(own_step, -max_step, max_step)

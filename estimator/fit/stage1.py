@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.data.fourier import Lines, PeriodicMotion, cut_off, held_lines, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
@@ -90,7 +91,7 @@ def _solve(columns: Lines, torque: Lines, weight: Array, max_condition: float) -
     goal = (torque * weight[:, None]).reshape(-1)
     b = np.concatenate((goal.real, goal.imag))
     norm = np.linalg.norm(A, axis=0)
-    U, size, Vt = np.linalg.svd(A / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
+    U, size, Vt = linalg.svd(A / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
     if size[-1] * max_condition < size[0]:
         raise UnidentifiableError(
             f"the regression has a condition number of {size[0] / max(size[-1], 1e-300):.2g}; at most "

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.models.terms import kind_of, term_of
 
@@ -30,7 +31,7 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
     # Each coordinate by its own scale: that of a parameter that has run to zero is many orders of magnitude smaller.
     scale = np.sqrt(np.diag(normal))
     scale = np.where(scale > FAINTEST, scale, 1.0)
-    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True)
+    inverse = linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True)
     count = len(slopes)
     step = -(inverse @ (gradient / scale))[:count] / scale[:count]
     covariance = (inverse / np.outer(scale, scale))[:count, :count]

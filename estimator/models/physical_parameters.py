@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ModelError
 from hil.estimator.models.terms import RIGID_BODY
@@ -107,7 +108,7 @@ def physical_quantities(
     exact = {name: item.value for name, item in known.items() if item.std == 0.0}
     measured = {name: item for name, item in known.items() if item.std > 0.0}
     floor = np.diag(1e-18 + 1e-14 * goal[rows] ** 2)
-    whiten = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(rows, rows)] + floor))
+    whiten = linalg.inv(linalg.cholesky(covariance[np.ix_(rows, rows)] + floor))
 
     def misfit(x: Array, whitened: bool) -> Array:
         given = exact | dict(zip(unknown, x.tolist(), strict=True))
@@ -172,7 +173,7 @@ def _slope(function: object, x: Array, size: Array) -> Array:
 
 def _null_space(slope: Array) -> Array:
     """Return the directions in which nothing changes (unknowns, directions)."""
-    _, size, Vt = np.linalg.svd(slope)
+    _, size, Vt = linalg.svd(slope)
     rank = int(np.sum(size > SINGULAR * size[0]))
     null: Array = Vt[rank:].T
     return null
@@ -180,7 +181,7 @@ def _null_space(slope: Array) -> Array:
 
 def _spread(slope: Array) -> Array:
     norm = np.maximum(np.linalg.norm(slope, axis=0), 1e-300)
-    _, size, Vt = np.linalg.svd(slope / norm, full_matrices=False)
+    _, size, Vt = linalg.svd(slope / norm, full_matrices=False)
     seen = size > SINGULAR * size[0]
     std: Array = np.sqrt(np.sum((Vt[seen].T / size[seen]) ** 2, axis=1)) / norm
     return std

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.fit.covariance import autocorrelation
@@ -104,7 +105,7 @@ class Linearised:
         normal, gradient = self.normal[np.ix_(at, at)], self.gradient[at]
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         prior = self.expected[np.ix_(at, at)] * self.colour
-        inverse = np.linalg.pinv((normal + prior) / np.outer(scale, scale), rcond=1e-11, hermitian=True)
+        inverse = linalg.pinv((normal + prior) / np.outer(scale, scale), rcond=1e-11, hermitian=True)
         step = -(inverse @ (gradient / scale)) / scale
         return float(-gradient @ step), step[: len(names)]
 
@@ -216,10 +217,10 @@ def widened(about: Linearised, names: Sequence[str], covariance: Array, left_out
     across = normal[np.ix_(fitted, extra)]
     prior = about.precision[extra] / scale[extra] ** 2
     expected = about.expected[np.ix_(fitted, fitted)] / np.outer(scale[fitted], scale[fitted]) * about.colour
-    inverse = np.linalg.pinv(own + expected, rcond=1e-11, hermitian=True)
+    inverse = linalg.pinv(own + expected, rcond=1e-11, hermitian=True)
     follow = -inverse @ across
     told = (normal[np.ix_(extra, extra)] + across.T @ follow) / about.colour
-    open_ = np.linalg.inv(0.5 * (told + told.T) + np.diag(prior) + 1e-12 * np.eye(len(extra)))
+    open_ = linalg.inv(0.5 * (told + told.T) + np.diag(prior) + 1e-12 * np.eye(len(extra)))
     moved = -open_ @ (gradient[extra] + follow.T @ gradient[fitted]) / about.colour
     count = len(names)
     wider = follow[:count] / scale[:count, None]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.fourier import cut_off, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
@@ -74,7 +75,7 @@ def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
     derivative = by_parameters(period, estimate)
     seconds = np.arange(period.samples) / period.rate
     since = (seconds - seconds.mean()) / drift.seconds
-    own = np.linalg.pinv(about.normal + about.expected * about.colour, rcond=1e-11, hermitian=True)
+    own = linalg.pinv(about.normal + about.expected * about.colour, rcond=1e-11, hermitian=True)
     wider = estimate.covariance.copy()
     seen = np.isfinite(np.diag(wider))
     for joint in range(period.joints):
@@ -143,7 +144,7 @@ def _fitted(later: "_Later", period: SettledPeriod, most: float | Array) -> tupl
     if not _is_finite(A, r):
         return change, np.full(joints, np.inf), np.inf
     for _ in range(ITERATIONS):
-        step = np.linalg.lstsq(A, r, rcond=None)[0]
+        step = linalg.lstsq(A, r, rcond=None)[0]
         for share in SHARES:
             further = change + np.clip(share * step[:joints], -most, most)
             start = state + share * step[joints:].reshape(2, -1)
@@ -153,8 +154,8 @@ def _fitted(later: "_Later", period: SettledPeriod, most: float | Array) -> tupl
                 break
         else:
             break
-    inverse = np.linalg.pinv(A.T @ A, hermitian=True)
-    rest = r - A @ np.linalg.lstsq(A, r, rcond=None)[0]
+    inverse = linalg.pinv(A.T @ A, hermitian=True)
+    rest = r - A @ linalg.lstsq(A, r, rcond=None)[0]
     std = np.sqrt(
         np.diag(inverse)[:joints] * float(rest @ rest) / max(1, r.size - A.shape[1]) * colour(rest.reshape(joints, -1))
     )

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.identify import Estimate
 from hil.estimator.models.model import Model
@@ -35,7 +36,7 @@ def pruned_model(
         for part, plainer in removable_parts(model):
             at = [names.index(name) for name in _tested(model, plainer)]
             away = value[at] - np.array([term_of(names[i]).absent for i in at])
-            own = np.linalg.pinv(covariance[np.ix_(at, at)], rcond=1e-12, hermitian=True)
+            own = linalg.pinv(covariance[np.ix_(at, at)], rcond=1e-12, hermitian=True)
             doubtful.append((float(away @ own @ away) / float(chdtri(len(at), level)), part, plainer, at, own, away))
         doubtful = [each for each in doubtful if each[0] < 1.0 and each[1] != fixed]
         if not doubtful:

@@ -51,6 +51,8 @@ class SegmentEvidence:
     """Values far from those known beforehand."""
     spoiled: bool = False
     """Whether the recordings themselves are at fault, so that neither terms nor other motion would help."""
+    notes: tuple[str, ...] = ()
+    """Findings, as sentences that cast no doubt on the values."""
 
 
 def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate) -> dict[str, float]:
@@ -82,6 +84,7 @@ def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, 
         _predicted(held_out, estimate.segment_length),
         *conflict_sentences(evidence.conflicts, explained),
         *evidence.doubts,
+        *evidence.notes,
         _weakest(weakest, relative[weakest], evidence.spoiled),
     )
     return Verdict(trust, weakest, sentences)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ALL, Shooting, ShootingEstimate
@@ -58,7 +59,7 @@ def linearised(recordings: Sequence[Recording], estimate: ShootingEstimate, name
         r, J = rows * weight, columns * weight[:, None]
         mine, state = J[:, :causes], J[:, causes:]
         # Changes that the segment's initial state explains carry no information about the parameters.
-        Q = np.linalg.qr(state)[0]
+        Q = linalg.qr(state)[0]
         mine, r = mine - Q @ (Q.T @ mine), r - Q @ (Q.T @ r)
         normal += mine.T @ mine
         gradient += mine.T @ r
@@ -102,7 +103,7 @@ def held_out_errors(
             r, J = rows[known], columns[known, -own.size :]
             if not (np.isfinite(r).all() and np.isfinite(J).all()):
                 break  # the simulated arm diverges: its prediction is as wrong as one can be
-            step = np.linalg.lstsq(J, r, rcond=None)[0]
+            step = linalg.lstsq(J, r, rcond=None)[0]
             own = own - np.clip(step, -1.0, 1.0)
             if float(np.abs(step).max()) < 1e-4:
                 break

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.data.relative_error import relative_error
 from hil.estimator.data.settled_period import SettledPeriod
@@ -89,7 +90,7 @@ class Choice:
             np.where(seen, std, 1.0), np.where(seen, std, 1.0)
         )
         across = correlation[np.ix_(added, base)]
-        told = np.sum(across * (np.linalg.pinv(correlation[np.ix_(added, added)]) @ across), axis=0)
+        told = np.sum(across * (linalg.pinv(correlation[np.ix_(added, added)]) @ across), axis=0)
         return float(np.exp(-0.5 * np.mean(np.log1p(-np.clip(told, 0.0, 1.0 - 1e-9)))))
 
 

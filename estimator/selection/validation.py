@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.fourier import cut_off, lines_of, motion_of, noise_power
 from hil.estimator.data.settled_period import SettledPeriod
@@ -85,7 +86,7 @@ def validate(period: SettledPeriod, estimate: Estimate) -> Validation:
         np.sqrt(np.nanmean(estimate.residual**2, axis=1)) / period.noise,
         np.array(outside),
         _free_run(period, estimate),
-        float(np.linalg.cond(correlation)),
+        float(linalg.cond(correlation)),
         (names[first], names[second], float(correlation[first, second])),
         _relative_std(period, estimate),
         _torque_std(period, estimate),

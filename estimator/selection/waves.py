@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod, without_spikes
 from hil.estimator.fit.ripple import WAVES, Wave
@@ -43,7 +44,7 @@ def wave_peaks(
     known = estimate.parameters | searched
     fitted = tuple(name for name in estimate.names if name not in searched)
     columns, position = columns_of(run, Physics.of(known), estimate.start, fitted, weight)
-    Q = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
+    Q = linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
     residual = (weight * (run.measured - position)).reshape(-1)
     rest = residual - Q @ (Q.T @ residual)
     falls: dict[str, list[float]] = {f"{wave}_cycles_{joint}": [] for wave, joint in places}
@@ -54,7 +55,7 @@ def wave_peaks(
         found = found[:, : len(names)] - Q @ (Q.T @ found[:, : len(names)])
         for place, name in enumerate(given):
             own = found[:, 2 * place : 2 * place + 2]
-            falls[name].append(float(np.sum((np.linalg.qr(own)[0].T @ rest) ** 2)))
+            falls[name].append(float(np.sum((linalg.qr(own)[0].T @ rest) ** 2)))
     return {name: _peaks(cycles, np.nan_to_num(fall)) for name, fall in falls.items()}
 
 

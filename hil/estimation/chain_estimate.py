@@ -17,6 +17,7 @@ from hil.estimation.result_checks import describe_chain_choice
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.slips.position_jumps import jump_disturbances
+from hil.estimation.torque_constants import RATIO, contradictions, ratios_of
 from hil.estimation.truth import back_emf, scaled
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import SYSTEMATIC, ChainEstimate, identify_chain
@@ -27,7 +28,7 @@ from hil.estimator.chain.simulation.prediction import predict
 from hil.estimator.models.bounds import bound_sentence
 from hil.estimator.models.conflicts import Trust, conflict_sentences, contradicted, lowered
 from hil.fakes.plants.arm import armature
-from hil.plan.chain_model import KnownChain, known_chain
+from hil.plan.chain_model import KnownChain, known_chain, torque_constant_stds
 from hil.plan.plan import HELD_OUT, IDENTIFY
 from hil.results.parts import ChainFacts, Covariance, Quantity, RunTiming, SettledFit, Validation, Verdict
 from hil.results.result import SettledResult
@@ -240,6 +241,9 @@ def _verdict(
     if estimate.at_bound:
         trust = lowered(trust, "with care")
         sentences.append(bound_sentence(estimate.at_bound))
+    if said_of_torques := contradicting_torques(config, estimate):
+        trust = lowered(trust, "with care")
+        sentences += said_of_torques
     trust = lowered(trust, contradicted(estimate.conflicts, explained))
     sentences += conflict_sentences(estimate.conflicts, explained)
     if estimate.unseen:
@@ -248,6 +252,14 @@ def _verdict(
             "zero within the standard error."
         )
     return Verdict(trust, weakest, tuple(sentences))
+
+
+def contradicting_torques(config: Config, estimate: ChainEstimate) -> tuple[str, ...]:
+    """One sentence for each joint whose torque constant contradicts the first joint's."""
+    std = torque_constant_stds(config)
+    spreads = {f"{RATIO}_{joint}": float(np.hypot(std[0], std[joint - 1])) for joint in range(2, std.size + 1)}
+    ratios = ratios_of(estimate.names, estimate.value, estimate.std)
+    return contradictions([joint.name for joint in config.joints], ratios, spreads, "constant", estimate.conflicts)
 
 
 def about_zeros(config: Config, estimate: ChainEstimate) -> str:

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from hil.config.schema import Config
+from hil.estimation.torque_constants import contradictions, ratios_of
 from hil.estimator.identify import Estimate
-from hil.estimator.models.conflicts import LARGE_RATIO, Conflict, conflicts
+from hil.estimator.models.conflicts import Conflict, conflicts
 from hil.plan.chain_model import torque_constant_stds
 
 DEVIATIONS = 4.0  # standard errors
@@ -22,10 +23,13 @@ def doubts(
 
     largest_torque: largest commanded torque [N m].
     """
-    found = [*_length(config, estimate), *_weight(config, estimate, largest_torque)]
-    if all(each.name != "torque_scale_2" for each in known):
-        found += _constants(estimate)
-    return tuple(found)
+    ratios = ratios_of(estimate.names, estimate.value, estimate.std)
+    joints = [joint.name for joint in config.joints]
+    return (
+        *_length(config, estimate),
+        *_weight(config, estimate, largest_torque),
+        *contradictions(joints, ratios, torque_scale_std(config), "constant", known),
+    )
 
 
 def _length(config: Config, estimate: Estimate) -> list[str]:
@@ -84,16 +88,6 @@ def torque_scale_std(config: Config) -> dict[str, float]:
     """Relative standard deviation of the ratio of the torque constants, by parameter; empty if the file gives none."""
     unsure = torque_constant_stds(config)
     return {"torque_scale_2": float(np.linalg.norm(unsure))} if unsure.size == 2 and unsure.any() else {}
-
-
-def _constants(estimate: Estimate) -> list[str]:
-    ratio = estimate.parameters.get("torque_scale_2", 1.0)
-    if abs(np.log(max(ratio, 1e-6))) < np.log1p(LARGE_RATIO):
-        return []
-    return [
-        f"The torque of joint 2 appears to be {ratio:.2g} times what its torque constant implies: check the model "
-        "and the torque_constant of both joints."
-    ]
 
 
 def _link_length(config: Config) -> float | None:

@@ -9,6 +9,7 @@ from hil.config.schema import Config
 from hil.errors import RecordingCutShort
 from hil.estimation.drive.supply import supply_sag, torque_factor
 from hil.estimation.lateness import acting_torque, lateness, velocity_of
+from hil.estimator import linalg
 from hil.estimator.data.periodicity import settling_difference
 from hil.estimator.data.repeated_noise import coloured_noise, repeated_noise
 from hil.estimator.data.settled_period import SettledPeriod
@@ -107,7 +108,7 @@ def _state_at(samples: NDArray[np.void], row: int, rate: float) -> NDArray[np.fl
         known = np.isfinite(position)
         if known.sum() < 2 * _FEWEST_AROUND:
             return None
-        state.append(np.polynomial.polynomial.polyfit(seconds[known], position[known], 3)[:2])
+        state.append(linalg.polyfit(seconds[known], position[known], 3)[:2])
     return np.ascontiguousarray(np.transpose(state))
 
 

@@ -1,13 +1,28 @@
 """Sentences about the uncertainty that the torque constants cause in a result, for terminal and report."""
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Literal, Protocol
 
-from hil.config.joint import JointConfig
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.config.joint import USUAL_TORQUE_SPREAD, JointConfig
 from hil.drivers.servo_model import Mode
+from hil.estimator.models.conflicts import Conflict
 from hil.results.parts import Quantity
 
+Values = NDArray[np.float64]
 RATIO = "torque_scale"
+USUAL_RATIO_STD = math.hypot(USUAL_TORQUE_SPREAD, USUAL_TORQUE_SPREAD)
+CONTRADICTORY = 2.0  # standard deviations, those of the torque constants and of the ratio combined
+Source = Literal["constant", "column"]
+"""What states the torque of a joint: its torque constant, or a column of a recording."""
+_STATES: dict[Source, str] = {"constant": "torque constants", "column": "torque columns"}
+_CHECK: dict[Source, str] = {
+    "constant": "check the model and the torque_constant of both joints, or measure the constants with `hil calibrate`",
+    "column": "check the unit, the scale, the gear ratio and the torque constant behind both columns",
+}
 
 
 class Driven(Protocol):
@@ -43,7 +58,8 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
         for joint in joints
         if joint.torque_per_goal_std
     ]
-    ratios = [(joint, extra[f"{RATIO}_{n}"]) for n, joint in enumerate(joints, 1) if f"{RATIO}_{n}" in extra]
+    names = [joint.name for joint in joints]
+    ratios = [(joint, ratio) for joint, _, ratio in _ratios(names, extra)]
     if not ratios:
         known = (
             "Every value also scales with its joint's torque constant, whose relative uncertainty is: "
@@ -51,15 +67,81 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
         )
         return " ".join(sentence for sentence in (known if unsure else "", silent) if sentence)
     first = joints[0]
-    given = ", ".join(f"{joint.name} gives {ratio.value:.5g} +- {ratio.std:.1g}" for joint, ratio in ratios)
-    its = "its torque constant implies" if len(ratios) == 1 else "their torque constants imply"
-    found = (
-        f"Relative to {first.name}, {given} times the torque that {its}. Every value scales only with the torque "
-        f"constant of {first.name}"
-    )
+    given = _capitalised(_relative(first.name, ratios, "constant"))
+    found = f"{given}. Every value scales only with the torque constant of {first.name}"
     if not first.torque_per_goal_std:
         return f"{found}, whose uncertainty is not given."
     return f"{found}, known to {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
+
+
+def ratios_of(names: Sequence[str], value: Values, std: Values) -> dict[str, Quantity]:
+    """The ratios of the torque constants among the parameters `names`."""
+    return {
+        name: Quantity(float(each), float(error), "1")
+        for name, each, error in zip(names, value, std, strict=True)
+        if name.startswith(RATIO)
+    }
+
+
+def contradictions(
+    joints: Sequence[str],
+    extra: Mapping[str, Quantity],
+    ratio_std: Mapping[str, float],
+    source: Source,
+    known: Sequence[Conflict] = (),
+) -> tuple[str, ...]:
+    """A sentence for each joint whose torque contradicts the first joint's by more than torque constants are uncertain.
+
+    joints: names. extra: terms of a result that include the ratios, if there are any. ratio_std: relative standard
+    deviation of the ratio of the torque constants, by parameter, where given; otherwise it is that among servos of one
+    model. known: contradictions that say so themselves.
+    """
+    said = {each.name for each in known}
+    found = []
+    for joint, name, ratio in _ratios(joints, extra):
+        spread = ratio_std.get(name) or USUAL_RATIO_STD
+        value = max(ratio.value, 1e-6)
+        if name in said or not abs(math.log(value)) > CONTRADICTORY * math.hypot(spread, ratio.std / value):
+            continue
+        found.append(
+            f"The {_STATES[source]} of {joints[0]} and {joint} contradict each other by a factor of "
+            f"{max(value, 1.0 / value):.3g}: {_relative(joints[0], [(joint, ratio)], source)}, and torque constants "
+            f"are uncertain by only {100 * spread:.2g} % relative to each other. All values, of all joints, are in the "
+            f"torque of {joints[0]} and as wrong as that: {_CHECK[source]}."
+        )
+    return tuple(found)
+
+
+def ratios_said(
+    joints: Sequence[str], extra: Mapping[str, Quantity], source: Source, without: Sequence[str]
+) -> tuple[str, ...]:
+    """A sentence on the ratios of the torques; () if `without`, sentences, says it already."""
+    ratios = [(joint, ratio) for joint, _, ratio in _ratios(joints, extra)]
+    if not ratios or without:
+        return ()
+    stated = _capitalised(_relative(joints[0], ratios, source))
+    return (f"{stated}. All values, of all joints, are in the torque of {joints[0]}.",)
+
+
+def _capitalised(sentence: str) -> str:
+    return sentence[0].upper() + sentence[1:]
+
+
+def _ratios(joints: Sequence[str], extra: Mapping[str, Quantity]) -> list[tuple[str, str, Quantity]]:
+    """Joint, parameter and value of each ratio of the torque constants in a result."""
+    names = [(joint, f"{RATIO}_{number}") for number, joint in enumerate(joints, 1)]
+    return [(joint, name, extra[name]) for joint, name in names if name in extra]
+
+
+def _relative(first: str, ratios: Sequence[tuple[str, Quantity]], source: Source) -> str:
+    """State the ratios, beginning with a lower-case letter."""
+    given = ", ".join(f"{joint} gives {ratio.value:.5g} +- {ratio.std:.1g}" for joint, ratio in ratios)
+    one = len(ratios) == 1
+    if source == "column":
+        stated = "its column states" if one else "their columns state"
+    else:
+        stated = "its torque constant implies" if one else "their torque constants imply"
+    return f"relative to {first}, {given} times the torque that {stated}"
 
 
 def by_voltage_said(joints: Sequence[JointConfig]) -> str:

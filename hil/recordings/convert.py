@@ -39,8 +39,8 @@ class Converted:
 def convert(table: Table, columns: Columns) -> Converted:
     """Convert `table` to recordings.
 
-    Raises CsvError for columns that are missing, ambiguous or not numeric, and RecordingError for data that cannot be a
-    recording in these units.
+    Raises CsvError for columns that are missing, ambiguous or not numeric, and for data that cannot be a recording in
+    these units.
     """
     whole = guessed(table, columns)
     notes = [] if whole == columns else [said(whole, table)]
@@ -73,7 +73,7 @@ def convert(table: Table, columns: Columns) -> Converted:
     try:
         recordings = tuple(Recording(each.time, each.torque, each.position, step, whole.between) for each in long)
     except RecordingError as error:
-        raise RecordingError(f"{table.source}: {error}") from error
+        raise CsvError(f"{table.source}: {error}") from error
     names = tuple(
         table.source if len(long) == 1 else f"{table.source}, part {number}" for number in range(1, len(long) + 1)
     )

@@ -10,13 +10,15 @@ from hil.recordings.table import Table
 
 TEXTS = (".csv", ".txt", ".tsv", ".dat")
 SUFFIXES = (*TEXTS, ".parquet", ".mcap")
+UNSUPPORTED = (".db3", ".bag", ".h5", ".hdf5", ".xlsx", ".mat", ".npz", ".npy", ".json", ".jsonl", ".gz", ".zip")
+"""Recordings, too, but to be converted; named even if there is no such file."""
 
 
 def is_recording(path: Path) -> bool:
     """Whether `path`, by its name, is a recording of another tool rather than a run folder."""
     if path.is_dir():
         return is_dataset(path) or is_bag(path)
-    return path.suffix.lower() in SUFFIXES or path.suffix.lower() in {".db3", ".bag", ".h5", ".hdf5", ".xlsx", ".mat"}
+    return path.suffix.lower() in (*SUFFIXES, *UNSUPPORTED)
 
 
 def read_tables(path: Path) -> list[Table]:
@@ -32,4 +34,7 @@ def read_tables(path: Path) -> list[Table]:
         return read_parquet(path)
     if kind == ".mcap":
         return read_mcap(path)
-    raise CsvError(f"{path}: {kind} files are not supported. Convert it to CSV, Parquet or MCAP.")
+    raise CsvError(
+        f"{path}: {kind} files are not supported. Recordings are CSV ({', '.join(TEXTS)}), Parquet or MCAP files, "
+        "LeRobot datasets or ROS 2 bags: convert it to CSV, Parquet or MCAP. A run is given by its folder."
+    )

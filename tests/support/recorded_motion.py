@@ -26,15 +26,17 @@ class Motion:
 
 
 @cache
-def two_joints(seconds: float) -> Motion:
-    """One multisine of 0.1 to 5 Hz from rest, at 200 Hz."""
+def two_joints(seconds: float, limit: float = math.inf) -> Motion:
+    """One multisine of 0.1 to 5 Hz from rest, at 200 Hz. limit: of joint 1's torque; commands exceed it [N m]."""
     drives = [{**SERVO, **drive, **FRICTION} for drive in DRIVES]
     arm = Arm.model_validate({"start": (-math.pi / 2, 0.0), "links": LINKS, "drives": drives})
     wave = design_multisine(RATE, seconds, zippered_lines(seconds, (max(0.1, 1.0 / seconds), 5.0), 2), (0.9, 0.35), 3)
     current = np.round(wave.torque / SERVO["torque_constant"] / CURRENT_STEP) * CURRENT_STEP
     plant = make_plant(arm)
     position = np.empty(current.shape)
-    for k, command in enumerate(current.T.tolist()):
+    most = limit / SERVO["torque_constant"]
+    driven = np.stack((np.clip(current[0], -most, most), current[1]))
+    for k, command in enumerate(driven.T.tolist()):
         plant.advance(k / RATE + 3e-4, command)
         position[:, k] = plant.position
         plant.advance((k + 1) / RATE, command)

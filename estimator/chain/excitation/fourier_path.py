@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.stage1 import columns_of_friction
 from hil.estimator.chain.model.base_parameters import BaseParameters
@@ -137,7 +138,7 @@ class Goal:
         rows = self._seen(self._columns(self.box.path(lines, self._samples))) * self._lengths
         information = rows.T @ rows
         information[np.diag_indices_from(information)] += 1.0
-        covariance = np.linalg.inv(information)[: self.base.count, : self.base.count]
+        covariance = linalg.inv(information)[: self.base.count, : self.base.count]
         wrong = np.einsum("jsa,ab,jsb->j", self._others, covariance, self._others)
         return float(np.max(np.sqrt(wrong) / self._level))
 

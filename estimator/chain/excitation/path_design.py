@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.chain.excitation.fourier_path import Path, random_lines
 from hil.estimator.chain.model.base_parameters import BaseParameters
@@ -206,8 +207,8 @@ class PathDesigner:
         information = np.eye(self._base.count)
         for row, unknown in zip(rows, friction, strict=True):
             both = unknown.T @ row
-            information += row.T @ row - both.T @ np.linalg.solve(np.eye(3) + unknown.T @ unknown, both)
-        errors: Array = np.sqrt(np.diag(np.linalg.inv(information)))
+            information += row.T @ row - both.T @ linalg.solve(np.eye(3) + unknown.T @ unknown, both)
+        errors: Array = np.sqrt(np.diag(linalg.inv(information)))
         return errors
 
     def _finished(self, centre: Array, lines: Array) -> Design | None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.model.dynamics import mass_matrix
@@ -43,6 +44,6 @@ def free_inertias(problem: ChainProblem, parameters: Mapping[str, float]) -> Arr
     inertia = np.inf * np.ones(model.joints)
     for period in problem.periods:
         for q in period.filled()[:, :: max(1, period.samples // POSES)].T:
-            inverse = np.linalg.pinv(mass_matrix(model.base.chain, every, q), hermitian=True)
+            inverse = linalg.pinv(mass_matrix(model.base.chain, every, q), hermitian=True)
             inertia = np.minimum(inertia, 1.0 / np.maximum(np.diag(inverse), 1e-9))
     return inertia

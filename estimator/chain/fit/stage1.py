@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
@@ -96,10 +97,10 @@ def solve(columns: Array | Lines, torque: Array | Lines, weight: Array, prior: P
     A = np.concatenate((np.asarray(A, dtype=np.float64), believed))
     b = np.concatenate((np.asarray(b, dtype=np.float64), prior.value / prior.std))
     norm = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-    theta = np.linalg.lstsq(A / norm, b, rcond=1e-12)[0]
+    theta = linalg.lstsq(A / norm, b, rcond=1e-12)[0]
     left = b - A @ (theta / norm)
     variance = float(left @ left) / max(1, b.size - theta.size)
-    spread = np.sqrt(variance * np.diag(np.linalg.pinv((A / norm).T @ (A / norm), hermitian=True)))
+    spread = np.sqrt(variance * np.diag(linalg.pinv((A / norm).T @ (A / norm), hermitian=True)))
     return theta / norm, spread / norm
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.fit.resolved_widths import free_inertias
@@ -30,7 +31,7 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
     """Return the covariance (coordinates, coordinates) at the minimum `x`, where the normal matrix is `normal`."""
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     lengths = np.outer(scale, scale)
-    inverse = np.linalg.pinv(normal / lengths, hermitian=True)
+    inverse = linalg.pinv(normal / lengths, hermitian=True)
     seen, middle = np.zeros((2, *normal.shape))
     parts = [part for index in range(len(problem.periods)) for part in _spectra(problem, x, index, scale, inverse)]
     levels = _levels(parts, problem.model.joints)

@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.dynamics import TERMS, Columns, regressor
 from hil.estimator.chain.model.geometry import Chain, parameter_names, unit_of
@@ -63,7 +64,7 @@ class BaseParameters:
         norm = np.linalg.norm(Y, axis=0)
         order = [TERMS * link + term for link in range(chain.joints) for term in ORDER]
         columns = _independent(Y / np.maximum(_norms_by_kind(norm), NOTHING * norm.max()), order)
-        grouping = np.linalg.lstsq(Y[:, columns] / norm[columns], Y, rcond=None)[0] / norm[columns][:, None]
+        grouping = linalg.lstsq(Y[:, columns] / norm[columns], Y, rcond=None)[0] / norm[columns][:, None]
         grouping[np.abs(grouping) < LEAST_FACTOR] = 0.0
         return cls(chain, columns, np.round(grouping, 13))
 

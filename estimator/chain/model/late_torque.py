@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
@@ -150,8 +151,8 @@ def _most_lost(
     largest, parts = 0.0, np.zeros_like(lost)
     for pose in _POSES[:, : base.chain.joints]:
         mass = mass_matrix(base.chain, every, pose)
-        if np.all(np.isfinite(mass)) and np.linalg.eigvalsh(mass)[0] > 0.0:  # else it cannot be simulated anyway
-            fractions, motions = np.linalg.eigh(root[:, None] * np.linalg.inv(mass) * root)
+        if np.all(np.isfinite(mass)) and linalg.eigvalsh(mass)[0] > 0.0:  # else it cannot be simulated anyway
+            fractions, motions = linalg.eigh(root[:, None] * linalg.inv(mass) * root)
             if fractions[-1] > largest:
                 largest, parts = float(fractions[-1]), np.square(motions[:, -1])
     return largest, parts

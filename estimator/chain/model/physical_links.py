@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.model.base_parameters import BaseParameters
@@ -110,10 +111,10 @@ def _coordinates(link: Array) -> Array:
     inertia = inertia + np.triu(inertia, 1).T
     about = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
     second = 0.5 * np.trace(about) * np.eye(3) - about
-    size, turned = np.linalg.eigh(second)
+    size, turned = linalg.eigh(second)
     second = turned @ np.diag(np.maximum(size, mass * LEAST_SPREAD**2)) @ turned.T
     # The upper triangular factor is a Cholesky factor with rows and columns reversed.
-    lower = np.linalg.cholesky(second[::-1, ::-1])
+    lower = linalg.cholesky(second[::-1, ::-1])
     U = lower[::-1, ::-1]
     return np.array(
         [*np.log(np.diag(U)), 0.5 * np.log(mass), U[0, 1], U[0, 2], centre[0], U[1, 2], centre[1], centre[2]]

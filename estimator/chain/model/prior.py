@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS
@@ -68,4 +69,4 @@ def scale_precision(std: Array) -> Array:
     std: relative standard deviations of the torque constants (joints,).
     """
     variance = np.square(np.maximum(std, LEAST_SCALE))
-    return np.asarray(np.linalg.inv(np.diag(variance[1:]) + variance[0]))
+    return np.asarray(linalg.inv(np.diag(variance[1:]) + variance[0]))

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS
@@ -184,7 +185,7 @@ def inertias(arms: ChainArms, poses: Array) -> tuple[Array, Array]:
             place(rotation, translation, axis, pose, work[0], work[1])
             move(link, armature, still, work)
             held[arm] += np.diag(work[4]) / len(poses)
-            free[arm] = np.minimum(free[arm], 1.0 / np.diag(np.linalg.inv(work[4])))
+            free[arm] = np.minimum(free[arm], 1.0 / np.diag(linalg.inv(work[4])))
     return held, free
 
 
@@ -199,7 +200,7 @@ def is_physical(arms: ChainArms, poses: Array) -> Any:
         for pose in np.ascontiguousarray(poses, dtype=np.float64):
             place(rotation, translation, axis, pose, work[0], work[1])
             move(link, armature, still, work)
-            if np.linalg.eigvalsh(work[4])[0] <= 0.0:
+            if linalg.eigvalsh(work[4])[0] <= 0.0:
                 good[arm] = False
                 break
     return good

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from hil.arm_model import ArmModel
+from hil.estimator import linalg
 from hil.estimator.models.terms import TERMS
 from hil.results.parts import Covariance
 
@@ -84,7 +85,7 @@ def _of_joint(
     names = [name for name, each in zip(names, usable, strict=True) if each]
     before, after, scale = (each[usable] for each in (*values, scale))
     difference = (after - before) / scale
-    precision = np.linalg.pinv(spread[np.ix_(usable, usable)] / np.outer(scale, scale), hermitian=True)
+    precision = linalg.pinv(spread[np.ix_(usable, usable)] / np.outer(scale, scale), hermitian=True)
     pushed, sharp = precision @ difference, np.diag(precision)
     z = pushed / np.sqrt(sharp)
     best = int(np.argmax(np.abs(z)))

@@ -124,7 +124,7 @@ def _best(fit: Callable[[float], tuple[Array, Array]], judge: Judge, period: Set
         began = time.perf_counter()
         try:
             value, std = fit(cutoff)
-        except (EstimationError, np.linalg.LinAlgError):
+        except EstimationError:
             continue
         seconds = time.perf_counter() - began
         parameters = _simulated(model, value)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.estimator import linalg
 
 Array = NDArray[np.float64]
 
@@ -67,9 +68,9 @@ def supply_sag(config: Config, samples: NDArray[np.void]) -> Sag | None:
     size = np.sqrt(np.mean(load**2, axis=0))
     A = np.concatenate((np.eye(joints)[at], -load / np.maximum(size, 1e-12)), axis=1)
     measured = volts[row, at].astype(np.float64)
-    solution = np.linalg.lstsq(A, measured, rcond=1e-9)[0]
+    solution = linalg.lstsq(A, measured, rcond=1e-9)[0]
     variance = max(float(np.mean((measured - A @ solution) ** 2)), STEP_V**2 / 12)
-    covariance = variance * np.linalg.pinv(A.T @ A, hermitian=True)
+    covariance = variance * linalg.pinv(A.T @ A, hermitian=True)
     drop = -A[:, joints:] @ solution[joints:]
     full = int(np.argsort(drop)[round(_FULL_LOAD * (len(drop) - 1))])
     std = float(np.sqrt(A[full, joints:] @ covariance[joints:, joints:] @ A[full, joints:]))

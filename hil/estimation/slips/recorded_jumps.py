@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.estimation.slips.position_jumps import FAR_OUTSIDE, LEAST_STEPS, USUAL_QUANTILE
+from hil.estimator import linalg
 from hil.estimator.data.recording import Recording
 
 Array = NDArray[np.float64]
@@ -112,7 +113,7 @@ def _weights(time: Array) -> Array:
     at = time - 0.5 * (time[:, SIDE - 1 : SIDE] + time[:, SIDE : SIDE + 1])
     at = at / (time[:, -1:] - time[:, :1])
     design = np.stack((*(at**order for order in range(ORDER + 1)), at > 0.0), axis=-1)
-    return np.asarray(np.linalg.pinv(design)[:, -1])
+    return np.asarray(linalg.pinv(design)[:, -1])
 
 
 def _is_step(time: Array, position: Array, noise: float) -> bool:
@@ -122,7 +123,7 @@ def _is_step(time: Array, position: Array, noise: float) -> bool:
 
     def left(*terms: Array) -> float:
         design = np.column_stack((*smooth, *terms))
-        residual = position - design @ np.linalg.lstsq(design, position, rcond=None)[0]
+        residual = position - design @ linalg.lstsq(design, position, rcond=None)[0]
         return float(residual @ residual)
 
     readings = (left((np.arange(at.size) == k).astype(float)) for k in range(at.size))

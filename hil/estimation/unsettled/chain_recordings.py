@@ -15,6 +15,7 @@ from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
 from hil.estimation.chain_estimate import vague
+from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
 from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -209,6 +210,10 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     )
     trust = lowered(trust, contradicted(found.conflicts, explained))
     sentences += conflict_sentences(found.conflicts, explained)
+    joints, ratios = [joint.name for joint in arm.joints], ratios_of(found.names, found.value, found.std)
+    contradictory = contradictions(joints, ratios, {}, "column", found.conflicts)
+    trust = lowered(trust, "with care" if contradictory else "")
+    sentences += (*contradictory, *ratios_said(joints, ratios, "column", contradictory))
     if not found.reached:
         trust = lowered(trust, "with care")
         sentences.append(

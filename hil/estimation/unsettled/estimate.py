@@ -16,7 +16,9 @@ from hil.estimation.model_from_config import wanted_model
 from hil.estimation.plausibility import torque_scale_std
 from hil.estimation.result_checks import describe_segment_choice, describe_verdict
 from hil.estimation.slips.position_jumps import jump_warnings
+from hil.estimation.torque_constants import Source, contradictions, ratios_of, ratios_said
 from hil.estimation.unsettled.agreement import disagreement
+from hil.estimation.unsettled.causes import causes
 from hil.estimation.unsettled.plausibility import implausible, undetermined
 from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.idim import fit_inverse_dynamics
@@ -61,13 +63,14 @@ class Given:
 
     torque_scale_std: see `hil.estimator.models.conflicts.conflicts`. zeros: whether the encoder zeros are those of a
     configuration. names: names of the recordings. jumps: a sentence for each joint of a recording whose position
-    jumped.
+    jumped. torque_source: what states the torques.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
     zeros: bool = False
     names: tuple[str, ...] = ()
     jumps: tuple[str, ...] = ()
+    torque_source: Source = "column"
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
@@ -84,7 +87,8 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
         between="held",
         command_to_sample=facts.command_to_sample,
     )
-    given = Given(torque_scale_std(config), zeros=True, jumps=tuple(jump_warnings(config, facts, samples)))
+    jumps = tuple(jump_warnings(config, facts, samples))
+    given = Given(torque_scale_std(config), zeros=True, jumps=jumps, torque_source="constant")
     zeros, gravity = config.model.zeros, config.arm.gravity
     result = estimate_any([recording], config.model, 1.0, zeros, facts.config, gravity, given=given).result
     result = replace(result, warnings=(*result.warnings, *current_findings(config, samples).warnings))
@@ -114,9 +118,14 @@ def estimate_any(
     start = _start(recordings)
     estimate, choice, held_out = _fitted(recordings, wanted, start, segment, zeros)
     estimate = considered(recordings, estimate)
-    found = doubts_of(recordings, estimate)
+    predicted = predicted_positions(recordings, estimate)
     apart = () if given.jumps else disagreement(recordings, given.names, estimate, segment, zeros)
-    odd = (*apart, *implausible(recordings, estimate, gravity), *undetermined(estimate))
+    why = () if given.jumps or apart else causes(recordings, given.names, predicted, estimate)
+    found = doubts_of(recordings, estimate, bool(why))
+    conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
+    ratios = ratios_of(estimate.names, estimate.value, estimate.std)
+    contradictory = contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
+    odd = (*apart, *why, *contradictory, *implausible(recordings, estimate, gravity), *undetermined(estimate))
     if given.jumps:
         odd = (JUMPED, *odd)
     verdict = judge_segments(
@@ -124,12 +133,13 @@ def estimate_any(
         estimate,
         SegmentEvidence(
             held_out,
-            () if given.jumps or apart else missing_terms(recordings, estimate),
+            () if given.jumps or apart or why else missing_terms(recordings, estimate),
             odd,
             bool(found.faults),
             bool(found.doubts),
-            conflicts_in(estimate, given),
-            bool(given.jumps or apart),
+            conflicts_found,
+            bool(given.jumps or apart or why),
+            ratios_said(joints, ratios, given.torque_source, contradictory),
         ),
     )
     result = _result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3), stepped)
@@ -146,7 +156,7 @@ def estimate_any(
     log.info("%s: %s, trust this model: %s", shown_path, result.method, verdict.trust)
     for warning in result.warnings:
         log.warning("%s: %s", shown_path, warning)
-    return Estimated(result, predicted_positions(recordings, estimate), estimate)
+    return Estimated(result, predicted, estimate)
 
 
 def conflicts_in(estimate: ShootingEstimate, given: Given) -> tuple[Conflict, ...]:
@@ -157,6 +167,11 @@ def conflicts_in(estimate: ShootingEstimate, given: Given) -> tuple[Conflict, ..
             names += [f"zero_{joint}" for joint in range(1, zero.size + 1)]
             value, std = [*value, *zero], [*std, *error]
     return conflicts(names, np.array(value), np.array(std), given.torque_scale_std)
+
+
+def joint_names(count: int) -> tuple[str, ...]:
+    """What `count` joints are called in sentences."""
+    return tuple(f"joint {joint}" for joint in range(1, count + 1))
 
 
 def _start(recordings: Sequence[Recording]) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from hil.errors import CsvError
-from hil.estimator.baselines.signs import suspect_absolute, suspect_signs, suspect_swapped
+from hil.estimator.baselines.signs import suspect_absolute, suspect_order, suspect_signs, suspect_swapped
 from hil.estimator.data.recording import Recording
 
 CLEAR = 0.25
@@ -14,7 +14,7 @@ WELL = 0.3
 
 
 def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
-    """Raise CsvError if a sign is reversed, torques are swapped, or an angle is measured from another direction."""
+    """Raise CsvError if a sign is reversed, joints or torques are swapped, or an angle is measured from elsewhere."""
     absolute = suspect_absolute(recordings)
     if absolute is not None and _is_clear(*absolute):
         raise CsvError(
@@ -22,6 +22,13 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
             f"instead of from link 1. With the difference of both angles, inverse dynamics leaves "
             f"{_percent(absolute[0])} of the torque unexplained instead of {_percent(absolute[1])}. Set in "
             '[columns] of --config ARM.toml (in Python: config="ARM.toml"): angles = "absolute"'
+        )
+    order = suspect_order(recordings)
+    if order is not None and _is_clear(*order):
+        raise CsvError(
+            f"{source}: the joints seem to be in the wrong order: with angles and torques of joints 1 and 2 exchanged, "
+            f"inverse dynamics leaves {_percent(order[0])} of the torque unexplained instead of {_percent(order[1])}. "
+            "Joint 1 is the one at the base: name its columns first in [columns] of --config ARM.toml."
         )
     swapped = suspect_swapped(recordings)
     if swapped is not None and _is_clear(*swapped):

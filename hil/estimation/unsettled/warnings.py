@@ -8,6 +8,7 @@ import numpy as np
 from hil.estimator.baselines.signs import suspect_signs
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
+from hil.estimator.selection.verdict import MUCH_LEFT
 
 LEAST_SWING = 30.0  # encoder steps
 LOST = 0.01  # fraction of the samples
@@ -16,6 +17,8 @@ FLAT = 0.05  # fraction of samples at the largest torque; a sine has fewer
 LEFT = 0.1  # RMS residual relative to the motion's RMS
 CERTAIN, LEAST_EARLY = 4.0, 0.1  # standard errors and sampling intervals by which a delay is negative
 WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
+
+UNITS_ADVICE = "check the units, signs and zero of position and torque; then try shorter segments"
 
 
 @dataclass(frozen=True)
@@ -27,22 +30,27 @@ class Doubts:
     warnings: tuple[str, ...]
 
 
-def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate) -> Doubts:
-    """What looks wrong in the recordings, or in how the estimate explains them."""
+def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate, cause_known: bool = False) -> Doubts:
+    """What looks wrong in the recordings, or in how the estimate explains them.
+
+    cause_known: whether the verdict says why much of the motion is unexplained.
+    """
     faults, doubts, warnings = _signs(recordings), [], []
     for joint in range(estimate.model.joints):
         name = f"Joint {joint + 1}"
         warnings += _motion(recordings, joint, name)
         doubts += _turns(recordings, joint, name)
-        warnings += _flat(recordings, joint, name)
+        warnings += _flat(recordings, joint, name, float(estimate.residual_over_noise.max()) > MUCH_LEFT)
         motion = float(np.sqrt(np.mean([np.var(each.filled()[joint]) for each in recordings])))
         left = float(estimate.residual_rms[joint]) / motion
         if left > LEFT:
+            advice = "the verdict names the cause" if cause_known else UNITS_ADVICE
             faults.append(
                 f"{name}: the fit leaves {100 * left:.2g} % of the motion unexplained, so do not use these numbers: "
-                "check the units, signs and zero of position and torque; then try shorter segments."
+                f"{advice}."
             )
-    return Doubts(tuple(faults), tuple(doubts), (*warnings, *_early(recordings, estimate), *_weak(estimate)))
+    early = [] if cause_known else _early(recordings, estimate)
+    return Doubts(tuple(faults), tuple(doubts), (*warnings, *early, *_weak(estimate)))
 
 
 def _signs(recordings: Sequence[Recording]) -> list[str]:
@@ -79,12 +87,14 @@ def _turns(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
     return [f"{name} moved over {turns:.0f} turns: if it did not, its positions are not in the stated unit."]
 
 
-def _flat(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
-    """Detect a measured torque that was clipped at its largest value; a commanded torque may stay constant."""
+def _flat(recordings: Sequence[Recording], joint: int, name: str, unexplained: bool) -> list[str]:
+    """Detect a torque that was clipped at its largest value; a commanded torque may stay constant if that explains the
+    motion.
+    """
     for each in recordings:
         size = np.abs(each.torque[joint])
         at_most = float(np.mean(size > 0.9999 * size.max()))
-        if each.between == "linear" and FLAT < at_most < 0.9:
+        if (each.between == "linear" or unexplained) and FLAT < at_most < 0.9:
             return [
                 f"{name}: its torque stays at {size.max():.3g} N m in {100 * at_most:.0f} % of the samples: if the "
                 "current was clipped, use the measured current, or use less torque."

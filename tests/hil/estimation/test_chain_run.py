@@ -334,6 +334,8 @@ def explained(known: KnownChain, std: NDArray[np.float64]) -> Any:
     """What the verdict needs of an estimate with these standard errors that leaves nothing unexplained."""
     return SimpleNamespace(
         model=ChainModel(known.base),
+        names=known.base.names,
+        value=known.prior.value,
         std=std,
         over_noise=np.ones(4),
         noise_steps=0.29 * np.ones(4),

@@ -77,11 +77,18 @@ def test_errors_that_repeat_with_the_motion_are_trusted_with_care(setup: bench.S
     found: Any = SimpleNamespace(
         **{"model": ChainModel(setup.base), "std": 0.01 * setup.prior.std, "simulated": True, "from_prior": ()},
         **{"residual_over_noise": np.ones(4), "reached": True, "systematic": 0.9},
+        names=setup.base.names,
+        value=setup.prior.value,
         at_bound=(),
         conflicts=(),
     )
     well = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
     assert well.trust == "yes"
+    found.names, found.value = (*found.names, "torque_scale_2"), np.append(found.value, 0.7)
+    found.std = np.append(found.std, 1e-3)
+    scaled = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
+    assert scaled.trust == "with care" and "contradict each other by a factor of 1.43" in " ".join(scaled.sentences)
+    found.names, found.value, found.std = found.names[:-1], found.value[:-1], found.std[:-1]
     found.systematic = 3.0
     hidden = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
     assert hidden.trust == "with care"

@@ -14,7 +14,6 @@ from hil.config.csv_columns import Columns
 from hil.errors import CsvError
 from hil.estimation.unsettled.slips import refuse_slips
 from hil.estimator.data.recording import Recording
-from hil.estimator.errors import RecordingError
 from hil.recordings.convert import Converted, convert
 from hil.recordings.encoder import encoder_step
 from hil.recordings.files import read_tables
@@ -296,6 +295,15 @@ def test_a_plain_slip_is_refused_before_the_fit(slip: Callable[[np.ndarray], np.
         refuse_slips([swung(slip)], "arm.csv")
 
 
+@pytest.mark.parametrize("offset", [0.0, np.pi / 2])
+def test_joints_in_the_wrong_order_are_refused_before_the_fit(offset: float) -> None:
+    """Also where the angles are measured from the hanging pose."""
+    recording = swung(lambda q: q)
+    position = recording.position[::-1] + np.array([[0.0], [offset]])
+    with pytest.raises(CsvError, match="joints seem to be in the wrong order"):
+        refuse_slips([replace(recording, torque=recording.torque[::-1].copy(), position=position)], "arm.csv")
+
+
 def test_swapped_torques_are_refused_before_the_fit() -> None:
     recording = swung(lambda q: q)
     with pytest.raises(CsvError, match="torque columns of joints 1 and 2 seem to be swapped"):
@@ -410,5 +418,5 @@ def test_an_angle_that_wraps_is_to_be_unwrapped() -> None:
     def wrapped(rows: list[str]) -> list[str]:
         return [*rows[:9], *(f"{t},{float(q) + 6.28},{r}" for t, q, r in (row.split(",", 2) for row in rows[9:]))]
 
-    with pytest.raises(RecordingError, match="unwrap the angle"):
+    with pytest.raises(CsvError, match="unwrap the angle"):
         spoilt(wrapped)

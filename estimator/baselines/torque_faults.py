@@ -1,0 +1,115 @@
+"""Detection of torques that were not those of the column: clipped by the drive, or logged by another clock.
+
+As for reversed columns (`hil.estimator.baselines.signs`), inverse dynamics judges the torque as given and as changed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hil.estimator.arrays import Array
+from hil.estimator.baselines.idim import fit_inverse_dynamics
+from hil.estimator.baselines.signs import COULOMB_WIDTH, CUTOFF, LESS_RESIDUAL
+from hil.estimator.data.recording import Recording
+from hil.estimator.errors import EstimationError
+
+BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
+"""Fractions of the samples beyond the levels at which clipping is tried."""
+INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
+DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
+EVALUATIONS = 30  # of the search for delay and drift
+MOST_SAMPLES = 30_000  # more would take too long
+
+
+@dataclass(frozen=True)
+class Clipped:
+    """A joint whose torque seems limited to `level` [N m], which the column exceeds in the fraction `beyond`.
+
+    residual, residual_given: relative RMS of its torque's residual with the limit and as given.
+    """
+
+    joint: int
+    level: float
+    beyond: float
+    residual: float
+    residual_given: float
+
+
+@dataclass(frozen=True)
+class ClockDrift:
+    """A delay of the torque that changes steadily from `start` to `end` [s] in the course of the longest recording.
+
+    residual, residual_given: relative RMS of the torque's residual, worst joint, with it and with the best constant
+    delay.
+    """
+
+    start: float
+    end: float
+    relative: float
+    """Change of the delay per time, the difference of the clocks' rates."""
+    residual: float
+    residual_given: float
+
+
+def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
+    """Return the joints whose motion is explained much better by a limited torque."""
+    given = _residuals(recordings)
+    if given is None:
+        return ()
+    found = []
+    for joint in range(recordings[0].joints):
+        size = np.abs(np.concatenate([each.torque[joint] for each in recordings]))
+        tried = []
+        for beyond in BEYOND.tolist():
+            level = float(np.quantile(size, 1.0 - beyond))
+            limit = np.where(np.arange(recordings[0].joints) == joint, level, np.inf)[:, None]
+            left = _residuals([replace(each, torque=np.clip(each.torque, -limit, limit)) for each in recordings])
+            if left is not None and level > 0.0:
+                tried.append(Clipped(joint + 1, level, beyond, float(left[joint]), float(given[joint])))
+        best = min(tried, key=lambda each: each.residual, default=None)
+        if best is not None and best.residual < LESS_RESIDUAL * best.residual_given:
+            found.append(best)
+    return tuple(found)
+
+
+def suspect_drift(recordings: Sequence[Recording]) -> ClockDrift | None:
+    """Return the drift of the torque's delay that explains the motion much better than a constant one; or None."""
+    from scipy.optimize import minimize
+
+    if sum(each.time.size for each in recordings) > MOST_SAMPLES:
+        return None
+    unit = float(np.median([each.interval for each in recordings]))
+    longest = max(float(each.time[-1] - each.time[0]) for each in recordings)
+
+    def left(x: Array) -> float:
+        delay, relative = unit * float(x[0]), unit * float(x[1]) / longest
+        found = _residuals([_shifted(each, delay, relative) for each in recordings])
+        return np.inf if found is None else float(found.max())
+
+    constant = min(((left(np.array([each, 0.0])), each) for each in INTERVALS.tolist()), default=(np.inf, 0.0))
+    drifting = min((left(np.array([constant[1], each])), each) for each in DRIFTS.tolist())
+    if not drifting[0] < constant[0]:
+        return None
+    start = np.array([constant[1], drifting[1]])
+    simplex = start + np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 0.5 * drifting[1]]])
+    best = minimize(left, start, method="Nelder-Mead", options={"maxfev": EVALUATIONS, "initial_simplex": simplex})
+    if not best.fun < LESS_RESIDUAL * constant[0] or abs(best.x[1]) < 1.0:
+        return None
+    middle, half = unit * float(best.x[0]), 0.5 * unit * float(best.x[1])
+    return ClockDrift(middle - half, middle + half, 2.0 * half / longest, float(best.fun), constant[0])
+
+
+def _shifted(recording: Recording, delay: float, relative: float) -> Recording:
+    """Return the recording with its torque delayed by `delay` in the middle, and increasingly so by `relative`."""
+    time = recording.time
+    at = time - delay - relative * (time - 0.5 * (time[0] + time[-1]))
+    return replace(recording, torque=np.stack([np.interp(at, time, torque) for torque in recording.torque]))
+
+
+def _residuals(recordings: Sequence[Recording]) -> Array | None:
+    """Relative RMS of the torque residual (joints,); None if inverse dynamics cannot be solved."""
+    try:
+        return fit_inverse_dynamics(recordings, CUTOFF, COULOMB_WIDTH).relative_residual
+    except EstimationError:
+        return None

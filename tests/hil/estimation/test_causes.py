@@ -1,0 +1,133 @@
+"""Local defects of recordings are named with their time, and torques that were not those of the column."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.estimation.unsettled.causes import causes
+from hil.estimation.unsettled.warnings import doubts_of
+from hil.estimator.data.recording import Recording
+from tests.support.recorded_motion import two_joints
+
+Spoil = Callable[[Recording], Recording]
+
+
+@cache
+def healthy(limit: float = np.inf) -> Recording:
+    motion = two_joints(8.0, limit)
+    return Recording(motion.time, motion.torque, motion.position, np.full(2, 2 * np.pi / 4096), "held")
+
+
+def found(recording: Recording, predicted: np.ndarray, left: float = 20.0) -> tuple[str, ...]:
+    estimate: Any = SimpleNamespace(residual_over_noise=np.array([1.0, left]), segment_length=1.0)
+    return causes([recording], ("arm.csv",), [predicted], estimate)
+
+
+def frozen(recording: Recording) -> Recording:
+    position = recording.position.copy()
+    position[1, 600:900] = position[1, 600]
+    return replace(recording, position=position)
+
+
+def silent(recording: Recording) -> Recording:
+    torque = recording.torque.copy()
+    torque[1, 800:1000] = 0.0
+    return replace(recording, torque=torque)
+
+
+def spiky(recording: Recording) -> Recording:
+    position = recording.position.copy()
+    position[0, 101::400] += 0.3
+    return replace(recording, position=position)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (frozen, "The position of joint 2 stays at"),
+        (frozen, "from 3.000 to 4.495 s"),
+        (silent, "The torque of joint 2 stays at 0 N m from 4.000 to 4.995 s"),
+        (
+            spiky,
+            "positions of joint 1 are far from their neighbours: 4 of 1600 samples, the first at 0.505, 2.505, 4.505 s",
+        ),
+    ],
+)
+def test_a_local_defect_is_named_with_its_time(spoil: Spoil, said: str) -> None:
+    """The model is that of the healthy arm, but for the stretch in which it lacks the torque."""
+    recording, predicted = spoil(healthy()), healthy().position + 1e-4
+    if spoil is silent:
+        predicted[1, 800:1000] += 0.2
+    (named,) = found(recording, predicted)
+    assert said in named
+    assert found(recording, predicted, left=3.0) == ()
+
+
+def test_a_stretch_without_a_visible_cause_is_named_too() -> None:
+    predicted = healthy().position + 1e-3
+    predicted[0, 400:600] += 0.3
+    (named,) = found(healthy(), predicted)
+    assert "residual of joint 1 is up to 301 times the usual one in 2 to 3 s" in named
+
+
+def test_a_stop_is_named_with_its_angle() -> None:
+    """A joint that rebounds at 0.6 rad from 4 s on, with a coefficient of restitution of a third."""
+    time, step = np.arange(0.0, 12.0, 0.005), 2 * np.pi / 4096
+    free = 0.9 * np.sin(2 * np.pi * 0.7 * time) + 0.2 * np.sin(2 * np.pi * 0.31 * time)
+    beyond = np.where(time > 4.0, np.maximum(free - 0.6, 0.0), 0.0)
+    position = np.round(np.stack((np.sin(3.0 * time), free - 1.3 * beyond)) / step) * step
+    recording = Recording(time, np.stack((np.cos(time), np.sin(5.0 * time))), position, np.full(2, step), "held")
+    (named,) = found(recording, position + 0.05 * np.sin(time))
+    assert re.match(r"Joint 2 rebounds at 0\.(59|6)", named) and "and never gets beyond" in named
+
+
+def drifting(recording: Recording) -> Recording:
+    """The torque has times of a clock that is 4000 ppm slower."""
+    at = recording.time * (1.0 - 4e-3)
+    return replace(recording, torque=np.stack([np.interp(at, recording.time, row) for row in recording.torque]))
+
+
+def test_clocks_that_drift_apart_are_named() -> None:
+    (named,) = found(drifting(healthy()), healthy().position + 1e-4)
+    drift = re.match(r"The delay of the torque drifts from .* \((-\d+) ppm\)", named)
+    assert drift and float(drift[1]) == pytest.approx(-4000, rel=0.05) and "different clocks" in named
+
+
+def test_a_torque_that_the_drive_limits_is_named_with_the_limit() -> None:
+    (named,) = found(healthy(0.75), healthy(0.75).position + 1e-4)
+    limit = re.match(r"The torque of joint 1 seems to have been limited to about (\S+) N m", named)
+    assert limit and float(limit[1]) == pytest.approx(0.75, rel=0.1) and "saturation" in named
+
+
+def test_a_healthy_recording_has_none() -> None:
+    assert found(healthy(), healthy().position + 1e-4) == ()
+
+
+def test_the_warning_refers_to_the_cause_and_not_to_units() -> None:
+    estimate: Any = SimpleNamespace(
+        **{"model": SimpleNamespace(joints=2, base_names=()), "names": (), "value": (), "std": ()},
+        residual_rms=np.array([0.001, 1.0]),
+        residual_over_noise=np.array([1.0, 20.0]),
+    )
+    for known in (True, False):
+        (fault,) = doubts_of([healthy()], estimate, known).faults
+        assert ("the verdict names the cause" in fault) is known and ("check the units" in fault) is not known
+
+
+@pytest.mark.parametrize(("left", "named"), [(20.0, True), (1.0, False)])
+def test_a_command_that_stays_at_its_largest_value_is_named_where_the_motion_is_not_explained(
+    left: float, named: bool
+) -> None:
+    estimate: Any = SimpleNamespace(
+        **{"model": SimpleNamespace(joints=2, base_names=()), "names": (), "value": (), "std": ()},
+        **{"residual_rms": np.full(2, 1e-3), "residual_over_noise": np.full(2, left)},
+    )
+    clipped = replace(healthy(), torque=np.clip(healthy().torque, -0.8, 0.8))
+    said = " ".join(doubts_of([clipped], estimate).warnings)
+    assert ("its torque stays at 0.8 N m" in said) is named
