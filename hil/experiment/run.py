@@ -163,7 +163,7 @@ def _play(
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):
             error.add_note(str(bus.torque_off_report))
-            if moved := _moved_without_torque(config, bus, stream.state):
+            if moved := _moved_without_torque(config, bus, recorder):
                 error.add_note(moved)
         cause = error.__context__ if isinstance(error, TorqueNotOff) else error
         note(f"stopped: {cause or 'end of the run.'} {bus.torque_off_report}")
@@ -177,15 +177,16 @@ def _play(
                 instead.last_samples = error.last_samples
             raise instead from None
         raise
-    said = changed_settings(settings, settings_now(bus)), _moved_without_torque(config, bus, stream.state)
+    said = changed_settings(settings, settings_now(bus)), _moved_without_torque(config, bus, recorder)
     return " ".join(each for each in said if each)
 
 
-def _moved_without_torque(config: Config, bus: ServoBus, state: State | None) -> str:
-    """What an arm has done without torque since this state, in which torque was cut; "" if nothing is known."""
-    if state is None or any(state.missing) or bus.torque_off_report is None:
+def _moved_without_torque(config: Config, bus: ServoBus, recorder: Recorder) -> str:
+    """What an arm has done without torque since the last sample, before which it had torque; "" if nothing is known."""
+    samples = recorder.samples
+    if not len(samples) or bus.torque_off_report is None:
         return ""
-    return moved_without_torque(config, bus, state.position)
+    return moved_without_torque(config, bus, samples["position"][-1].tolist())
 
 
 def _try_again(bus: ServoBus, note: Note) -> None:

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hil.config.schema import load_config
+from hil.drivers.bus import ServoBus
 from hil.drivers.state import State
 from hil.errors import ExperimentError, SafetyStop, StopRequested
 from hil.experiment.lowering import Lowering
@@ -56,8 +57,18 @@ def rest_of(text: str) -> NDArray[np.float64]:
     return np.array([float(word) for word in line.split("[")[1].split("]")[0].split(",")])
 
 
-def test_ctrl_c_lowers_the_arm_to_its_rest_pose(tmp_path: Path) -> None:
+def test_ctrl_c_lowers_the_arm_to_its_rest_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[tuple[float, ...]]()
+
+    def moved(_: object, bus: ServoBus, before: tuple[float, ...]) -> str:
+        asked.append(before)
+        assert not any(servo.read("Torque Enable") for servo in bus.drives.values())
+        return "Once torque was off, the arm moved."
+
+    monkeypatch.setattr("hil.experiment.run.moved_without_torque", moved)
     error, samples = play(tmp_path, TEXT, (AT_S,))
+    assert error.__notes__[-1] == "Once torque was off, the arm moved."
+    np.testing.assert_array_equal(asked, samples["position"][-1:])
     lowered = samples[samples["phase"] == Phase.LOWERING]
     assert isinstance(error, StopRequested)
     assert any("lowered to its rest pose" in note for note in error.__notes__)
