@@ -66,6 +66,10 @@ class ControlTable:
     def __contains__(self, name: object) -> bool:
         return name in self.registers
 
+    def defines(self, address: int) -> bool:
+        """Whether the byte at this address belongs to a register."""
+        return any(each.address <= address < each.address + each.size for each in self.registers.values())
+
 
 def _folder() -> Path:
     # find_spec does not import the package, which would load far more than the data files.

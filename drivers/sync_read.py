@@ -17,6 +17,7 @@ from hil.drivers.packet import ALERT, BROADCAST_ID, HEADER, Framer, Instruction,
 Answer = tuple[int, ...] | None
 
 _crc = crc16.umts
+_ADDRESSES = 1 << 16
 _ERROR_BITS = 0xFF & ~ALERT
 _FAST_ID = 9
 """Index of the first servo's ID in a fast reply: behind header, broadcast ID, LEN, INST and its ERR."""
@@ -50,11 +51,16 @@ class Span:
     def each(cls, tables: Sequence[ControlTable], registers: Sequence[Sequence[str]]) -> "tuple[Span, ...]":
         """Return one span per table, with `registers[i]` of `tables[i]`, all covering the same range of addresses.
 
-        Raises KeyError if a table lacks one of its registers.
+        The range ends where every table defines a register: a servo refuses a read that ends at an undefined address.
+        Raises KeyError if a table lacks one of its registers, ValueError if there is no such range.
         """
         own = [cls._in(table, names) for table, names in zip(tables, registers, strict=True)]
         start = min(span.address for span in own)
         end = max(span.address + span.size for span in own)
+        end = next((at for at in range(end, _ADDRESSES) if all(table.defines(at - 1) for table in tables)), 0)
+        if not end:
+            models = ", ".join(sorted({table.model for table in tables}))
+            raise ValueError(f"{models} have no range of addresses in common that holds these registers.")
         return tuple(
             cls(
                 span.registers,

@@ -150,6 +150,7 @@ class ReadBack:
         """Place and value of each servo that holds a value that this program did not write."""
         self.is_unexpected = False
         self._looks += not self.is_of_modes
+        servos = [answer if answer is not None and len(answer) > 1 else None for answer in servos]  # not the refusals
         for answer, value in zip(servos, self._modes if self.is_of_modes else sent[-1], strict=True):
             if answer is not None and answer[-1] != value:
                 self.is_unexpected = True
@@ -159,15 +160,13 @@ class ReadBack:
             return [
                 (place, answer[-1])
                 for place, (answer, mode) in enumerate(zip(servos, self._modes, strict=True))
-                if answer is not None and answer[-1] != mode and len(answer) > 1
+                if answer is not None and answer[-1] != mode
             ]
         self._count_missed(servos, sent)
         # A servo that received its neighbour's goal is not commanded by another master.
         own = set().union(*islice(reversed(sent), _RECENT))
         return [
-            (place, answer[-1])
-            for place, answer in enumerate(servos)
-            if answer is not None and answer[-1] not in own and len(answer) > 1
+            (place, answer[-1]) for place, answer in enumerate(servos) if answer is not None and answer[-1] not in own
         ]
 
     def _count_missed(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> None:

@@ -112,10 +112,8 @@ def test_a_reversed_second_servo_is_refused_and_a_time_based_profile_is_not(open
 # Current and PWM on one arm
 
 
-@pytest.mark.parametrize("fast", [True, False])
-@pytest.mark.parametrize("one_write", [True, False])
-@pytest.mark.parametrize("interval", [0.0, 0.01])
-def test_current_and_pwm_joints_on_one_arm(opened: Open, fast: bool, one_write: bool, interval: float) -> None:
+def current_and_pwm() -> tuple[Any, ...]:
+    """An arm of three joints that are driven by voltage, current and voltage."""
     models = ("XL430-W250", "XL330-M288", "XL430-W250")
     servos = [{"id": number, "model": model, "zero_ticks": 2048} for number, model in enumerate(models, start=1)]
     description = FakeArm.model_validate(
@@ -125,12 +123,19 @@ def test_current_and_pwm_joints_on_one_arm(opened: Open, fast: bool, one_write: 
             "plant_options": {"joints": [ONE] * 3},
         }
     )
-    joints = (
+    return (
+        description,
         Joint("a", 1, servo_model("XL430-W250"), zero_ticks=2048, mode=Mode.PWM),
         Joint("b", 2, servo_model("XL330-M288"), -1, zero_ticks=2048),
         Joint("c", 3, servo_model("XL430-W250"), zero_ticks=2048, mode=Mode.PWM),
     )
-    bus, port = opened(description, *joints, fast_sync_read=fast, one_write=one_write, slow_every=5, interval=interval)
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize("one_write", [True, False])
+@pytest.mark.parametrize("interval", [0.0, 0.01])
+def test_current_and_pwm_joints_on_one_arm(opened: Open, fast: bool, one_write: bool, interval: float) -> None:
+    bus, port = opened(*current_and_pwm(), fast_sync_read=fast, one_write=one_write, slow_every=5, interval=interval)
     with bus, bus.torque(watchdog=0.1):
         states = []
         for _ in range(60):
@@ -152,6 +157,20 @@ def test_current_and_pwm_joints_on_one_arm(opened: Open, fast: bool, one_write: 
             (told, *_) = [state.status for state in states if state.status]
             assert all(status and status.watchdog == 5 for status in told)
             assert [status.goal for status in told if status] == pytest.approx([1.0, -0.1, -2.0], abs=0.01)
+
+
+@pytest.mark.parametrize("place", [1, 2, 3])
+def test_another_master_is_found_on_current_and_pwm_joints_of_one_arm(opened: Open, place: int) -> None:
+    """The XL430-W250 has no Goal Current: a read that ends there would be refused."""
+    bus, port = opened(*current_and_pwm(), interval=0.01)
+    with bus, bus.torque(watchdog=0.1), pytest.raises(BusShared, match=f"ID {place}.* another program"):
+        for cycle in range(40):
+            due = port.clock.now() + 0.01
+            bus.exchange([0.01 * cycle] * 3)
+            if cycle > 30:
+                port.bus.servos[place].write(102 if place == 2 else 100, b"\x55\0")
+            bus.check_not_overruled(due)
+            port.clock.wait_until(due)
 
 
 ONE = {"gravity": 0.0, "start": [0.0], "links": [LINK], "drives": [DRIVE | {"torque_constant": 0.4}]}

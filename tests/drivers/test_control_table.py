@@ -1,10 +1,14 @@
 """Control tables read from the SDK's own files."""
 
+import itertools
+
 import pytest
 
 from hil.drivers.control_table import load_control_table, model_names
 from hil.drivers.errors import UnknownModel
 from hil.drivers.servo_model import SERVO_MODELS, Mode, servo_model
+from hil.drivers.state import read_back_spans, spans
+from hil.drivers.sync_read import one_each
 
 
 def test_registers_of_the_xm430_stand_where_the_manual_has_them() -> None:
@@ -55,6 +59,18 @@ def test_every_model_has_the_registers_of_the_exchange_together(model: str) -> N
     assert velocity.address + velocity.size == position.address
     assert ("Goal PWM" if pwm else "Goal Current") in table
     assert "Bus Watchdog" in table
+
+
+def test_servos_of_any_models_and_modes_can_be_read_together() -> None:
+    """A servo refuses a read that ends at an undefined address, as where the XL430-W250 lacks Goal Current."""
+    tables = [load_control_table(model) for model in sorted(SERVO_MODELS)]
+    driven = [(each, mode) for each in tables for mode in Mode if mode is Mode.PWM or "Goal Current" in each]
+    for two in itertools.combinations(driven, 2):
+        both, modes = zip(*two, strict=True)
+        for one in (*spans(modes, both), *read_back_spans(modes, both)):
+            shared = one_each(one, 2)[0]
+            ends = shared.address, shared.address + shared.size - 1
+            assert all(table.defines(end) for table in both for end in ends)
 
 
 @pytest.mark.parametrize("model", sorted(SERVO_MODELS))

@@ -121,11 +121,14 @@ def test_an_earlier_goal_than_the_latest_is_unexpected_though_not_foreign(goal: 
     assert not back.is_unexpected
 
 
-def test_a_refusal_or_a_missing_answer_shows_nothing() -> None:
+@pytest.mark.parametrize("error", [FOREIGN, SENT[0][1]])
+def test_a_refusal_or_a_missing_answer_shows_nothing(error: int) -> None:
+    """The number of an error may equal a goal that was sent before."""
     back = read_back()
     for number in range(50):
-        assert back.look([None, (FOREIGN,)], SENT, 0.01 * number) is None
-    assert back.doubts_until < 0.0
+        assert back.look([None, (error,)], SENT, 0.01 * number) is None
+        assert not back.is_unexpected
+    assert back.doubts_until < 0.0 and back.lost is None
 
 
 def test_a_goal_that_was_sent_recently_or_to_the_neighbour_is_not_foreign() -> None:
