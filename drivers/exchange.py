@@ -136,6 +136,8 @@ class Exchange:
         self._until_slow = slow_every
         self._slow = 0
         self._late_possible = False
+        self._collided = False
+        """Whether the latest goals were sent while a late reply may have been on the wire, which destroys them."""
         self._after_loss = 0
         self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
         self._off_wire = math.inf
@@ -248,7 +250,7 @@ class Exchange:
                 self.read_back_at = now + TRY_AGAIN_S  # a late reply costs the next cycle time
         else:
             back.took(min(now - before, 2.0 * takes))
-        found = back.look(servos, self._sent, now)
+        found = back.look(servos, self._sent, now, collided=self._collided)
         if back.is_unexpected:
             self.read_status_next()  # it distinguishes lost goals from another master's
         return found
@@ -265,6 +267,7 @@ class Exchange:
         if not between:
             self._until_slow -= 1
         self._until_status -= 1
+        self._collided = self._late_possible
         if self._until_status > 0 and (self._until_slow > 0 or between) and not self._late_possible:
             plan = self._usual
         else:

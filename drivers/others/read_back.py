@@ -7,6 +7,7 @@ from itertools import islice
 from random import Random
 from typing import NamedTuple
 
+from hil.drivers.packet import ALERT
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
 
 __all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack"]
@@ -113,11 +114,19 @@ class ReadBack:
     def took(self, seconds: float) -> None:
         self.longest = max(_FADES * self.longest, seconds)
 
-    def look(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float) -> Overruled | None:
-        """Compare the answers with what was written; return what only another master can have written."""
+    def look(
+        self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float, *, collided: bool = False
+    ) -> Overruled | None:
+        """Compare the answers with what was written; return what only another master can have written.
+
+        An answer with an error is no answer: a servo that refuses a read has told nothing about its goal.
+
+        collided: whether a late reply may have destroyed the latest goals on the wire, so that a servo that holds older
+        ones is not at fault.
+        """
         of_modes = self.is_of_modes
         is_nearly_sure = False
-        for place, value in self._foreign(servos, sent):
+        for place, value in self._foreign([_intact(answer) for answer in servos], sent, collided=collided):
             seen = (self._modes_sighted if of_modes else self._goals_sighted)[place]
             while seen and now - seen[0][0] > _SIGHTED_S:
                 seen.popleft()
@@ -146,11 +155,13 @@ class ReadBack:
         enough = _GOALS_PER_MODE_IN_DOUBT if now < self.doubts_until else 1
         self.is_of_modes = now >= self._modes_due and self._goals_since >= enough
 
-    def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
+    def _foreign(
+        self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], *, collided: bool
+    ) -> list[tuple[int, int]]:
         """Place and value of each servo that holds a value that this program did not write."""
         self.is_unexpected = False
-        self._looks += not self.is_of_modes
-        servos = [answer if answer is not None and len(answer) > 1 else None for answer in servos]  # not the refusals
+        counts = not (self.is_of_modes or collided)
+        self._looks += counts
         for answer, value in zip(servos, self._modes if self.is_of_modes else sent[-1], strict=True):
             if answer is not None and answer[-1] != value:
                 self.is_unexpected = True
@@ -162,7 +173,8 @@ class ReadBack:
                 for place, (answer, mode) in enumerate(zip(servos, self._modes, strict=True))
                 if answer is not None and answer[-1] != mode
             ]
-        self._count_missed(servos, sent)
+        if counts:
+            self._count_missed(servos, sent)
         # A servo that received its neighbour's goal is not commanded by another master.
         own = set().union(*islice(reversed(sent), _RECENT))
         return [
@@ -178,3 +190,8 @@ class ReadBack:
             missed.append(self._looks)
             if len(missed) == LOST_GOALS and self._looks - missed[0] < LOST_OF:
                 self.lost = Overruled(place, self._goals[place], answer[-1], sent[-1][place])
+
+
+def _intact(answer: Answer) -> Answer:
+    """The answer of a servo that has sent values without an error; None for any other."""
+    return answer if answer is not None and len(answer) > 1 and not answer[0] & ~ALERT else None
