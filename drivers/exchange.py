@@ -190,6 +190,11 @@ class Exchange:
         return self._read_back.sighted if self._read_back is not None and self.is_in_doubt else None
 
     @property
+    def modes_seen_ago(self) -> float:
+        """Time since every servo was last found to be in the mode that was set [s]; infinite if it never was."""
+        return math.inf if self._read_back is None else self._now() - self._read_back.modes_seen_at
+
+    @property
     def lost(self) -> Overruled | None:
         """A servo that has missed many of the latest goals, as read-backs showed; None if there is none."""
         return self._read_back.lost if self._read_back is not None else None

@@ -90,6 +90,8 @@ class ReadBack:
         self._modes = tuple(modes)
         self.is_of_modes = True
         """Whether the next read-back is of the operating modes, instead of the goals."""
+        self.modes_seen_at = -math.inf
+        """Time of the latest read-back in which every servo was in the mode that was set [s]."""
         self._modes_due = -math.inf
         self._goals_since = 0
         self._draw = Random(1)
@@ -126,7 +128,11 @@ class ReadBack:
         """
         of_modes = self.is_of_modes
         is_nearly_sure = False
-        for place, value in self._foreign([_intact(answer) for answer in servos], sent, collided=collided):
+        intact = [_intact(answer) for answer in servos]
+        foreign = self._foreign(intact, sent, collided=collided)
+        if of_modes and not foreign and None not in intact:
+            self.modes_seen_at = now
+        for place, value in foreign:
             seen = (self._modes_sighted if of_modes else self._goals_sighted)[place]
             while seen and now - seen[0][0] > _SIGHTED_S:
                 seen.popleft()

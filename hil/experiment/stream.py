@@ -134,6 +134,9 @@ class Stream:
         longest = max(len(segment.period_current) for segment in plan.segments)
         self._repetition = Repetition(longest, len(bus.joints), self._interval)
 
+        self.modes_seen_ago = float("inf")
+        """Time from the latest read-back of the modes that found those that were set to a stop by the guard [s]."""
+
     def begins_at(self, positions: Sequence[float]) -> None:
         """Process the joints' angles just before torque is switched on [rad]: the first sample must show the same."""
         self._guard.rests_at(positions)
@@ -148,6 +151,7 @@ class Stream:
         try:
             self._play_all()
         except ExperimentError as error:
+            self.modes_seen_ago = self._bus.modes_seen_ago
             if isinstance(error, SafetyStop) and error.cause in _BY_OTHER_GOALS and self._bus.commanded_by_another:
                 error.add_note(self._bus.commanded_by_another)
                 error.overruled = True
