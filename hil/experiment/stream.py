@@ -267,12 +267,7 @@ class Stream:
             state = self._sample(row.tolist(), Phase.PERIODIC, period)
             repetition.add(index, state.position)
             if (joint := repetition.unlike) is not None:
-                raise SafetyStop(
-                    f"{self._bus.joints[joint].title} does not repeat its motion: under the same torque it is at "
-                    f"{state.position[joint]:.3f} rad, far from where it was one period ago. Something pushes or holds "
-                    "it, it slips, or its encoder has failed.",
-                    Cause.UNLIKE_BEFORE,
-                )
+                self._guard.does_not_repeat(joint, state.position[joint])
 
     def _come_to_rest(self) -> None:
         self._note("coming to rest")
