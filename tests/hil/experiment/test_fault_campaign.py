@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.fault_campaign.arms import MIXED, RATES, Setting, names, settings
 from benchmarks.fault_campaign.attack import Attack, Kind
-from benchmarks.fault_campaign.campaign import Outcome, prepare
+from benchmarks.fault_campaign.campaign import Outcome, inject_drawn, prepare
 from benchmarks.fault_campaign.draw import Drawn
 from benchmarks.fault_campaign.judge import judge_words, received, since_again
 from benchmarks.fault_campaign.twin import has_healthy_twin
@@ -75,6 +75,11 @@ def test_every_shipped_configuration_is_in_it_at_every_rate() -> None:
     every = [*names(), MIXED]
     assert {(each.name, each.rate) for each in settings()} == {(name, rate) for name in every for rate in RATES}
     assert len(names()) >= 11
+
+
+def test_a_limit_lowered_before_a_kill_is_restored_once_it_has_been_set_back() -> None:
+    attacks = Attack(Kind.LOWERED_LIMIT, 0.8, np.inf, servo=1, amount=0.1), Attack(Kind.KILLED, 0.85, np.inf)
+    assert inject_drawn(prepare(Setting("fake_pendulum", 100), 1.0), Drawn(attacks, ()), 1).not_restored == ()
 
 
 def test_a_healthy_arm_that_mixes_servos_with_and_without_goal_current_is_not_stopped() -> None:
