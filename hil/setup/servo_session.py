@@ -15,7 +15,7 @@ from pathlib import Path
 from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError, TorqueNotOff
+from hil.drivers.errors import DriverError, TorqueNotOff, WrongModel
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import attainable, put_back, read_settings
 from hil.drivers.servo_model import Mode
@@ -251,6 +251,8 @@ class ServoSession:
             try:
                 self.bus.confirm_later(joint)
                 servo, settings = self.bus.drives[joint], self._wanted[joint]
+                if servo.read_despite_error("Model Number") != servo.table.number:
+                    raise WrongModel(f"{joint.title}: a servo of another model answers at its ID now.")
                 put_back(servo, settings)
                 possible = attainable(servo, settings)
                 self._cut[joint] = {name: value for name, value in possible.items() if value != settings[name]}

@@ -280,6 +280,15 @@ def test_what_somebody_set_since_a_kill_stays(arm: Arm, bench: Bench, monkeypatc
     assert [servo.operating_mode for servo in bench.servos.values()] == [4, 4]
 
 
+def test_settings_are_not_restored_to_a_servo_of_another_model(arm: Arm, bench: Bench) -> None:
+    """The IDs may have been exchanged during the run."""
+    said = r"could not be restored\. A servo of another model answers at its ID now"
+    with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
+        bench.servos[2].memory.set("Model Number", 1060)
+        bench.eeprom[2].clear()
+    assert bench.eeprom[2] == []
+
+
 def test_what_was_put_back_in_part_is_put_back_whole(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     config = arm(SHORT)
     with monkeypatch.context() as gone, pytest.raises(PortLost), servo_session(config) as bus:
