@@ -1,4 +1,4 @@
-"""The fault campaign: random faults in every bundled configuration at 20, 100, 400 and 1,000 Hz.
+"""The fault campaign: random faults in every bundled configuration and a mixed arm at 20, 100, 400 and 1,000 Hz.
 
     python benchmarks/faults.py [--json] [--injections N] [--jobs N] [--show] [--only NAME] [--rate HZ]
 

@@ -334,6 +334,11 @@ class ServoBus:
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"
 
     @property
+    def modes_seen_ago(self) -> float:
+        """Time since every servo was last found to be in the mode that was set [s]; infinite if it never was."""
+        return self.prepared.modes_seen_ago
+
+    @property
     def heard_instead(self) -> str:
         """What was received in the last 0.1 s instead of complete and timely replies, and what to do about it; "" if
         nothing was.

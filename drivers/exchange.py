@@ -137,6 +137,8 @@ class Exchange:
         self._until_slow = slow_every
         self._slow = 0
         self._late_possible = False
+        self._collided = False
+        """Whether the latest goals were sent while a late reply may have been on the wire, which destroys them."""
         self._after_loss = 0
         self._cut_off = b""
         """What had been received of a reply when time was up in the latest exchange."""
@@ -191,6 +193,11 @@ class Exchange:
     def sighted(self) -> Overruled | None:
         """A value that a servo held a moment ago although this program did not write it; None if there was none."""
         return self._read_back.sighted if self._read_back is not None and self.is_in_doubt else None
+
+    @property
+    def modes_seen_ago(self) -> float:
+        """Time since every servo was last found to be in the mode that was set [s]; infinite if it never was."""
+        return math.inf if self._read_back is None else self._now() - self._read_back.modes_seen_at
 
     @property
     def lost(self) -> Overruled | None:
@@ -253,7 +260,7 @@ class Exchange:
                 self.read_back_at = now + TRY_AGAIN_S  # a late reply costs the next cycle time
         else:
             back.took(min(now - before, 2.0 * takes) - self._wire_s[read])
-        found = back.look(servos, self._sent, now)
+        found = back.look(servos, self._sent, now, collided=self._collided)
         if back.is_unexpected:
             self.read_status_next()  # it distinguishes lost goals from another master's
         return found
@@ -270,6 +277,7 @@ class Exchange:
         if not between:
             self._until_slow -= 1
         self._until_status -= 1
+        self._collided = self._late_possible
         if self._until_status > 0 and (self._until_slow > 0 or between) and not self._late_possible:
             plan = self._usual
         else:

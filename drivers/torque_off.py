@@ -214,13 +214,19 @@ def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) 
 def by_reason(failures: Iterable[tuple[Joint, str]]) -> dict[str, list[Joint]]:
     """The joints for which each reason applies; reasons that differ only in the joint's name are merged."""
     joints: dict[str, list[Joint]] = {}
-    own = {joint: why.replace(joint.title, "It").replace(str(joint), "it") for joint, why in failures}
+    own = {joint: _of_it(why.replace(joint.title, "It").replace(str(joint), "it")) for joint, why in failures}
     for joint, why in own.items():
         joints.setdefault(why, []).append(joint)
     return {
         why.replace("It ", "Each ", 1) if len(each) > 1 and why.startswith("It ") else why: each
         for why, each in joints.items()
     }
+
+
+def _of_it(why: str) -> str:
+    """The reason without the name in front of a colon: "It: reading failed" is said as "Reading failed"."""
+    rest = why.removeprefix("It: ")
+    return rest[:1].upper() + rest[1:]
 
 
 def and_list(names: Iterable[str]) -> str:

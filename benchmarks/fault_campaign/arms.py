@@ -11,6 +11,12 @@ RATES = (20, 100, 400, 1000)
 PERIOD_S = 2.0
 SCHEME = "campaign://"
 
+MIXED = "xl430_and_xl330"
+"""An arm of none of the files: one joint driven by voltage, without the register Goal Current, one by current."""
+
+_MIXED_FROM = ("xl430_two_link", "xl330_two_link")
+"""The files that its joints are taken from, in this order."""
+
 _DONOR = "fake_two_link"
 _DONOR_TORQUE = 0.312  # N m, peak torque of joint 1 in xm430_two_link.toml, an arm like the donor's
 _FAST_BAUD = 4_000_000  # 1 kHz does not fit on a wire of 1 Mbaud
@@ -18,7 +24,7 @@ _FAST_BAUD = 4_000_000  # 1 kHz does not fit on a wire of 1 Mbaud
 
 @dataclass(frozen=True)
 class Setting:
-    """One bundled configuration at one rate [Hz]."""
+    """One bundled configuration, or `MIXED`, at one rate [Hz]."""
 
     name: str
     rate: int
@@ -30,8 +36,8 @@ def names() -> list[str]:
 
 
 def settings() -> list[Setting]:
-    """Every bundled configuration at every rate."""
-    return [Setting(name, rate) for name in names() for rate in RATES]
+    """Every bundled configuration and the mixed arm at every rate."""
+    return [Setting(name, rate) for name in [*names(), MIXED] for rate in RATES]
 
 
 def make_document(setting: Setting, period: float = PERIOD_S) -> dict[str, Any]:
@@ -85,6 +91,10 @@ def _inline(value: Any) -> str:
 
 
 def _load(name: str) -> dict[str, Any]:
+    if name == MIXED:
+        document, other = map(_load, _MIXED_FROM)
+        document["joints"][1] = other["joints"][1]
+        return document
     return tomllib.loads((CONFIGS / f"{name}.toml").read_text(encoding="utf-8"))
 
 

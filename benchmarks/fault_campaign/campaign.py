@@ -49,6 +49,9 @@ STATE = "XDG_STATE_HOME"
 FREE = frozenset({"Goal Position", "Registered Instruction"})
 """Registers that a servo writes itself, independently of any program."""
 
+_LIMITS_LEFT = frozenset({Kind.KILLED, Kind.LOWERED_LIMIT})
+"""The first start after this pair finds the limit as the other program left it; the second one, as the killed run."""
+
 _PACKAGE = "benchmarks.fault_campaign"
 _ARMS = 12
 _CHECKED_CYCLES = 8
@@ -157,11 +160,18 @@ def play(ready: Ready, drawn: Drawn, seed: int) -> tuple[Story, bool, tuple[str,
         port = Bench.port
         if port is None:  # the command ended before it opened the port
             return Story(np.empty(0), Traffic(), 0.0, code, text), True, ()
-        port.let_be()
+        port.over = True
+        if not (finds_limits := {each.kind for each in drawn.attacks} >= _LIMITS_LEFT):
+            port.undo()
         ended = port.clock.now()
         port.bus.faults.clear()
         port.clock.wait_until(ended + AFTER_S)
         port.bus.advance(port.clock.now())
+        if finds_limits:
+            port.dead = False
+            port.close()
+            _command("check", str(ready.path))
+            port.undo()
         changed = _changed(before, port)
         readable = _is_readable(folder, len(ready.config.joints))
         if changed:

@@ -86,9 +86,8 @@ class Middle(FakeSerial):
         )
         self._sleeps = max((each.end for each in on_bytes), default=-math.inf)
 
-    def let_be(self) -> None:
-        """End all attacks, because the program has ended, and undo their changes to the servos."""
-        self.over = True
+    def undo(self) -> None:
+        """Undo the attacks' changes to the servos."""
         while self._undo:
             self._undo.pop()()
 

@@ -7,6 +7,7 @@ from itertools import islice
 from random import Random
 from typing import NamedTuple
 
+from hil.drivers.packet import ALERT
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
 
 __all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack"]
@@ -93,6 +94,8 @@ class ReadBack:
         self._settings = one_each(mode, len(ids))[0].registers[-len(self._modes[0]) :]
         self.is_of_modes = True
         """Whether the next read-back is of the operating modes and other settings, instead of the goals."""
+        self.modes_seen_at = -math.inf
+        """Time of the latest read-back in which every servo had the settings that were set [s]."""
         self._modes_due = -math.inf
         self._goals_since = 0
         self._draw = Random(1)
@@ -117,11 +120,23 @@ class ReadBack:
     def took(self, seconds: float) -> None:
         self.longest = max(_FADES * self.longest, seconds)
 
-    def look(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float) -> Overruled | None:
-        """Compare the answers with what was written; return what only another master can have written."""
+    def look(
+        self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float, *, collided: bool = False
+    ) -> Overruled | None:
+        """Compare the answers with what was written; return what only another master can have written.
+
+        An answer with an error is no answer: a servo that refuses a read has told nothing about its goal.
+
+        collided: whether a late reply may have destroyed the latest goals on the wire, so that a servo that holds older
+        ones is not at fault.
+        """
         of_modes = self.is_of_modes
         is_nearly_sure = False
-        for place, register, value, written in self._foreign(servos, sent):
+        intact = [_intact(answer) for answer in servos]
+        foreign = self._foreign(intact, sent, collided=collided)
+        if of_modes and not foreign and None not in intact:
+            self.modes_seen_at = now
+        for place, register, value, written in foreign:
             seen = (self._modes_sighted if of_modes else self._goals_sighted)[place]
             while seen and now - seen[0][0] > _SIGHTED_S:
                 seen.popleft()
@@ -147,20 +162,20 @@ class ReadBack:
         enough = _GOALS_PER_MODE_IN_DOUBT if now < self.doubts_until else 1
         self.is_of_modes = now >= self._modes_due and self._goals_since >= enough
 
-    def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]]) -> list[Overruled]:
+    def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], *, collided: bool) -> list[Overruled]:
         """What each servo holds that this program did not write."""
-        servos = [answer if answer is not None and len(answer) > 1 else None for answer in servos]  # not the refusals
         if self.is_of_modes:
             found = self._other_settings(servos)
             self.is_unexpected = bool(found)
             return found
-        self._looks += 1
+        self._looks += not collided
         self.is_unexpected = any(
             answer is not None and answer[-1] != value for answer, value in zip(servos, sent[-1], strict=True)
         )
         if not self.is_unexpected:
             return []
-        self._count_missed(servos, sent)
+        if not collided:
+            self._count_missed(servos, sent)
         # A servo that received its neighbour's goal is not commanded by another master.
         own = set().union(*islice(reversed(sent), _RECENT))
         return [
@@ -188,3 +203,8 @@ class ReadBack:
             missed.append(self._looks)
             if len(missed) == LOST_GOALS and self._looks - missed[0] < LOST_OF:
                 self.lost = Overruled(place, self._goals[place], answer[-1], sent[-1][place])
+
+
+def _intact(answer: Answer) -> Answer:
+    """The answer of a servo that has sent values without an error; None for any other."""
+    return answer if answer is not None and len(answer) > 1 and not answer[0] & ~ALERT else None

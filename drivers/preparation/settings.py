@@ -31,8 +31,13 @@ RAM = (
     "Profile Velocity",
 )
 
-_BOUNDS = {"Goal PWM": "PWM Limit", "Goal Velocity": "Velocity Limit", "Profile Velocity": "Velocity Limit"}
-"""The EEPROM limit of each goal that an experiment does not set: a servo refuses larger goals."""
+_BOUNDS = {
+    "Goal PWM": "PWM Limit",
+    "Goal Current": "Current Limit",
+    "Goal Velocity": "Velocity Limit",
+    "Profile Velocity": "Velocity Limit",
+}
+"""The EEPROM limit of each goal: a servo refuses larger goals."""
 
 STARTUP_CONFIGURATION = Register("Startup Configuration", 60, 1)
 """Not in the SDK's tables. Bit 0: torque on after power-up or reboot; bit 1: RAM registers restored then."""
@@ -63,14 +68,15 @@ def read_settings(servo: Servo) -> dict[str, int]:
 
 
 def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
-    """The settings with goals cut to the servo's present limits, which another program may have lowered since.
+    """The settings with goals cut to the limits, which another program may have lowered since.
 
+    A limit that is among the settings is restored before its goal; for any other, the servo's present value counts.
     Same errors as `Servo.read`.
     """
     cut = dict(settings)
     for goal, limit in _BOUNDS.items():
         if goal in settings and goal in servo.table and limit in servo.table:
-            most = servo.read_despite_error(limit)
+            most = settings[limit] if limit in settings else servo.read_despite_error(limit)
             cut[goal] = max(-most, min(settings[goal], most))
     return cut
 

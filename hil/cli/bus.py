@@ -136,7 +136,7 @@ def setup(
     from hil.cli.views.setup_view import changed, print_changes
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
-    from hil.setup.servo_session import recover
+    from hil.setup.killed_run import recover
     from hil.setup.servo_settings import open_servo, set_up
 
     for each in (baud, new_baud):
@@ -147,8 +147,11 @@ def setup(
     opened = open_port(port_url(port), baud)
     try:
         servo = open_servo(opened, servo_id)
-        if written := recover(servo, opened.url):
-            print(f"Restored settings that an earlier run had left changed: {', '.join(written)}.", file=sys.stderr)
+        restored = recover(servo, opened.url)
+        if written := ", ".join(restored.written):
+            print(f"Restored settings that an earlier run had left changed: {written}.", file=sys.stderr)
+        if restored.others:
+            print(f"{servo.title}: {restored.others}", file=sys.stderr)
         confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm
         changes = set_up(
             servo,

@@ -80,6 +80,7 @@ class Guard:
         self._seconds = [[second.id for second in joint.joint.seconds] for joint in config.joints]
         self._names = [str(joint.joint) for joint in config.joints]
         self._safety = safety
+        self._left_by_a_run = left_by_a_run
         currents = (joint.drive_mode is Mode.CURRENT for joint in config.joints)
         self._units = [joint.drive_mode.goal_unit for joint in config.joints]
         self._models = [
@@ -233,9 +234,26 @@ class Guard:
                     index,
                     Cause.EARLY_MOTION,
                     f"moves before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
-                    "is allowed. Let the arm come to rest; check whether a hand or a cable pushes or holds it, or "
-                    "its horn slips.",
+                    f"is allowed. {self._still_swings()} Otherwise check whether a hand or a cable pushes or holds it, "
+                    "or its horn slips.",
                 )
+
+    def _still_swings(self) -> str:
+        """What to do where the arm has not come to rest."""
+        if not self._left_by_a_run:
+            return "If it still swings, as an arm with little friction does, wait until it is at rest."
+        longer = f"raise safety.rest_time ({self._safety.rest_time:g} s)"
+        return f"If it still swings after the run before, as an arm with little friction does, {longer}."
+
+    def does_not_repeat(self, index: int, position: float) -> NoReturn:
+        """Raise SafetyStop for a joint that is at `position` [rad], not where it was one period ago."""
+        self._stop(
+            index,
+            Cause.UNLIKE_BEFORE,
+            f"does not repeat its motion: under the same torque it is at {position:.3f} rad, far from where it was one "
+            "period ago. Something pushes or holds it, its load has changed, it slips, or its encoder has failed. If "
+            f"none is so, it swings so far that its motion never repeats.{self._lower_torque}",
+        )
 
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
         joint = self._joints[index]

@@ -27,7 +27,7 @@ from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
-from hil.setup.changed_settings import EXPLAINED, WRITTEN, Settings, changed_settings, settings_now
+from hil.setup.changed_settings import EXPLAINED, WRITTEN, Settings, changed_settings, may_be_later, settings_now
 from hil.setup.lying import from_where_it_lies, moved_without_torque, said_of_the_rest, tolerance_now, wait_for_rest
 from hil.setup.realtime import on_time
 from hil.setup.servo_session import (
@@ -158,7 +158,7 @@ def _play(
                 stream.run()
     except BaseException as error:
         _explain_alert(bus, stream.state, error)
-        _explain_by_settings(bus, settings, error)
+        _explain_by_settings(bus, settings, error, stream.modes_seen_ago)
         if isinstance(error, DriverError | HilError):
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):
@@ -242,10 +242,10 @@ def _check_unchanged(bus: ServoBus) -> Settings:
     return now
 
 
-def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException) -> None:
+def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, modes_seen_ago: float) -> None:
     """Name settings that another program changed; read only once torque is off, because reading takes time.
 
-    A change that can explain a stop is named before it, any other one after it.
+    A change that can explain a stop is named before it, any other one, and one that may be later, after it.
     """
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return
@@ -253,7 +253,8 @@ def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException) 
     now = settings_now(bus)
     explained = stop if isinstance(stop, SafetyStop) and stop.cause in EXPLAINED else None
     if explained is not None and (changed := changed_settings(before, now, explained.cause)):
-        explained.args = (f"{changed} Symptom: {explained}",)
+        later = may_be_later(before, now, explained.cause, modes_seen_ago)
+        explained.args = (f"{explained} {later}" if later else f"{changed} Symptom: {explained}",)
         explained.overruled = True
     elif changed := changed_settings(before, now):
         error.add_note(changed)

@@ -134,6 +134,9 @@ class Stream:
         longest = max(len(segment.period_current) for segment in plan.segments)
         self._repetition = Repetition(longest, len(bus.joints), self._interval)
 
+        self.modes_seen_ago = float("inf")
+        """Time from the latest read-back of the modes that found those that were set to a stop by the guard [s]."""
+
     def begins_at(self, positions: Sequence[float]) -> None:
         """Process the joints' angles just before torque is switched on [rad]: the first sample must show the same."""
         self._guard.rests_at(positions)
@@ -148,6 +151,7 @@ class Stream:
         try:
             self._play_all()
         except ExperimentError as error:
+            self.modes_seen_ago = self._bus.modes_seen_ago
             if isinstance(error, SafetyStop) and error.cause in _BY_OTHER_GOALS and self._bus.commanded_by_another:
                 error.add_note(self._bus.commanded_by_another)
                 error.overruled = True
@@ -265,12 +269,7 @@ class Stream:
             state = self._sample(row.tolist(), Phase.PERIODIC, period)
             repetition.add(index, state.position)
             if (joint := repetition.unlike) is not None:
-                raise SafetyStop(
-                    f"{self._bus.joints[joint].title} does not repeat its motion: under the same torque it is at "
-                    f"{state.position[joint]:.3f} rad, far from where it was one period ago. Something pushes or holds "
-                    "it, it slips, or its encoder has failed.",
-                    Cause.UNLIKE_BEFORE,
-                )
+                self._guard.does_not_repeat(joint, state.position[joint])
 
     def _come_to_rest(self) -> None:
         self._note("coming to rest")

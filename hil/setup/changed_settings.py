@@ -10,10 +10,10 @@ from hil.drivers.joint import Joint
 from hil.drivers.servo_model import RETURN_DELAY_UNIT
 from hil.errors import Cause
 
-__all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "settings_now"]
+__all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "may_be_later", "settings_now"]
 
-_DELAY = "Return Delay Time"
-_REGISTERS = ("Operating Mode", "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _DELAY)
+_MODE, _DELAY = "Operating Mode", "Return Delay Time"
+_REGISTERS = (_MODE, "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _DELAY)
 
 WRITTEN = frozenset({"Operating Mode", "Current Limit"})
 """Those that this program writes itself."""
@@ -40,6 +40,13 @@ _MOVED = frozenset(
 """Causes of a stop that a change of the other settings can explain."""
 
 EXPLAINED = _MOVED | _LATE
+
+_AT_A_LIMIT = frozenset({Cause.POSITION, Cause.VELOCITY})
+"""Causes of a stop that need no other explanation than too much torque."""
+
+_MODES_SEEN_S = 0.06
+"""Largest time from a read-back of the modes to a stop for which a change of a mode may as well have come after it [s].
+"""
 
 Settings = Mapping[tuple[Joint, str], int]
 
@@ -93,6 +100,18 @@ def _by_joint(settings: Settings) -> dict[Joint, dict[str, int]]:
     for (joint, register), value in settings.items():
         found.setdefault(joint, {})[register] = value
     return found
+
+
+def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago: float) -> str:
+    """A sentence to add to a stop at a limit if the only change may have come after it; "" if the change explains it.
+
+    modes_seen_ago: time from the latest read-back that found the modes that were set to the stop [s].
+    """
+    changed = {each[1] for each, value in before.items() if after.get(each, value) != value}
+    if changed != {_MODE} or cause not in _AT_A_LIMIT or modes_seen_ago > _MODES_SEEN_S:
+        return ""
+    last = f"{1e3 * modes_seen_ago:.0f} ms before it, the modes still were those that had been set"
+    return f"{changed_settings(before, after)} This may have come after the stop: {last}."
 
 
 def _may_explain(register: str, cause: Cause | None) -> bool:

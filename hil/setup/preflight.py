@@ -25,8 +25,8 @@ from hil.plan.find_torque import how_to_find_torque
 from hil.plan.stabiliser import too_slow
 from hil.rest_pose_hint import rest_pose_hint, within_limits
 from hil.setup.bus_rate import check_rate, goals_taken
+from hil.setup.killed_run import recover
 from hil.setup.others import others_on_the_bus
-from hil.setup.servo_session import recover
 
 _WARM_BELOW_LIMIT_C = 15
 _LONG_RETURN_DELAY_US = 20
@@ -205,13 +205,19 @@ def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding
     """Restore settings that a killed run could not restore."""
     what = "settings from an earlier run"
     try:
-        written = recover(servo, config.url)
+        restored = recover(servo, config.url)
     except DriverError as error:
         yield Finding(Level.WARNING, str(joint), what, "cannot be restored", str(error))
         return
-    if written:
+    if written := ", ".join(restored.written):
+        yield Finding(Level.OK, str(joint), what, f"it ended before it could restore them; restored now: {written}")
+    if restored.others:
         yield Finding(
-            Level.OK, str(joint), what, f"it ended before it could restore them; restored now: {', '.join(written)}"
+            Level.WARNING,
+            str(joint),
+            what,
+            "not all of them are restored",
+            restored.others[0].upper() + restored.others[1:],
         )
 
 

@@ -2,7 +2,7 @@
 
 A session holds the port. A session inside another one for the same arm shares it, so that the steps of a pilot write
 each EEPROM register only once, and restore it once, when the outermost block is left for whatever reason. If a killed
-program left saved settings behind, these count as the servos' own and are restored at the end.
+program left saved settings behind, these count as the servos' own and are restored at the end (`killed_run`).
 """
 
 import sys
@@ -15,16 +15,16 @@ from pathlib import Path
 from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError, TorqueNotOff
+from hil.drivers.errors import DriverError, TorqueNotOff, WrongModel
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import attainable, put_back, read_settings
-from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
 from hil.drivers.torque_off import and_list, by_reason, signals_held_back
 from hil.errors import ExperimentError, RunFolderError, StopRequested
 from hil.setup import settings_file
 from hil.setup.changed_settings import Settings, settings_now
 from hil.setup.current_limit import current_limit_ticks
+from hil.setup.killed_run import Left, left_behind, recover, what_is_left
 from hil.setup.others import others_on_the_bus
 from hil.setup.settings_file import Kept
 from hil.setup.unmoved import Lies, where_it_lies
@@ -35,8 +35,6 @@ __all__ = [
     "ServoSession",
     "has_moved",
     "lay_at_start",
-    "left_behind",
-    "recover",
     "servo_session",
     "settings_at_start",
     "to_stderr",
@@ -45,7 +43,8 @@ __all__ = [
 Say = Callable[[str], None]
 
 _DELAY = "Return Delay Time"
-_PWM_LIMIT = "PWM Limit"
+_PWM_LIMIT, _GOAL_PWM = "PWM Limit", "Goal PWM"
+_NEXT = "The next hil identify, record, check or setup on this port restores them from"
 
 SETTINGS_NAME = "servo_settings.json"
 """Name of the copy of the saved settings in the run folder."""
@@ -82,10 +81,14 @@ class ServoSession:
     """What `settings_now` found at the beginning."""
     lay: Lies = field(default_factory=dict)
     """Where the servos were at the beginning."""
-    _left: set[Joint] = field(default_factory=set)
-    """Servos whose settings an earlier run left changed; restoring a goal that a lowered limit cuts is retried only
-    once.
-    """
+    _wanted: dict[Joint, dict[str, int]] = field(default_factory=dict)
+    """Settings to restore: those saved, except for what another program changed since an earlier run was killed."""
+    _left: dict[Joint, Kept] = field(default_factory=dict)
+    """Settings that an earlier run left changed; restoring a goal that a lowered limit cuts is retried only once."""
+    _refused: set[Joint] = field(default_factory=set)
+    """Servos whose Current Limit another program has left too low for this run: its former value stays on file."""
+    _is_ours: bool = False
+    """Whether the servos are the arm's and no other program holds them, so that they may be written to."""
     _cut: dict[Joint, dict[str, int]] = field(default_factory=dict)
     """Goals that could only be restored as far as a lowered limit allows, with their values."""
     shared: int = 0
@@ -99,9 +102,10 @@ class ServoSession:
         Nothing is written to a servo before its settings are on disk. Same errors as `ServoBus.open`.
         """
         bus = self.bus
+        self._left = {joint: kept for joint in bus.drives if (kept := left_behind(bus.port.url, joint)) is not None}
         bus.check_identity()
-        left = {joint: kept for joint in bus.drives if (kept := left_behind(bus.port.url, joint)) is not None}
-        bus.release_held(ours=left)
+        bus.release_held(ours=self._left)
+        self._is_ours = True
         self.lay = where_it_lies(bus)
         if others := others_on_the_bus(bus):
             self._say(f"Also on this bus (left alone): {'; '.join(others)}.")
@@ -111,27 +115,38 @@ class ServoSession:
         for joint, servo in bus.drives.items():
             settings = read_settings(servo)
             self._delays[joint] = servo.read(_DELAY)
-            if joint in left:
-                self._left.add(joint)
-                settings = _before(left[joint], settings)
-                self._say(
-                    f"{joint.title}: an earlier run ended before it could restore its settings "
-                    f"({left[joint].since}); this one will."
-                )
             changed = {"Operating Mode": int(joint.mode)}
             if joint.mode is Mode.CURRENT:
                 share = described[joint].goal_limit / len(described[joint].ids)
                 changed["Current Limit"] = current_limit_ticks(joint, share)
-            self._keep(joint, settings, changed)
+            if joint in self._left:
+                self._take_over(joint, what_is_left(self._left[joint], servo, settings), changed)
+            else:
+                self._keep(joint, settings, changed)
         self.settings = settings_now(bus)
         if folder is not None:
             copies = {str(joint.id): kept.settings for joint, kept in self._kept.items()}
             settings_file.write_durably(folder / SETTINGS_NAME, {"port": bus.port.url, "servos": copies})
 
-    def _keep(self, joint: Joint, settings: dict[str, int], changed: dict[str, int]) -> None:
+    def _take_over(self, joint: Joint, left: Left, changed: dict[str, int]) -> None:
+        """Save what an earlier run left, and say what of it will be restored.
+
+        What another program has changed is the servo's own value from now on, unless it prevents this run.
+        """
+        if said := left.told(joint.title):
+            self._say(said)
+        if left.is_refused(changed):
+            self._refused.add(joint)
+            self._keep(joint, left.kept.settings, changed, left.kept.since)
+            self._wanted[joint] = left.wanted
+        else:
+            self._keep(joint, left.wanted, changed)
+
+    def _keep(self, joint: Joint, settings: dict[str, int], changed: dict[str, int], since: str = "") -> None:
         url, model = self.bus.port.url, joint.servo.name
+        self._wanted[joint] = settings
         try:
-            self._kept[joint] = settings_file.keep(url, joint.id, model, settings, changed)
+            self._kept[joint] = settings_file.keep(url, joint.id, model, settings, changed, since)
         except RunFolderError as error:
             self._say(
                 f"The settings of {joint} cannot be saved ({error}). If this program is killed, its Operating Mode "
@@ -165,14 +180,38 @@ class ServoSession:
             clock.wait_until(clock.now() + REBOOT_S)
             failed = self._put_back(failed)
         return [
+            *self._not_reached(),
             *self._changed_delays(failed),
             *self._lowered_limits(failed),
             *(
-                f"The settings of {and_list(map(str, joints))} could not be restored. {why} The next hil identify, "
-                f"record, check or setup on this port restores them from {self._where(joints)}."
+                f"The settings of {and_list(map(str, joints))} could not be restored. {why} {_NEXT} "
+                f"{_where([self._kept[joint].path for joint in joints])}."
                 for why, joints in by_reason((joint, str(error)) for joint, error in failed.items()).items()
             ),
         ]
+
+    def _not_reached(self) -> Iterator[str]:
+        """Restore what an earlier run left on servos that this one did not get to; say where that is impossible."""
+        waiting: list[tuple[Joint, str]] = []
+        for joint, kept in self._left.items():
+            if joint in self._kept:
+                continue
+            why = "This run ended before it could restore them."
+            if self._is_ours:
+                try:
+                    self.bus.confirm_later(joint)
+                    if (others := recover(self.bus.drives[joint], kept.port).others) != "":
+                        yield f"{joint.title}: {others}"
+                    continue
+                except DriverError as error:
+                    why = str(error)
+            waiting.append((joint, why))
+        for why, joints in by_reason(waiting).items():
+            paths = [self._left[joint].path for joint in joints]
+            yield (
+                f"The settings that an earlier run left on {and_list(map(str, joints))} are not restored yet. {why} "
+                f"{_NEXT} {_where(paths)}."
+            )
 
     def _changed_delays(self, silent: Collection[Joint]) -> Iterator[str]:
         """Say which Return Delay Times were changed meanwhile, by another program or a factory reset."""
@@ -195,10 +234,14 @@ class ServoSession:
             if before is None or joint in silent:
                 continue
             with suppress(DriverError):
-                now, wanted = servo.read(_PWM_LIMIT), self._kept[joint].settings
+                now, wanted = servo.read(_PWM_LIMIT), self._wanted[joint]
                 if now == before:
                     continue
-                cut = [f"{name} is {value}, not {wanted[name]}" for name, value in self._cut[joint].items()]
+                cut = [
+                    f"{name} is {value}, not {wanted[name]}"
+                    for name, value in self._cut[joint].items()
+                    if name == _GOAL_PWM
+                ]
                 later = (
                     "; the next start on this port then restores the goal" if cut and joint not in self._left else ""
                 )
@@ -208,27 +251,29 @@ class ServoSession:
                     f"To change it back, use DYNAMIXEL Wizard 2.0{later}."
                 )
 
-    def _where(self, joints: Sequence[Joint]) -> str:
-        """The file that holds the settings of a servo; for several servos, their folder."""
-        paths = [self._kept[joint].path for joint in joints]
-        return str(paths[0]) if len(paths) == 1 else f"{len(paths)} files in {paths[0].parent}"
-
     def _put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
         """Restore the settings of these joints; return the error of each joint that failed."""
         failed: dict[Joint, DriverError] = {}
         for joint in joints:
             try:
                 self.bus.confirm_later(joint)
-                servo, settings = self.bus.drives[joint], self._kept[joint].settings
+                servo, settings = self.bus.drives[joint], self._wanted[joint]
+                if servo.read_despite_error("Model Number") != servo.table.number:
+                    raise WrongModel(f"{joint.title}: a servo of another model answers at its ID now.")
                 put_back(servo, settings)
                 possible = attainable(servo, settings)
                 self._cut[joint] = {name: value for name, value in possible.items() if value != settings[name]}
             except DriverError as error:
                 failed[joint] = error
             else:
-                if not self._cut[joint] or joint in self._left:
+                if joint not in self._refused and (not self._cut[joint] or joint in self._left):
                     settings_file.forget(self._kept[joint])
         return failed
+
+
+def _where(paths: Sequence[Path]) -> str:
+    """The file that holds the settings of a servo; for several servos, their folder."""
+    return str(paths[0]) if len(paths) == 1 else f"{len(paths)} files in {paths[0].parent}"
 
 
 _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=None)
@@ -347,33 +392,3 @@ def lay_at_start() -> Lies:
     """Where the servos were at the beginning of this session; empty if a run may have moved the arm since."""
     outer = _outermost.get()
     return {} if outer is None or outer.shared > 1 else outer.lay
-
-
-def left_behind(port: str, joint: Joint) -> Kept | None:
-    """Settings of this joint's servo that a terminated program left unrestored; None if there are none."""
-    kept = settings_file.load(port, joint.id, joint.servo.name)
-    return kept if kept is not None and kept.may_restore else None
-
-
-def recover(servo: Servo, port: str) -> list[str]:
-    """Restore settings that a terminated program left changed; return those written. Same errors as `Servo.write`."""
-    kept = settings_file.load(port, servo.id, servo.table.model)
-    if kept is None or not kept.may_restore:
-        return []
-    if servo.read("Torque Enable"):
-        servo.write("Torque Enable", 0)
-    written = put_back(servo, _before(kept, read_settings(servo)))
-    settings_file.forget(kept)
-    return [f"{name} {before} -> {after}" for name, (before, after) in written.items()]
-
-
-def _before(kept: Kept, present: dict[str, int]) -> dict[str, int]:
-    """The settings before the program that was killed, except for registers that have been changed since.
-
-    A register that holds neither the value set by that program nor the one it found was changed by something else. If
-    that is the Operating Mode, goals and gains belong to the new mode and are kept.
-    """
-    theirs = {name for name, value in kept.changed.items() if present.get(name) not in (value, kept.settings.get(name))}
-    wanted = present if "Operating Mode" in theirs else kept.settings
-    untouched = {name: kept.settings[name] for name in kept.changed if name in kept.settings and name not in theirs}
-    return {**wanted, **untouched, **{name: present[name] for name in theirs if name in present}}

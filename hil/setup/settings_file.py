@@ -65,9 +65,14 @@ def settings_path(port: str, servo_id: int, model: str) -> Path:
     return state_folder() / f"{name}_ID{servo_id}_{model}.json"
 
 
-def keep(port: str, servo_id: int, model: str, settings: dict[str, int], changed: dict[str, int]) -> Kept:
-    """Write the file of a servo; it is on disk when this function returns. Raises RunFolderError."""
-    since = datetime.now().astimezone().isoformat(timespec="seconds")
+def keep(
+    port: str, servo_id: int, model: str, settings: dict[str, int], changed: dict[str, int], since: str = ""
+) -> Kept:
+    """Write the file of a servo; it is on disk when this function returns. Raises RunFolderError.
+
+    since: when these settings were saved first; by default, now.
+    """
+    since = since or datetime.now().astimezone().isoformat(timespec="seconds")
     kept = Kept(port, servo_id, model, settings, changed, os.getpid(), since)
     write_durably(kept.path, {"schema": SCHEMA, **asdict(kept)})
     return kept

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hil.drivers.control_table import load_control_table
 from hil.drivers.errors import PortLost
 from hil.drivers.exchange import HOST_S, Exchange
-from hil.drivers.others.read_back import TRY_AGAIN_S
+from hil.drivers.others.read_back import LOST_OF, TRY_AGAIN_S
 from hil.drivers.packet import HEADER, Framer, Instruction, crc, encode, encode_status
 from hil.drivers.port import Port
 from hil.drivers.servo_model import Mode
@@ -411,6 +411,33 @@ def test_a_lost_reply_or_a_long_cycle_delays_the_next_read_back_by_one_cycle_onl
         before = wire.now()
         assert cycles.overruled(before + (1e-4 if not is_passing else 0.1)) is None
         assert cycles.read_back_at == (before if is_passing else before + TRY_AGAIN_S)
+
+
+class Held(Wire):
+    """A wire on which two servos answer every read with zeros in front of the goal that they hold."""
+
+    goal, is_silent = 0, False
+
+    def write(self, data: bytes) -> None:
+        reads = [each.body for each in Framer().feed(data) if each.instruction == Instruction.SYNC_READ]
+        for body in [] if self.is_silent else reads:
+            told = bytes((body[2] | body[3] << 8) - 2) + struct.pack("<h", self.goal)
+            self.waiting += b"".join(encode_status(servo, 0, told) for servo in (1, 2))
+
+
+@pytest.mark.parametrize("is_late", [False, True])
+def test_goals_sent_while_a_reply_is_late_may_collide_with_it_and_are_not_counted_as_missed(is_late: bool) -> None:
+    wire = Held()
+    cycles = read_back_of(wire)
+    for number in range(2 * LOST_OF):
+        wire.goal = number
+        if is_late:
+            wire.is_silent = True
+            cycles.cycle([number, number])
+            wire.is_silent = False
+        cycles.cycle([number + 1, number + 1])
+        assert cycles.overruled(wire.now() + ONE_READ_BACK_S) is None
+    assert (cycles.lost is None) is is_late
 
 
 @pytest.mark.parametrize(("doubts_until", "pause"), [(0.0, TRY_AGAIN_S), (1.0, 0.0)])

@@ -5,7 +5,8 @@ import itertools
 import pytest
 
 from hil.drivers.control_table import load_control_table
-from hil.drivers.others.read_back import Overruled, ReadBack
+from hil.drivers.others.read_back import LOST_OF, Overruled, ReadBack
+from hil.drivers.packet import ALERT, StatusError
 from hil.drivers.sync_read import Answer, Span
 
 XM430 = load_control_table("XM430-W350")
@@ -140,6 +141,24 @@ def test_a_refusal_or_a_missing_answer_shows_nothing(error: int) -> None:
         assert back.look([None, (error,)], SENT, 0.01 * number) is None
         assert not back.is_unexpected
     assert back.doubts_until < 0.0 and back.lost is None
+
+
+@pytest.mark.parametrize(("error", "shows"), [(ALERT, True), (StatusError.ACCESS, False), (ALERT | 7, False)])
+def test_values_with_an_error_are_no_read_back(error: int, shows: bool) -> None:
+    back = read_back()
+    look(back, 1.0)
+    assert back.look([None, (error, FOREIGN)], SENT, 1.001) is None
+    assert back.is_unexpected is shows
+
+
+@pytest.mark.parametrize("collided", [False, True])
+def test_goals_that_a_late_reply_may_have_destroyed_are_not_counted_as_missed(collided: bool) -> None:
+    back, now = read_back(), 1.0
+    for _ in range(2 * LOST_OF):
+        now += 0.01
+        servos: list[Answer] = [(0, MODE)] * 2 if reads_modes(back) else [(0, SENT[-1][0]), (0, SENT[-2][1])]
+        assert back.look(servos, SENT, now, collided=collided) is None
+    assert (back.lost is None) is collided and back.is_unexpected
 
 
 def test_a_goal_that_was_sent_recently_or_to_the_neighbour_is_not_foreign() -> None:

@@ -138,6 +138,7 @@ def test_a_reason_that_concerns_several_servos_is_given_once() -> None:
     said = str(TorqueOff((), ((first, "It is hot."), (second, "It is silent."))))
     assert f"for {str(first).upper()}. It is hot. Nor for {str(second).upper()}. It is silent. The" in said
     assert by_reason(reasons[1:]) == {"It does not answer. Check it.": [second]}
+    assert by_reason([(first, f"{first.title}: Current Limit reads 3.")]) == {"Current Limit reads 3.": [first]}
     assert by_reason([(first, "It is hot."), (second, "It is silent.")]) == {
         "It is hot.": [first],
         "It is silent.": [second],

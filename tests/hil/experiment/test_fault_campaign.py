@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.fault_campaign.arms import RATES, Setting, names, settings
+from benchmarks.fault_campaign.arms import MIXED, RATES, Setting, names, settings
 from benchmarks.fault_campaign.attack import Attack, Kind
-from benchmarks.fault_campaign.campaign import Outcome, prepare
+from benchmarks.fault_campaign.campaign import Outcome, inject_drawn, prepare
 from benchmarks.fault_campaign.draw import Drawn
 from benchmarks.fault_campaign.judge import judge_words, received, since_again
 from benchmarks.fault_campaign.twin import has_healthy_twin
 from benchmarks.faults import campaign, figures
+from hil.drivers.servo_model import Mode
 
 INJECTIONS = 312
 
@@ -51,7 +52,8 @@ def taught(outcome: Outcome) -> bool:
 
 def chosen() -> list[Setting]:
     """Every configuration at every rate, except that two thirds of them are left out at 1 kHz to save time."""
-    return [each for each in settings() if each.rate != RATES[-1] or names().index(each.name) % EVERY_THIRD == 0]
+    every = [*names(), MIXED]
+    return [each for each in settings() if each.rate != RATES[-1] or every.index(each.name) % EVERY_THIRD == 0]
 
 
 @pytest.mark.long
@@ -70,8 +72,21 @@ def test_random_faults_end_safe_recorded_restored_and_named(part: int) -> None:
 
 
 def test_every_shipped_configuration_is_in_it_at_every_rate() -> None:
-    assert {(each.name, each.rate) for each in settings()} == {(name, rate) for name in names() for rate in RATES}
+    every = [*names(), MIXED]
+    assert {(each.name, each.rate) for each in settings()} == {(name, rate) for name in every for rate in RATES}
     assert len(names()) >= 11
+
+
+def test_a_limit_lowered_before_a_kill_is_restored_once_it_has_been_set_back() -> None:
+    attacks = Attack(Kind.LOWERED_LIMIT, 0.8, np.inf, servo=1, amount=0.1), Attack(Kind.KILLED, 0.85, np.inf)
+    assert inject_drawn(prepare(Setting("fake_pendulum", 100), 1.0), Drawn(attacks, ()), 1).not_restored == ()
+
+
+def test_a_healthy_arm_that_mixes_servos_with_and_without_goal_current_is_not_stopped() -> None:
+    ready = prepare(Setting(MIXED, 100), PERIOD_S)
+    modes = [joint.drive_mode for joint in ready.config.joints]
+    assert modes == [Mode.PWM, Mode.CURRENT]
+    assert np.ptp(received(ready.config, ready.undisturbed).angle, axis=0).min() > 0.05
 
 
 JUMP = "reports an angle that changed by 0.3 rad within 5 ms; its velocity limit allows at most 0.1. Check the encoder."

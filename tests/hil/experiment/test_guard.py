@@ -292,11 +292,21 @@ def test_deadlines_missed_again_and_again_stop_though_never_many_in_a_row(arm: A
 
 
 def test_motion_before_the_start(arm: Arm) -> None:
-    guard = Guard(arm())
-    guard.look_at_rest(STILL)
-    with pytest.raises(SafetyStop, match=r"'elbow' \(ID 2.*moves before the start: \+0\.060") as stop:
-        guard.look_at_rest(STILL._replace(position=(-1.57, 0.06)))
-    assert stop.value.cause is Cause.EARLY_MOTION
+    for is_left, advice in (
+        (False, "still swings, .* wait until"),
+        (True, r"still swings .* raise safety\.rest_time \(3 s"),
+    ):
+        guard = Guard(arm(), left_by_a_run=is_left)
+        guard.look_at_rest(STILL)
+        with pytest.raises(SafetyStop, match=rf"'elbow' \(ID 2.*moves before the start: \+0\.060.*{advice}") as stop:
+            guard.look_at_rest(STILL._replace(position=(-1.57, 0.06)))
+        assert stop.value.cause is Cause.EARLY_MOTION
+
+
+def test_motion_that_does_not_repeat_may_need_less_torque(arm: Arm) -> None:
+    with pytest.raises(SafetyStop, match=r"its load has changed.* Lower experiment\.peak_torque") as stop:
+        Guard(arm()).does_not_repeat(1, 0.5)
+    assert stop.value.cause is Cause.UNLIKE_BEFORE
 
 
 def test_commands_are_clamped_slew_limited_and_never_nan(arm: Arm) -> None:

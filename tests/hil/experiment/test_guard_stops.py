@@ -201,6 +201,32 @@ def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
     assert f"{register} is {value} and was " in (run.path / "events.jsonl").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("ago", [0.02, 0.2])
+def test_a_mode_that_may_have_changed_after_a_stop_at_a_limit_is_not_said_to_be_its_cause(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch, ago: float
+) -> None:
+    def change(bus: ServoBus) -> Any:
+        found.append(settings_now(bus))
+        if len(found) == 2:  # once torque is off
+            ports[0].bus.servos[1].memory.set("Operating Mode", 3)
+            return settings_now(bus)
+        return found[0]
+
+    found: list[Any] = []
+    settings_now = run.settings_now
+    monkeypatch.setattr(run, "settings_now", change)
+    if ago > 0.1:
+        monkeypatch.setattr(ServoBus, "modes_seen_ago", ago)
+    stop, _ = run_until_stopped(arm(), tmp_path / "run", once(lambda: swing_elbow(ports, 40.0)), plan)
+    changed = "Another program changed the settings of a servo during the run (joint 'shoulder'"
+    assert stop.cause is Cause.VELOCITY and changed in str(stop)
+    if ago > 0.1:
+        assert str(stop).startswith(changed) and "Symptom: Joint 'elbow'" in str(stop)
+    else:
+        assert str(stop).startswith("Joint 'elbow'") and "Symptom" not in str(stop)
+        assert re.search(r"peak_torque.* changed .* may have come after the stop: \d+ ms before it", str(stop))
+
+
 def test_a_return_delay_that_another_program_raised_is_named_before_late_replies(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
 ) -> None:

@@ -282,6 +282,15 @@ def test_what_somebody_set_since_a_kill_stays(arm: Arm, bench: Bench, monkeypatc
     assert [servo.operating_mode for servo in bench.servos.values()] == [4, 4]
 
 
+def test_settings_are_not_restored_to_a_servo_of_another_model(arm: Arm, bench: Bench) -> None:
+    """The IDs may have been exchanged during the run."""
+    said = r"could not be restored\. A servo of another model answers at its ID now"
+    with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
+        bench.servos[2].memory.set("Model Number", 1060)
+        bench.eeprom[2].clear()
+    assert bench.eeprom[2] == []
+
+
 def test_what_was_put_back_in_part_is_put_back_whole(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     config = arm(SHORT)
     with monkeypatch.context() as gone, pytest.raises(PortLost), servo_session(config) as bus:
@@ -292,6 +301,86 @@ def test_what_was_put_back_in_part_is_put_back_whole(arm: Arm, bench: Bench, mon
         servo.write(102, (7).to_bytes(2, "little"))
     list(check_arm(config))
     assert bench.changed() == []
+
+
+LOWERED = 60
+"""A Current Limit that is too low for the arm [ticks]."""
+
+
+def kill(config: Config, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as gone, pytest.raises(PortLost), servo_session(config) as bus:
+        gone.setattr(bench.port, "write", _raise)  # nothing leaves a killed program
+        bus.exchange([0.0, 0.0])
+    monkeypatch.setattr(bench.port, "write", type(bench.port).write.__get__(bench.port))
+    bench.port.close()
+
+
+def lower(servo: EmulatedServo, limit: int) -> None:
+    servo.write(38, limit.to_bytes(2, "little"))
+    assert servo.value("Current Limit") == limit
+
+
+def test_a_current_limit_that_another_program_lowered_before_a_kill_stays_on_file_until_it_is_restored(
+    arm: Arm, tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path
+) -> None:
+    config = arm(SHORT)
+    kill(config, bench, monkeypatch)
+    lower(bench.servos[2], LOWERED)
+    for number in range(3):
+        said: list[str] = []
+        with (
+            pytest.raises(WrongSetting, match="Current Limit is 60, but") as refused,
+            servo_session(config, say=said.append),
+        ):
+            play(config, tmp_path / str(number))
+        assert not hasattr(refused.value, "__notes__"), "nothing is promised"
+        assert f"ts Current Limit is {LOWERED} and was 1193 before the run of" in said[-1]
+        assert ("this one will" in said[-1]) is (number == 0), "all the rest is restored once"
+        assert bench.changed() == [f"Current Limit of 2: 1193 -> {LOWERED}", f"Goal Current of 2: 1193 -> {LOWERED}"]
+    (found,) = (each for each in check_arm(config) if each.what == "settings from an earlier run")
+    assert found.level is Level.WARNING and "was 1193 before the run of" in found.fix
+    lower(bench.servos[2], 1193)
+    with servo_session(config):
+        pass
+    assert bench.changed() == [] and list(state_folder.glob("*.json")) == []
+
+
+def test_a_current_limit_that_another_program_lowered_and_that_suffices_is_the_servos_own(
+    arm: Arm, tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path
+) -> None:
+    config = arm(SHORT)
+    kill(config, bench, monkeypatch)
+    lower(bench.servos[2], 900)
+    said: list[str] = []
+    with servo_session(config, say=said.append):
+        play(config, tmp_path / "next")
+    assert "Its Current Limit is 900 and was 1193" in said[-1]
+    assert bench.changed() == ["Current Limit of 2: 1193 -> 900", "Goal Current of 2: 1193 -> 900"]
+    assert list(state_folder.glob("*.json")) == []
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_start_that_is_stopped_before_it_reaches_a_servo_restores_it_too_or_says_so(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path, answers: bool
+) -> None:
+    config = arm(SHORT)
+    kill(config, bench, monkeypatch)
+
+    def stop(said: str) -> None:
+        assert "'shoulder'" in said
+        if not answers:
+            bench.port.bus.faults.add(Fault(kind="silent_servo", servo=2, at=0.0))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stopped, servo_session(config, say=stop):
+        pass
+    waiting = [each.name for each in state_folder.glob("*.json")]
+    if answers:
+        assert bench.changed() == [] and waiting == []
+        return
+    assert len(waiting) == 1 and {each.split(" of ")[1][0] for each in bench.changed()} == {"2"}
+    (told,) = (note for note in stopped.value.__notes__ if "are not restored yet" in note)
+    assert "left on joint 'elbow' (ID 2, XM430-W350)" in told and told.endswith(f"{waiting[0]}.")
 
 
 def test_a_pilot_writes_each_eeprom_register_twice(tmp_path: Path, bench: Bench) -> None:

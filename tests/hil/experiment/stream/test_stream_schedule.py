@@ -41,6 +41,7 @@ class Bus:
         self.read_back_at = math.inf
         self.heard_instead = self.commanded_by_another = ""
         self.is_watched = True
+        self.modes_seen_ago = math.inf
         self.goals_lost: tuple[int, str] | None = None
         self.takes = takes
         self.calls: list[Call] = []

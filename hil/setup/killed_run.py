@@ -1,0 +1,104 @@
+"""Settings that a killed program left on the servos: what can be restored, and what another program has changed.
+
+A register that holds neither the value that the killed program set nor the one that it found was changed by something
+else. It is left as it is, since a person may want it so, and named with the value that it had before.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from hil.drivers.joint import Joint
+from hil.drivers.preparation.settings import attainable, put_back, read_settings
+from hil.drivers.servo import Servo
+from hil.setup import settings_file
+from hil.setup.settings_file import Kept
+
+__all__ = ["Left", "Restored", "left_behind", "recover", "what_is_left"]
+
+_MODE, _CURRENT_LIMIT = "Operating Mode", "Current Limit"
+
+
+def left_behind(port: str, joint: Joint) -> Kept | None:
+    """Settings of this joint's servo that a terminated program left unrestored; None if there are none."""
+    kept = settings_file.load(port, joint.id, joint.servo.name)
+    return kept if kept is not None and kept.may_restore else None
+
+
+@dataclass(frozen=True)
+class Left:
+    """What a killed program left on one servo.
+
+    kept: the settings before that program. wanted: those to restore, with what another program changed since left as
+    it is. changed: these registers, each with its present value.
+    """
+
+    kept: Kept
+    wanted: dict[str, int]
+    changed: dict[str, int]
+    is_to_restore: bool
+
+    def told(self, title: str) -> str:
+        """What is restored and what is not, for the user."""
+        others = self.others if self.changed else ""
+        if not self.is_to_restore:
+            return f"{title}: {others}" if others else ""
+        restored = f"an earlier run ended before it could restore its settings ({self.kept.since}); this one will."
+        return f"{title}: {restored} {others[:1].upper()}{others[1:]}".rstrip()
+
+    @property
+    def others(self) -> str:
+        """A sentence about the registers that another program changed."""
+        named = " and ".join(
+            f"its {name} is {value} and was {self.kept.settings[name]}" for name, value in self.changed.items()
+        )
+        cut = ", and its Goal Current is not restored beyond it" if _CURRENT_LIMIT in self.changed else ""
+        return (
+            f"{named} before the run of {self.kept.since}. Another program changed this during that run or since, so "
+            f"it is left as it is{cut}. To change it back, use DYNAMIXEL Wizard 2.0."
+        )
+
+    def is_refused(self, needed: Mapping[str, int]) -> bool:
+        """Whether a run that needs these values cannot start with the Current Limit that another program lowered."""
+        return self.changed.get(_CURRENT_LIMIT, 0) < needed.get(_CURRENT_LIMIT, 0) and _CURRENT_LIMIT in self.changed
+
+
+def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
+    """Compare the settings before a killed program with the present ones. Raises as `Servo.read`.
+
+    If another program changed the Operating Mode, goals and gains belong to the new mode and are kept.
+    """
+    changed = {
+        name: present[name]
+        for name, value in kept.changed.items()
+        if name in present and name in kept.settings and present[name] not in (value, kept.settings[name])
+    }
+    settings = {**present, **{name: kept.settings[name] for name in kept.changed if name in kept.settings}}
+    wanted = {**(settings if _MODE in changed else kept.settings), **changed}
+    is_to_restore = any(present.get(name) != value for name, value in attainable(servo, wanted).items())
+    return Left(kept, wanted, changed, is_to_restore)
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What `recover` wrote, as text, and a sentence about what another program changed; "" if nothing."""
+
+    written: list[str] = field(default_factory=list)
+    others: str = ""
+
+
+def recover(servo: Servo, port: str) -> Restored:
+    """Restore settings that a terminated program left changed; raises as `Servo.write`.
+
+    The file stays as long as another program's value prevents a register from being restored.
+    """
+    kept = settings_file.load(port, servo.id, servo.table.model)
+    if kept is None or not kept.may_restore:
+        return Restored()
+    if servo.read("Torque Enable"):
+        servo.write("Torque Enable", 0)
+    left = what_is_left(kept, servo, read_settings(servo))
+    written = put_back(servo, left.wanted)
+    if not left.changed:
+        settings_file.forget(kept)
+    told = [f"{name} {before} -> {after}" for name, (before, after) in written.items()]
+    return Restored(told, left.others if left.changed else "")
