@@ -283,6 +283,8 @@ def _wait_for_rest(config: Config, bus: ServoBus) -> Lies:
         refuse_moved(lay, lies)
     except ExperimentError:
         _check_unchanged(bus)  # which names another program that shifted the angles
+        if config.is_chain and not wait_for_rest(bus):
+            _check_pose(config, bus)  # which names the pose to which the arm fell
         raise
     # An upright arm that nobody holds would only fall farther.
     if has_moved() or config.is_chain or (has_stirred(lay, lies) and not must_balance(config)):

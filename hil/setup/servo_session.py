@@ -332,15 +332,13 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
 def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
     """What to raise in place of `error` if torque is off on all servos by now; None if it is not.
 
-    That is what cut torque, with a note about torque, or an ExperimentError if nothing but the silence of servos did.
+    That is what cut torque, or an ExperimentError if nothing but the silence of servos did, with a note about torque.
     """
     report = bus.torque_off_report
     error.args = (str(report),)
     if report is None or report.unconfirmed:
         return None
-    cause = error.__context__
-    if cause is None:
-        return ExperimentError(f"{_LATE_CONFIRMED} {report}")
+    cause = error.__context__ or ExperimentError(_LATE_CONFIRMED)
     cause.add_note(str(report))
     return cause
 

@@ -414,14 +414,15 @@ def test_a_lost_reply_or_a_long_cycle_delays_the_next_read_back_by_one_cycle_onl
 
 
 class Held(Wire):
-    """A wire on which two servos answer every read with zeros in front of the goal that they hold."""
+    """A wire on which two servos answer every read with zeros, and at its end with the goal that they hold."""
 
     goal, is_silent = 0, False
 
     def write(self, data: bytes) -> None:
         reads = [each.body for each in Framer().feed(data) if each.instruction == Instruction.SYNC_READ]
         for body in [] if self.is_silent else reads:
-            told = bytes((body[2] | body[3] << 8) - 2) + struct.pack("<h", self.goal)
+            is_of_settings = body[0] | body[1] << 8 < 64
+            told = bytes((body[2] | body[3] << 8) - 2) + struct.pack("<h", 0 if is_of_settings else self.goal)
             self.waiting += b"".join(encode_status(servo, 0, told) for servo in (1, 2))
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hil.estimator import linalg
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ModelError, RecordingError, ShapeError, StandstillError, UnidentifiableError
 from hil.estimator.excitation.multisine import Multisine
@@ -108,13 +109,13 @@ def test_regression_alone_is_close_for_two_small_decompositions(
     ideal_arm: Arm, ideal_period: SettledPeriod, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shapes: list[tuple[int, ...]] = []
-    svd = np.linalg.svd
+    svd = linalg.svd
 
     def counted(matrix: np.ndarray, **how: Any) -> Any:
         shapes.append(matrix.shape)
         return svd(matrix, **how)
 
-    monkeypatch.setattr(np.linalg, "svd", counted)
+    monkeypatch.setattr(linalg, "svd", counted)
     linear = fit_lines(ideal_period)
     lines = linear.harmonics[0] + 1
     assert shapes == [(4 * lines, 13)] * 2  # real and imaginary parts of two joints; twelve parameters and the delay

@@ -28,7 +28,7 @@ def test_too_little_room_on_the_way_down_is_not() -> None:
 def test_arms_that_do_not_reach_the_rest_pose_are_not() -> None:
     why = ChainStops(FALL, LoweringForeseen(5.0, FREE, 0.83, "knee", 0.4, HELPS)).unsafe
     assert "83 % of the simulated stops" in why
-    assert why.endswith(f"rad away. {HELPS}")
+    assert why.endswith(f"rad away from it. {HELPS}")
     assert "'knee' ends up to 0.4 rad away" in why
 
 
