@@ -51,7 +51,7 @@ def taught(outcome: Outcome) -> bool:
 
 
 def chosen() -> list[Setting]:
-    """Every bundled configuration at every rate, two thirds of them not at 1 kHz, and the mixed arm at one, to save time."""
+    """Every bundled configuration at every rate, except for two thirds of them at 1 kHz; the mixed arm at one rate."""
     bundled = [each for each in settings() if each.name != MIXED]
     kept = [each for each in bundled if each.rate != RATES[-1] or names().index(each.name) % EVERY_THIRD == 0]
     return [*kept, Setting(MIXED, 100)]
