@@ -120,14 +120,16 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     limits = np.array([joint.position_limit for joint in config.joints])
     position = story.record["position"]
     beyond = np.maximum(limits[:, 0] - position.min(axis=0), position.max(axis=0) - limits[:, 1])
-    drives_ms = driving_ms(config, told, undisturbed)
+    drives_ms = driving_ms(config, told, story, undisturbed)
     unsafe = (late_ms > bound and not unseen) or left_on or drives_ms > DRIVES_MS
     return Verdict(owed, late_ms, unsafe, beyond, named, misleading, unseen, drives_ms)
 
 
-def driving_ms(config: Config, told: "Told", undisturbed: Story) -> float:
+def driving_ms(config: Config, told: "Told", story: Story, undisturbed: Story) -> float:
     """Longest time for which the program commanded a joint more than ever in the undisturbed run, in the direction in
     which the positions that it received were moving [ms]; 0 for an arm that a stabiliser may hold with any torque.
+
+    Goals of a servo without torque, as when settings are restored, drive nothing.
     """
     if config.stabiliser is not None:
         return 0.0
@@ -135,8 +137,11 @@ def driving_ms(config: Config, told: "Told", undisturbed: Story) -> float:
     for joint, (sent, heard) in enumerate(zip(told.sent, told.heard, strict=True)):
         record = undisturbed.record[:, joint]
         most = DRIVES_SHARE * np.abs(record["goal"][record["driven"]]).max(initial=1)
-        moved = _visible_motion(np.array([each[0] for each in sent]), np.array(heard).reshape(-1, 4))
+        sent_at = np.array([each[0] for each in sent])
+        moved = _visible_motion(sent_at, np.array(heard).reshape(-1, 4))
         along = config.joints[joint].direction * np.array([each[1] for each in sent]) * np.sign(moved)
+        own = story.record[:, joint]
+        along *= own["torque"][np.clip(np.searchsorted(own["time"], sent_at) - 1, 0, own.size - 1)]
         begun = None
         for (when, _), drives in zip(sent, along > most, strict=True):
             if begun is not None:
