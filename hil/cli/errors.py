@@ -23,8 +23,8 @@ def message(error: Exception) -> str:
     The notes end with the next command, if they name one.
     """
     lines = [f"hil: {error}"]
-    cause = error.__context__
-    if cause is not None and error.__cause__ is None and isinstance(cause, Exception) and exit_code(cause) is not None:
+    cause = None if error.__suppress_context__ else error.__context__
+    if isinstance(cause, Exception) and exit_code(cause) is not None:
         lines.append(f"Preceded by: {cause}")
     return "\n".join([*lines, *getattr(error, "__notes__", [])])
 

@@ -193,10 +193,14 @@ class Stream:
             )
 
     def _false_velocity(self, state: State, window: int) -> str:
-        """Which joint reports a velocity although its position has not changed in the last `window` samples."""
+        """Which joint reports a velocity although its position has not changed in the last `window` samples.
+
+        One sample does not show it: at a low rate, a joint may have begun to move right before it.
+        """
         moved = np.ptp(self._recorder.samples["position"][-window:], axis=0)
-        for joint, velocity, way in zip(self._bus.joints, state.velocity, moved, strict=True):
-            if abs(velocity) > self._safety.rest_velocity and way <= _STILL_STEPS * abs(joint.position_unit):
+        lasting = np.abs(self._recorder.samples["velocity"][-2:]).min(axis=0)
+        for joint, velocity, least, way in zip(self._bus.joints, state.velocity, lasting, moved, strict=True):
+            if least > self._safety.rest_velocity and way <= _STILL_STEPS * abs(joint.position_unit):
                 return (
                     f"{joint.title} reports a velocity of {velocity:.2f} rad/s before the start, but its position has "
                     f"changed by {way:.4f} rad in the last {window * self._interval:.1f} s: one of the two readings is "

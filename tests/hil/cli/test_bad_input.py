@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from hil.cli.errors import stop_behind
+from hil.cli.errors import message, stop_behind
 from hil.config.schema import load_config
-from hil.errors import ConfigError, StopRequested
+from hil.errors import ConfigError, ExperimentError, StopRequested
 from hil.pilot.search import pilot_config
 from tests.support.command_line import hil
 from tests.support.paths import CONFIGS
@@ -383,3 +383,18 @@ def test_a_closed_terminal_does_not_hide_the_stop() -> None:
     assert stop_behind(closed) is stop
     assert stop_behind(OSError()) is None
     assert stop_behind(ValueError()) is None
+
+
+def test_what_led_to_an_error_is_told_unless_it_has_been_replaced() -> None:
+    told = []
+    for replaced in (False, True):
+        try:
+            try:
+                raise ConfigError("first")
+            except ConfigError:
+                if replaced:
+                    raise ExperimentError("then") from None
+                raise ExperimentError("then")
+        except ExperimentError as error:
+            told.append(message(error))
+    assert told == ["hil: then\nPreceded by: first", "hil: then"]

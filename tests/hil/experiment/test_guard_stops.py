@@ -446,9 +446,17 @@ def test_an_arm_that_is_still_moving_when_the_rest_is_over(
     assert_stopped(ports[0])
 
 
-def test_a_velocity_without_motion_before_the_start_is_a_false_reading(
-    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+FALSE_VELOCITY = (
+    r"'elbow' \(ID 2.* reports a velocity of 0\.\d\d rad/s before the start, but its position .* by 0\.000\d rad"
+)
+MOVES = r"^The arm is moving before the start: joint 'elbow'"
+
+
+@pytest.mark.parametrize(("before_the_end", "said"), [(20, FALSE_VELOCITY), (1, MOVES)])
+def test_a_velocity_without_motion_before_the_start_is_a_false_reading_unless_it_has_just_begun(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, before_the_end: int, said: str
 ) -> None:
+    since = plan.rest_samples - before_the_end
     config = arm()
 
     def freeze() -> None:
@@ -457,9 +465,8 @@ def test_a_velocity_without_motion_before_the_start_is_a_false_reading(
         elbow.present.state = lambda position, _velocity, current: right(position, 0.5, current)
 
     run = RunFolder.create(tmp_path / "run", config)
-    said = r"'elbow' \(ID 2.* reports a velocity of 0\.\d\d rad/s before the start, but its position .* by 0\.000\d rad"
     with pytest.raises(ExperimentError, match=said):
-        run_experiment(config, run, config.path, once(freeze, Phase.REST, 180), plan)
+        run_experiment(config, run, config.path, once(freeze, Phase.REST, since), plan)
     assert_stopped(ports[0])
 
 
