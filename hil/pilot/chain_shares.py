@@ -148,12 +148,14 @@ class SafeShares:
 
     def _helped_by_rate(self, config: Config, shares: tuple[float, ...]) -> str:
         """Name a higher rate at which a path would be safe, since the spring would be stiffer; "" if there is none."""
+        if self.given.stabiliser is not None:
+            return ""
         experiment = self.given.experiment
         gains = self.belief.gains(self.given)
         for wanted in sorted({min(RAISED_RATE * experiment.rate, gains.sufficient_rate), gains.sufficient_rate}):
-            rate = _round_rate(wanted, experiment.period)
-            if self.given.stabiliser is not None or wanted <= experiment.rate:
+            if wanted <= experiment.rate:
                 continue
+            rate = _round_rate(wanted, experiment.period)
             faster = _at_rate(config, rate).model_copy(update={"stabiliser": gains.at(rate)})
             try:
                 paths = Paths.of(_at_rate(self.given, rate), self.belief.torque, tell=self.designing)

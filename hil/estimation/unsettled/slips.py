@@ -19,23 +19,21 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
     if absolute is not None and _is_clear(*absolute):
         raise CsvError(
             f"{source}: the angle of joint 2 seems to be measured from a fixed direction, such as the horizontal, "
-            f"instead of from link 1. With the difference of both angles, inverse dynamics leaves "
-            f"{_percent(absolute[0])} of the torque unexplained instead of {_percent(absolute[1])}. Set in "
+            f"instead of from link 1. With the difference of both angles, {_unexplained(*absolute)}. Set in "
             '[columns] of --config ARM.toml (in Python: config="ARM.toml"): angles = "absolute"'
         )
     order = suspect_order(recordings)
     if order is not None and _is_clear(*order):
         raise CsvError(
             f"{source}: the joints seem to be in the wrong order: with angles and torques of joints 1 and 2 exchanged, "
-            f"inverse dynamics leaves {_percent(order[0])} of the torque unexplained instead of {_percent(order[1])}. "
+            f"{_unexplained(*order)}. "
             "Joint 1 is the one at the base: name its columns first in [columns] of --config ARM.toml."
         )
     swapped = suspect_swapped(recordings)
     if swapped is not None and _is_clear(*swapped):
         raise CsvError(
-            f"{source}: the torque columns of joints 1 and 2 seem to be swapped: exchanged, inverse dynamics leaves "
-            f"{_percent(swapped[0])} of the torque unexplained instead of {_percent(swapped[1])}. Exchange them in the "
-            "file, or in [columns] of --config ARM.toml."
+            f"{source}: the torque columns of joints 1 and 2 seem to be swapped: exchanged, {_unexplained(*swapped)}. "
+            "Exchange them in the file, or in [columns] of --config ARM.toml."
         )
     signs = suspect_signs(recordings)
     if signs is None:
@@ -43,9 +41,8 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
     if _is_clear(signs.residual, signs.residual_given):
         columns = " and ".join(signs.signs.reversed_columns)
         raise CsvError(
-            f"{source}: the sign of {columns} is reversed: with the sign changed, inverse dynamics leaves "
-            f"{_percent(signs.residual)} of the torque unexplained instead of {_percent(signs.residual_given)}. Change "
-            "the sign in the file, or swap the columns."
+            f"{source}: the sign of {columns} is reversed: with the sign changed, "
+            f"{_unexplained(signs.residual, signs.residual_given)}. Change the sign in the file, or swap the columns."
         )
     # All torques reversed leave the same residual, but nothing has a negative inertia.
     inertias = [name for name in signs.impossible if name.startswith("inertia")]
@@ -59,6 +56,11 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
 
 def _is_clear(residual: float, given: float) -> bool:
     return residual < CLEAR * given and residual < WELL
+
+
+def _unexplained(residual: float, given: float) -> str:
+    """What a correction gains: the torque that inverse dynamics leaves unexplained with and without it."""
+    return f"inverse dynamics leaves {_percent(residual)} of the torque unexplained instead of {_percent(given)}"
 
 
 def _percent(share: float) -> str:
