@@ -63,9 +63,11 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
         tried = []
         for beyond in BEYOND.tolist():
             level = float(np.quantile(size, 1.0 - beyond))
+            if level == 0.0:  # most commands are zero, which no limit explains
+                continue
             limit = np.where(np.arange(recordings[0].joints) == joint, level, np.inf)[:, None]
             left = _residuals([replace(each, torque=np.clip(each.torque, -limit, limit)) for each in recordings])
-            if left is not None and level > 0.0:
+            if left is not None:
                 tried.append(Clipped(joint + 1, level, beyond, float(left[joint]), float(given[joint])))
         best = min(tried, key=lambda each: each.residual, default=None)
         if best is not None and best.residual < LESS_RESIDUAL * best.residual_given:

@@ -12,6 +12,7 @@ import pytest
 
 from hil.estimation.unsettled.causes import causes
 from hil.estimation.unsettled.warnings import doubts_of
+from hil.estimator.baselines.torque_faults import suspect_clipped
 from hil.estimator.data.recording import Recording
 from tests.support.recorded_motion import two_joints
 
@@ -103,6 +104,12 @@ def test_a_torque_that_the_drive_limits_is_named_with_the_limit() -> None:
     (named,) = found(healthy(0.75), healthy(0.75).position + 1e-4)
     limit = re.match(r"The torque of joint 1 seems to have been limited to about (\S+) N m", named)
     assert limit and float(limit[1]) == pytest.approx(0.75, rel=0.1) and "saturation" in named
+
+
+def test_no_limit_is_sought_among_torques_that_are_mostly_zero() -> None:
+    """Two recordings in each of which one joint is driven: limited to zero, one of them would have no torque at all."""
+    driven = [replace(healthy(), torque=healthy().torque * np.array(each)[:, None]) for each in ((1, 0), (0, 1))]
+    assert suspect_clipped(driven) == ()
 
 
 def test_a_healthy_recording_has_none() -> None:
