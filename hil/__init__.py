@@ -5,8 +5,8 @@
     result = hil.identify("fake_two_link")
     result.parameters["inertia_1"].value
 
-The functions do what the commands of the same names do. They are loaded on first use, so that `import hil` takes
-almost no time.
+Each function does the same as the command of its name. The functions are loaded on first use, so that `import hil`
+takes almost no time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """An identified spatial arm as a model; see `hil.arm_model`. Needs numpy only.
 
-Newton-Euler equations with the base parameters in place of the links' own inertial parameters, and zero for all
-parameters that were eliminated: the dynamics are the same. A mass of zero therefore says nothing about a link.
+Newton-Euler equations in which the base parameters replace the links' own inertial parameters, and all eliminated
+parameters are zero. The dynamics stay the same, but a mass of zero says nothing about the real link.
 """
 
 from dataclasses import dataclass

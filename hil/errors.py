@@ -146,8 +146,8 @@ class ExperimentError(HilError):
 class SafetyStop(ExperimentError):
     """The guard stopped the arm, or a dry run ruled out starting it. Example: joint 2 exceeded its position limit.
 
-    overruled: a servo held goals or settings that this program had not written, so the motion was not that of the
-    commanded torque and reveals nothing about the arm.
+    overruled: a servo held goals or settings that this program had not written, so the commanded torque did not cause
+    the motion, which therefore reveals nothing about the arm.
     """
 
     def __init__(self, message: str, cause: Cause) -> None:

@@ -16,7 +16,7 @@ __all__ = ["CheckReport", "Finding", "Level", "check"]
 class CheckReport:
     """The findings of a check, in the order in which they were made.
 
-    config: the configuration file of the arm, as the caller gave it.
+    config: the configuration file of the arm, as passed by the caller.
     """
 
     config: Path

@@ -27,7 +27,7 @@ __all__ = ["Rehearsal", "dry_run"]
 class Rehearsal:
     """The outcome of a dry run.
 
-    file: the configuration file, as the caller gave it. found: the complete results of the simulation.
+    file: the configuration file, as passed by the caller. found: the complete results of the simulation.
     """
 
     file: Path
@@ -54,7 +54,9 @@ class Rehearsal:
 
     @property
     def prediction(self) -> Prediction:
-        """The prediction for the configured torque, else for the largest safe one, else for the pilot's first run."""
+        """The prediction for the configured torque or, without one, for the largest safe torque or the pilot's first
+        run.
+        """
         return self.found.prediction if isinstance(self.found, ChainDryRun) else self.found.shown
 
     def to_json(self) -> dict[str, Any]:
@@ -111,9 +113,8 @@ def dry_run(
         result: run folder or result.json of an earlier identification, used instead of [arm.prior].
         arms: number of arms to simulate.
         servos: also read the servos' limits and measure bus timing, with torque off.
-        executor: a concurrent.futures executor, or `hil.study.engine.executor`, that simulates the arms. The result is
-        the same
-            with and without it.
+        executor: a concurrent.futures executor, or `hil.study.engine.executor`, that simulates the arms. It does not
+            change the result.
         on_progress: called with a `Progress` when the simulation begins.
 
     Raises:

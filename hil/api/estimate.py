@@ -36,15 +36,15 @@ def estimate(
     """Estimate an arm's parameters from a recording: `hil estimate` as a function.
 
     Args:
-        recording: a run folder or a `Run`, whose result.json is rewritten; or one or more recordings of one arm by
-            other tools: CSV, Parquet or MCAP files, LeRobot datasets, ROS 2 bags.
+        recording: a run folder or a `Run` (its result.json is rewritten), or one or more recordings of one arm made
+            with other tools: CSV, Parquet or MCAP files, LeRobot datasets, ROS 2 bags.
         config: for recordings of other tools, a TOML file whose [columns] table describes them; without it, the
             column names must be clear enough.
-        out: for recordings of other tools, the folder of the result, which must be new or empty; runs/TIME-NAME unless
-            given.
+        out: for recordings of other tools, the folder for the result, which must be new or empty; by default
+            runs/TIME-NAME.
         all_samples: use every sample of a run, by multiple shooting; no settled period is needed.
-        executor: a concurrent.futures executor, or `hil.study.engine.executor`; with `friction = "auto"` it starts fits
-            before they are known to be needed: less waiting, more work in total. The result is the same either way.
+        executor: a concurrent.futures executor, or `hil.study.engine.executor`; with `friction = "auto"` it also starts
+            fits that may turn out not to be needed: less waiting, more work in total. It does not change the result.
         on_progress: called with a `Progress` when a new stage begins.
 
     Returns:
@@ -85,7 +85,7 @@ def estimate(
 
 
 def are_recordings(paths: Sequence[Path]) -> bool:
-    """Whether these are recordings of other tools and not one run folder; raises ValueError for a mixture."""
+    """Whether these are recordings made with other tools, not one run folder. Raises ValueError for a mixture."""
     if not paths:
         raise ValueError("no recording is given: name a run folder, or recordings (CSV, Parquet, MCAP).")
     files = [is_recording(path) for path in paths]

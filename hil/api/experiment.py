@@ -46,11 +46,12 @@ def identify(
     Args:
         config: TOML file of the arm, the name of a bundled one such as "fake_two_link", or a loaded configuration.
         out: run folder, which must be new or empty; by default runs/TIME-ARM.
-        take_over: take over an arm whose torque another program left on, and lower it slowly; support it by hand.
-        start_from: run folder or result.json of an earlier identification of the same arm, which replaces the prior, so
-            that fewer runs are needed; only with experiment.pilot. If the arm moves differently, the prior is used.
-        on_progress: called with a `Progress` about 20 times a second while the arm moves, in a separate thread on a
-            real bus. It cannot disturb the experiment: reports that arrive too fast are dropped, and if it raises, the
+        take_over: take over an arm that another program left with its torque on, and lower it slowly; support it by
+            hand.
+        start_from: run folder or result.json of an earlier identification of the same arm. It replaces the prior and
+            saves runs; only with experiment.pilot. If the arm moves differently, the prior is used.
+        on_progress: called with a `Progress` about 20 times a second while the arm moves; on a real bus, in a separate
+            thread. It cannot disturb the experiment: reports that arrive too fast are dropped. If it raises, the
             exception is logged and it is not called again.
 
     Returns:

@@ -41,7 +41,7 @@ OnProgress = Callable[[Progress], None]
 def forgiving(listener: OnProgress) -> OnProgress:
     """Wrap a callback so that its first exception is logged and it is not called again.
 
-    A signal that arrives while the callback runs is not the callback's failure: the stop request is passed on.
+    A stop request by signal during the callback does not count as a failure of the callback: it is passed on.
     """
     failed = False
 

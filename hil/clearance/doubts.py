@@ -1,4 +1,4 @@
-"""Warnings about the configuration and the description of an arm, which do not prevent an experiment."""
+"""Warnings about the configuration and the description of an arm. They do not prevent an experiment."""
 
 from collections.abc import Iterator
 
@@ -30,7 +30,7 @@ def doubts(config: Config) -> Iterator[str]:
 
 
 def unchecked(space: Space) -> Iterator[str]:
-    """Yield one sentence per pair of links with parts whose distance is not checked."""
+    """Yield one sentence per pair of links that is not fully checked for contact."""
     for first, second in space.as_built:
         yield (
             f"Some parts of {first!r} and {second!r} are closer than clearance.margin in nearly every pose, as if by "

@@ -1,4 +1,4 @@
-"""The capsules of an arm as a file next to a copy of its description, whose meshes are not copied."""
+"""The capsules of an arm, stored in a file next to the copy of its description, because meshes are not copied."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""Capsules that enclose each link: from the collision geometry of its file, otherwise from the joint positions.
+"""Capsules that enclose each link: from the collision geometry in the arm's file, otherwise from the joint
+positions.
 
 A capsule is the set of points within its radius of a line segment. Spheres are represented exactly. A cylinder is
 enclosed by one capsule, a box by one or a row of them, and a mesh by those of its bounding box. A link whose geometry
@@ -48,7 +49,8 @@ class Shapes:
     """The capsules of an arm.
 
     names: names of the links, the base's first. guessed: links whose shape was guessed from the joint positions.
-    doubts: one sentence for each of these, except for a base without geometry: why, and what replaces the shape.
+    doubts: for each guessed link, except a base without geometry, one sentence that says why the shape is unknown and
+    what replaces it.
     """
 
     names: tuple[str, ...]

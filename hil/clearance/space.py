@@ -21,13 +21,13 @@ ALWAYS_SHARE = 0.9
 """Two capsules that are closer than the margin in at least this fraction of poses are assumed to touch by design."""
 
 NEAR_SHARE, NEAR_SHARE_OF_OTHERS = 0.75, 0.98
-"""Two capsules with one link in between, or with more, that are closer than BUILT_NEAR in at least this fraction of
-poses are near each other by design: they must not touch, but need no margin.
+"""Two capsules that are closer than BUILT_NEAR in at least this fraction of poses are near each other by design: they
+must not touch, but need no margin. First value: exactly one link lies between them; second: more than one.
 """
 
 BUILT_NEAR = 0.02  # m beyond the margin
 TOUCHED = 0.02
-"""Capsules closer than this in the rest pose may carry the arm there [m]."""
+"""Capsules closer than this in the rest pose may support the arm there [m]."""
 
 RANDOM_POSES = 400
 AT_REST_SLACK = 0.008
@@ -67,9 +67,9 @@ class Nearest:
 class Space:
     """Pairs of capsules that must keep apart, and by how much.
 
-    as_built: pairs of links with capsules that are not checked, because they are closer than the margin in nearly every
-    pose. near: pairs of links with capsules that must not touch, but need no margin, because they are near each other
-    in most poses.
+    as_built: pairs of links that are not fully checked, because some of their capsules are closer than the margin in
+    nearly every pose. near: pairs of links with capsules that are near each other in most poses; these must not touch,
+    but need no margin.
     """
 
     shapes: Shapes
@@ -82,7 +82,7 @@ class Space:
     at_rest: Array
     """Distance of each pair in the rest pose (pairs,) [m]."""
     is_touched: NDArray[np.bool_]
-    """Whether in the rest pose anything may touch the part of the arm that a joint moves (joints,)."""
+    """For each joint (joints,): whether anything may touch the part of the arm that it moves, in the rest pose."""
     _built: Array
     """Median distance of pairs that are near each other by design, otherwise infinite (pairs,) [m]."""
     _pairs: NDArray[np.int64]
@@ -286,7 +286,9 @@ def _by_design(
 
 
 def _touched(joints: int, link: NDArray[np.int64], contacts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether any of the contacts (contacts, 2) is between what a joint moves and what it does not (joints,)."""
+    """For each joint (joints,): whether a contact (contacts, 2) is between a part that it moves and one that it does
+    not.
+    """
     touched = np.zeros(joints, dtype=bool)
     for first, second in contacts:
         ends = sorted((int(link[first]), int(link[second]) if second >= 0 else 0))

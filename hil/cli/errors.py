@@ -18,7 +18,7 @@ def exit_code(error: Exception) -> int | None:
 
 
 def message(error: Exception) -> str:
-    """Return the error's message, that of the error that was being handled when it occurred, and its notes.
+    """Return the message of the error and of the error that was being handled when it occurred, then its notes.
 
     The notes end with the next command, if they name one.
     """
@@ -30,7 +30,7 @@ def message(error: Exception) -> str:
 
 
 def stop_behind(error: BaseException) -> Exception | None:
-    """The stop request during whose handling `error` occurred because the terminal was closed; None if there is none.
+    """Return the stop request that was being handled when a closed terminal caused `error`; None if there was none.
 
     A closed terminal sends SIGHUP, and then rejects any output.
     """

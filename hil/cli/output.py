@@ -1,4 +1,4 @@
-"""Handling of standard output whose reader closed it early or whose disk is full. Results have been saved by then."""
+"""Handle standard output that its reader closed early or that goes to a full disk. Results are already saved."""
 
 import errno
 import os

@@ -18,7 +18,9 @@ from hil.next_step import next_step
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM or SIGHUP, raised like Ctrl-C so that everything is cleaned up in the same way."""
+    """Raised on SIGTERM or SIGHUP, as KeyboardInterrupt is on Ctrl-C, so that everything is cleaned up in the same
+    way.
+    """
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -43,12 +45,14 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 def how_to_go_on(stopped: BaseException) -> list[str]:
-    """The notes attached to the interrupted call, and the next command."""
+    """Return the notes attached to the interruption, and the next command."""
     return [*getattr(stopped, "__notes__", []), *same_again(stopped)]
 
 
 def same_again(stopped: BaseException) -> list[str]:
-    """The same command as the next one, if the notes attached to the interrupted call name none."""
+    """Return a line that suggests the same command again, unless the notes attached to the interruption name a next
+    command.
+    """
     notes = getattr(stopped, "__notes__", [])
     return [] if any("hil " in note for note in notes) else [next_step(*sys.argv[1:])]
 

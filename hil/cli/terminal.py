@@ -146,7 +146,7 @@ def _bar(console: Console) -> Progress:
 
 
 def rows_below(text: str, width: int) -> str:
-    """The text, with each row of a table on separate lines if the table is wider than `width`.
+    """Return the text; if its table is wider than `width`, each row is split over several lines.
 
     A row's cells are two spaces or more apart; the first row holds the headings.
     """

@@ -19,8 +19,8 @@ def find_config(path: Path) -> Path:
 
 
 def meant(path: Path) -> str:
-    """The hint for a name without ".toml", or one that is not a bundled configuration; empty for others and for files
-    that exist.
+    """Return a hint for a `path` that does not exist: the same name with ".toml", or the bundled configurations. "" if
+    there is no hint.
     """
     if path.suffix == "" and not path.exists() and path.with_suffix(".toml").is_file():
         return f" Did you mean {path.with_suffix('.toml')}?"

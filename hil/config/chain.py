@@ -46,10 +46,10 @@ def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
 
 
 def doubted_limits(config: "Config") -> Iterator[str]:
-    """Yield one sentence per joint whose limits in the file make no sense or do not contain the paths.
+    """Yield one sentence per joint whose limits in the description make no sense or do not contain the paths.
 
-    At either end, position_limit may exceed them by the margin that a path leaves free: it only stops the arm, and some
-    arms rest on a stop.
+    position_limit may exceed the described limits at either end by the margin that a path leaves free: it only serves
+    to stop the arm, and some arms rest on a mechanical stop.
     """
     arm = described_arm(config)
     wanted = config.joint_path

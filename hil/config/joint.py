@@ -130,7 +130,9 @@ class JointConfig(Table):
 
     @property
     def torque_spread(self) -> float:
-        """Relative standard deviation of the torque per goal: as given, or that among servos of one model."""
+        """Relative standard deviation of the torque per goal: as configured, otherwise that among servos of one
+        model.
+        """
         name = "torque_per_volt_std" if self.drive_mode is Mode.PWM else "torque_constant_std"
         if name not in self.model_fields_set:
             return USUAL_TORQUE_SPREAD

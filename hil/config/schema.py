@@ -274,17 +274,15 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is a spatial one: described by a file, unless the file describes a planar arm and there is no
-        path.
-        """
+        """Whether the arm is spatial. Every arm with [arm] urdf is, except a planar arm without [joint_path]."""
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property
     def rest_tolerance(self) -> float:
         """Largest deviation from the rest pose at the start [rad]: `arm.rest_tolerance`.
 
-        If that is not given, it is LYING_RAD for a spatial arm: it lies on something, so friction holds it closer to
-        its rest pose than an arm that hangs.
+        The default for a spatial arm is LYING_RAD: such an arm lies on something, and friction holds it closer to its
+        rest pose than an arm that hangs.
         """
         is_given = "rest_tolerance" in self.arm.model_fields_set
         return LYING_RAD if self.is_chain and not is_given else self.arm.rest_tolerance
@@ -331,8 +329,8 @@ def load_config(path: str | PathLike[str]) -> Config:
 def parse_config(text: str, path: Path, *, recorded: bool = False) -> Config:
     """Check the text of a TOML file read from `path`. Raises ConfigError.
 
-    recorded: whether the file is the copy in a run folder, which may be of an older version; configurations of spatial
-    arms could then contain arm.link_lengths, which had no effect.
+    recorded: whether the file is the copy in a run folder. If so, arm.link_lengths of a spatial arm is ignored: older
+    versions of hil accepted this key, although it had no effect.
     """
     try:
         values = parse_toml(text, path)

@@ -25,6 +25,6 @@ Angle = Annotated[float, Field(ge=-4 * math.pi, le=4 * math.pi)]
 """An angle of a joint [rad]: up to two turns, so that values in degrees are detected."""
 
 Turned = Annotated[float, Field(ge=-2 * math.pi, le=2 * math.pi)]
-"""An angle by which something is mounted [rad]."""
+"""A mounting angle [rad], such as that of the base or of an obstacle."""
 
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]

@@ -31,8 +31,8 @@ class Body:
         return cls(0.0, np.zeros(3), np.zeros((3, 3)))
 
     def moved(self, rotation: Array, translation: Array) -> "Body":
-        """Express the body in another frame; rotation (3, 3) and translation (3,) [m] give its own frame's pose in that
-        frame.
+        """Express the body in another frame; rotation (3, 3) and translation (3,) [m] give the pose of its present
+        frame in the new one.
         """
         return Body(self.mass, rotation @ self.centre + translation, rotation @ self.inertia @ rotation.T)
 
@@ -59,8 +59,8 @@ class Body:
 
     @property
     def is_physical(self) -> bool:
-        """Whether some mass distribution has this inertia: no negative moment, and none larger than the sum of the
-        others.
+        """Whether a real body can have this inertia: no principal moment is negative or larger than the sum of the
+        other two.
         """
         if not self.mass > 0.0:
             return False
@@ -88,8 +88,8 @@ class ArmJoint:
     fixed: tuple[str, ...]
     """Names of the links attached to this joint's link by fixed or held joints."""
     movable: Mapping[str, Body] = field(default_factory=dict)
-    """Those of these links that held joints move, each without its own attached links, in the frame of this joint's
-    link.
+    """The links of `fixed` that held joints move, in the frame of this joint's link. Each excludes the links attached
+    to it.
     """
 
 
@@ -106,7 +106,7 @@ class ArmDescription:
     doubts: tuple[str, ...]
     """Warnings about implausible inertias and physics that is not modelled, one sentence each."""
     gravity: tuple[float, float, float] | None = None
-    """Gravity that the file gives in the base's frame [m/s^2]; None if it gives none or its format's usual one."""
+    """Gravity in the base's frame as given in the file [m/s^2]; None if the file gives none or the format's default."""
 
     @property
     def parameters(self) -> Array:

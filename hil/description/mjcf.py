@@ -25,7 +25,8 @@ USUAL_GRAVITY = (0.0, 0.0, -9.81)
 
 
 def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
-    """The arm of these joints, from the base outwards; of all hinges if none are named. The base is MuJoCo's world.
+    """Read the arm formed by these joints, from the base outwards; by default, by all hinges. The base is MuJoCo's
+    world.
 
     Raises ArmFileError as `hil.description.urdf.read_urdf` does, and if MuJoCo is not installed.
     """
@@ -74,7 +75,7 @@ class Geom:
 
 
 def read_geoms(path: Path, joints: Sequence[str]) -> list[Geom]:
-    """The shapes of the arm of these joints and of what is fixed to the world, without planes.
+    """Read the shapes of the arm formed by these joints, and those fixed to the world, except planes.
 
     Shapes without contacts, such as visual ones, are used only for links that have no others. Raises
     ArmFileError.

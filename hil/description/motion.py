@@ -36,9 +36,10 @@ def moves(arm: ArmDescription, angles: Array, joint: int, up: Array | tuple[floa
 
 
 def _towards(vector: Array, up: Array) -> str:
-    """Name the base's axis that is nearest to a vector, and the direction of this axis for someone beside the arm.
+    """Name the base's axis that is nearest to a vector, and the direction of this axis for an observer next to the
+    arm.
 
-    They look along the base's x axis or, where that is vertical (a base on a wall), along its z axis.
+    The observer looks along the base's x axis or, if that is vertical (a base on a wall), along its z axis.
     """
     upwards = int(np.argmax(np.abs(up)))
     forwards = 0 if upwards != 0 else 2

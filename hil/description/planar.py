@@ -11,8 +11,8 @@ ALIGNED = 1e-3  # rad: directions closer than this count as the same
 def is_planar(arm: ArmDescription, gravity: Array) -> bool:
     """Whether the planar model applies to the arm: one or two joints with parallel axes.
 
-    With gravity, the axes must also be horizontal, and at angle zero the first link must be horizontal and be lifted by
-    positive angles. `gravity`: gravity in the base's frame (3,) [m/s^2].
+    With gravity, the axes must also be horizontal. At angle zero the first link must be horizontal, and positive angles
+    must lift it. `gravity`: gravity in the base's frame (3,) [m/s^2].
     """
     if len(arm.joints) > PLANAR_JOINTS:
         return False

@@ -32,20 +32,20 @@ class AmplitudeOptions:
     max_polishing_rounds: int = 4
     """Maximum number of final torque increases, one joint at a time."""
     close: float = 0.94
-    """Fraction of the limits, at the required probability, at which they count as reached."""
+    """Fraction of the limits from which on they count as reached, evaluated at the required probability."""
     over: float = 0.97
     """Fraction of the limits that the next iteration aims at if the last torque exceeded them."""
     under: float = 0.99
     """Fraction of the limits that the next iteration aims at if the last torque did not reach them."""
     max_ratio: float = 2.0
-    """Maximum ratio of the torques of two iterations."""
+    """Maximum ratio of the torques of two successive iterations."""
     damping: float = 0.85
     """Factor by which the exponent of the corrections decreases from one iteration to the next."""
     min_exponent: float = 0.4
     least_change: float = 0.005
     """Relative change of the torque below which another iteration is not worth its simulations."""
     polishing_ratio: float = 1.06
-    """Ratio by which one of the final increases raises a joint's torque."""
+    """Factor by which each of the final increases raises a joint's torque."""
     back_off: float = 0.93
     """Factor on the torque when the check on all arms has failed."""
     torque_share: float = 0.97
@@ -53,7 +53,7 @@ class AmplitudeOptions:
     initial_share: float = 0.125
     """Initial torque, relative to what the current limits allow."""
     initial_safe_share: float = 0.25
-    """Torque that is assumed to be safe until a larger one is found to be, relative to the initial one."""
+    """Torque, relative to the initial one, that is assumed to be safe until the search finds a larger safe torque."""
 
 
 DEFAULTS = AmplitudeOptions()
@@ -159,7 +159,8 @@ def _search(
 def _polished(
     reached_with: Callable[[Array], Array], torque: Array, reached: Array, most: Array, options: AmplitudeOptions
 ) -> Array:
-    """Raise the joint that uses the least of its limits in small steps while all joints stay within their limits.
+    """Raise the torque of the joint that uses the least of its range, in small steps, while all joints stay within
+    limits.
 
     reached: fraction of the allowed range that each joint uses with `torque`.
     """

@@ -1,7 +1,8 @@
 """Prior ensemble of spatial arms, before anything was identified.
 
-Each link's mass, centre of mass and inertia are drawn around its description, friction and rotor inertia around typical
-values of its servos. `[arm.prior] spread` is the relative standard deviation of the described masses.
+Each link's mass, centre of mass and inertia are drawn around their described values; friction and rotor inertia are
+drawn around typical values of the servos. `[arm.prior] spread` is the relative standard deviation of the described
+masses.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
-"""Simulated stops of a spatial arm: lowered if its servos still accept commands, falling if they do not.
+"""Simulated stops of a spatial arm, which is lowered if its servos still accept commands, and falls if they do not.
 
-Stops are simulated from times spread over the planned path, on arms of the ensemble: the path home as the stream would
-command it, and the fall without torque until the first collision.
+Stops begin at times spread over the planned path, on arms of the ensemble. For each one, the path home is simulated as
+the stream would command it, and the fall without torque until the first collision.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,8 @@ class LoweringForeseen:
     """Predicted lowering.
 
     seconds: longest duration [s]. nearest: smallest clearance. lies: fraction of simulations that end in the rest pose.
-    joint: name of the joint that ends farthest from it, `away` [rad]. helps: what to do about that joint.
+    joint: name of the joint that ends farthest from its rest angle, by `away` [rad]. helps: what to do about that
+    joint.
     """
 
     seconds: float

@@ -34,8 +34,8 @@ class Ensemble:
     """An ensemble of possible arms.
 
     physics: parameters of each arm. torque_scale: ratio of actual to commanded torque (arms, joints), because the
-    torque constant is uncertain too; 1 for a result, whose parameters are in units of the commanded torque. source:
-    "prior" or "result".
+    torque constant is uncertain too; 1 for arms drawn from a result, because its parameters are in units of the
+    commanded torque. source: "prior" or "result".
     """
 
     physics: tuple[Physics, ...]
@@ -89,7 +89,7 @@ def _joints(count: int) -> str:
 
 
 def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
-    """Draw arms from a result, whose covariance is widened by the model error that the residual indicates.
+    """Draw arms from a result. Its covariance is widened by the model error that the residual indicates.
 
     farther: ratio of the range of motion to be simulated to the range used for identification.
     """

@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 QUANTITIES = ("lowest position", "highest position", "velocity", "current", "torque", "power")
 UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")
 GUARDED = 3
-"""The guard stops at the limits of this many quantities, counted from the first; current is clamped, the others follow
-from it.
+"""Number of quantities, counted from the first, at whose limits the guard stops the arm. Current is clamped instead;
+the others follow from it.
 """
 
 QUANTILE = 0.99
@@ -67,7 +67,7 @@ class Prediction:
 
     @property
     def quantile(self) -> Array:
-        """Bounds within which all peaks of an arm lie in 99 of 100 arms (quantities, joints).
+        """Bounds that contain all peaks of 99 out of 100 arms (quantities, joints).
 
         All bounds are the same number of deviations above their medians, so that they change smoothly with the
         amplitude.
@@ -142,7 +142,7 @@ def predict(
         pose: where the arm starts at rest (joints,) [rad]; by default the rest pose.
         briefly: simulate only one period of each multisine; used during a search.
         shown: number of arms whose motion is stored.
-        executor: executor that simulates the arms, some at a time; the result is the same with and without it.
+        executor: executor that simulates the arms in groups; it does not change the result.
     """
     commands = [commands_of(config, segment) for segment in plan.segments]
     start = np.array(config.arm.rest_pose) if pose is None else pose

@@ -1,7 +1,8 @@
-"""Joints of a spatial arm that lie on their own mechanical stop in the rest pose, which no configuration states.
+"""Joints of a spatial arm that lie on their own mechanical stop in the rest pose; the configuration does not say
+which.
 
-In the rest pose an arm lies without torque. It is carried by a surface (floor, cradle, another link) or by the joints'
-own stops. A surface is left behind as the arm moves; a stop holds its joint wherever the others are.
+In the rest pose an arm lies without torque. It is supported by a surface (floor, cradle, another link) or by the
+joints' own stops. Moving the arm can lift it off a surface; a stop holds its joint wherever the others are.
 """
 
 import numpy as np
@@ -20,16 +21,16 @@ NEAR_STOP_RAD = 0.14
 
 
 PASSED_RAD = 0.05
-"""A joint that was this far beyond its rest pose does not lie on its stop there: no stop gives way as much [rad]."""
+"""A joint that has been this far [rad] beyond its rest pose does not lie on a stop there: no stop yields that much."""
 
 
 def resting_stops(config: Config, arms: ChainArms, passed: NDArray[np.bool_] | None = None) -> Array:
     """Side on which each joint lies on its stop (joints,): -1 at its smallest angle, 1 at its largest, 0 if on neither.
 
-    It does if its rest pose is near the end of its range, nothing else touches the part of the arm that it moves, and
-    gravity does not pull it away from there. A support that the description lacks looks the same until the joint has
-    moved beyond its rest pose. passed: whether each joint has (-, + side; joints), as `passed_rest` returns it. Raises
-    ArmFileError.
+    A joint is assumed to lie on its stop if its rest pose is near the end of its range, nothing else touches the part
+    of the arm that it moves, and gravity does not pull it away from there. A support missing from the description looks
+    the same until the joint has moved beyond its rest pose. passed: on which sides each joint has done so, as
+    `passed_rest` returns it (2, joints). Raises ArmFileError.
     """
     rest = np.array(config.arm.rest_pose)
     low, high = _ends(config, rest)

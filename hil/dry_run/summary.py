@@ -21,8 +21,8 @@ class FirstRun:
     """The first run of a pilot.
 
     peak_torque: peak torques (joints,) [N m]. prediction: peaks of the simulated arms, with the limits of that run.
-    played: its configuration, with a proposed stabiliser where the arm needs one, and with position limits close to the
-    rest pose where no torque is safe in the whole range.
+    played: its configuration. If the arm needs a stabiliser, it contains the proposed one; if no torque is safe in the
+    whole range, its position limits are closer to the rest pose.
     """
 
     peak_torque: NDArray[np.float64]
@@ -55,7 +55,7 @@ class DryRun:
 
     @property
     def shown(self) -> Prediction:
-        """The prediction for the configured torque, else for the largest safe torque, else for the first run."""
+        """The prediction for the configured torque or, without one, for the largest safe torque or the first run."""
         if self.asked is not None:
             return self.asked
         if self.largest is not None:
@@ -234,7 +234,7 @@ def _list(values: NDArray[np.float64], digits: int = 2) -> str:
 
 
 def _percent(chance: float) -> str:
-    """A percentage; the far tail of a few hundred arms has no digits."""
+    """A percentage; "below 0.01 %" in the far tail, which a few hundred arms cannot resolve."""
     if chance < 1e-8:
         return "0 %"
     return "below 0.01 %" if chance < 1e-4 else f"{100 * chance:.2g} %"

@@ -1,7 +1,8 @@
 """The speed that the supply allows: near no-load speed, a motor cannot carry the commanded current in either direction.
 
-A run whose currents fall short of their goals determines nothing, so a dry run and the pilot keep joints below this
-speed, whatever velocity_limit says. In PWM mode the back-EMF is part of the model, and no such limit is needed.
+If the currents fall short of their goals, a run determines nothing. The dry run and the pilot therefore keep joints
+below this speed, whatever velocity_limit says. In PWM mode the back-EMF is part of the model, and no such limit is
+needed.
 """
 
 from hil.config.joint import JointConfig

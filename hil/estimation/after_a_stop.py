@@ -31,7 +31,9 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
 
 
 def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
-    """What is kept after the guard or a failed servo ended a run, and a next command that checks the arm first."""
+    """Sentences about what is kept after the guard or a failed servo stopped a run; the last one is the next
+    command.
+    """
     if can_be_estimated(run.path):
         return ["The recording is kept and complete enough for an estimate.", next_step("estimate", run.path)]
     return [f"The recording up to that point is kept in {run.path}.", next_step("check", shown)]

@@ -45,7 +45,7 @@ class CalibrationFit:
     """Quality of the fit.
 
     residual_rms_ticks: residuals of both runs in encoder steps RMS. misfit: weighted sum of squared residuals per
-    sample; 1 is noise alone. joints: number of joints. reached: whether the fit has reached its minimum.
+    sample; 1 means noise alone. joints: number of joints. reached: whether the fit has reached its minimum.
     """
 
     residual_rms_ticks: tuple[PerJoint, ...]

@@ -119,9 +119,9 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
 def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
     """The model requested by the configuration.
 
-    Links moved by several joints couple these joints' torques, so inexact torque constants contradict each other: their
-    ratios are parameters wherever the configuration gives an uncertainty. Each joint has its own lag: servo models
-    differ, and neglected differences of half a millisecond make inertias of light joints wrong by several percent.
+    A link moved by several joints couples their torques, so inexact torque constants contradict each other. Their
+    ratios are therefore parameters wherever the configuration gives an uncertainty. Each joint has its own lag: servo
+    models differ, and neglecting half a millisecond makes the inertias of light joints wrong by several percent.
     """
     wanted = config.model
     scales = known.base.chain.joints > 1 and (wanted.torque_scale or known.prior.scale_precision is not None)
@@ -282,7 +282,9 @@ def about_zeros(config: Config, estimate: ChainEstimate) -> str:
 
 
 def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_prior: tuple[str, ...]) -> str:
-    """Name base parameters, besides `from_prior`, with standard errors larger than the prior's; empty if none."""
+    """Name the base parameters, other than those in `from_prior`, with standard errors larger than the prior's; empty
+    if none.
+    """
     found = [name for name in prior.surpassing(names, std) if name not in from_prior]
     if not found:
         return ""

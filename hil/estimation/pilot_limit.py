@@ -1,4 +1,4 @@
-"""The limit that determined the torque of a pilot: advice to raise peak_torque would not help then."""
+"""The limit that determined the torque of a pilot. In such a run, advice to raise peak_torque would not help."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,9 +8,8 @@ from hil.drivers.servo_model import Mode
 
 
 def torque_limit(config: Config, samples: NDArray[np.void], index: int | None = None) -> str:
-    """The setting whose limit the joint `index`, or any joint, came closest to, and the share of it that was used.
-
-    Without a pilot it is "", since the user gave peak_torque.
+    """Return the setting of the limit that joint `index`, or any joint, came closest to, and the fraction of it that
+    was used. Without a pilot, the setting is "", since the user gave peak_torque.
     """
     if not config.experiment.pilot or not len(samples):
         return ""

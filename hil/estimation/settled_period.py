@@ -19,8 +19,8 @@ from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
 
 _AROUND_S, _FEWEST_AROUND = 0.04, 4
-"""Time before and after a sample whose readings determine its velocity [s], and the minimum number of them on either
-side.
+"""A sample's velocity is determined from the readings within this time [s] before and after it. Second value: minimum
+number of readings on either side.
 """
 
 
@@ -132,8 +132,8 @@ def _stabilised(config: Config, rows: NDArray[np.void], torque: NDArray[np.float
 
 
 def scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Standard deviation of each joint's mean over periods, (periods, joints, samples) to (joints,) [rad]; None for a
-    single period.
+    """Standard deviation of the mean over periods for each joint (joints,) [rad], from (periods, joints, samples); None
+    for a single period.
     """
     count = len(position)
     if count < 2:

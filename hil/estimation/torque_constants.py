@@ -17,7 +17,7 @@ RATIO = "torque_scale"
 USUAL_RATIO_STD = math.hypot(USUAL_TORQUE_SPREAD, USUAL_TORQUE_SPREAD)
 CONTRADICTORY = 2.0  # standard deviations, those of the torque constants and of the ratio combined
 Source = Literal["constant", "column"]
-"""What states the torque of a joint: its torque constant, or a column of a recording."""
+"""Where a joint's torque comes from: its torque constant, or a column of a recording."""
 _STATES: dict[Source, str] = {"constant": "torque constants", "column": "torque columns"}
 _CHECK: dict[Source, str] = {
     "constant": "check the model and the torque_constant of both joints, or measure the constants with `hil calibrate`",
@@ -94,7 +94,7 @@ def contradictions(
 
     joints: names. extra: terms of a result that include the ratios, if there are any. ratio_std: relative standard
     deviation of the ratio of the torque constants, by parameter, where given; otherwise it is that among servos of one
-    model. known: contradictions that say so themselves.
+    model. known: contradictions that have sentences of their own.
     """
     said = {each.name for each in known}
     found = []
@@ -115,7 +115,7 @@ def contradictions(
 def ratios_said(
     joints: Sequence[str], extra: Mapping[str, Quantity], source: Source, without: Sequence[str]
 ) -> tuple[str, ...]:
-    """A sentence on the ratios of the torques; () if `without`, sentences, says it already."""
+    """A sentence on the ratios of the torques; () if one of the sentences `without` already gives them."""
     ratios = [(joint, ratio) for joint, _, ratio in _ratios(joints, extra)]
     if not ratios or without:
         return ()

@@ -59,21 +59,21 @@ def back_emf(config: Config, fake: FakeArm, drives: Sequence[Drive]) -> dict[str
 class Truth:
     """True values, scaled to the file's torque constants. note: how they differ from the arm's own; "" if they do not.
 
-    Values that several joints' torques determine are left out if the constants of these joints are wrong by different
-    factors: no single factor converts such a value.
+    A value that depends on the torques of several joints is left out if the constants of these joints are wrong by
+    different factors: no single factor converts it.
     """
 
     values: dict[str, float]
     note: str
 
     def standard_errors(self, name: str, found: Quantity) -> float | None:
-        """The error of an estimate in its own standard errors; None if there is no truth or no standard error."""
+        """The error of an estimate in units of its standard error; None if there is no truth or no standard error."""
         if name not in self.values or not 0.0 < found.std < math.inf:
             return None
         return (found.value - self.values[name]) / found.std
 
     def is_determined(self, name: str, found: Quantity) -> bool:
-        """Whether the parameter is known so well that its error relative to its true value means something."""
+        """Whether the parameter is known well enough for its relative error to be meaningful."""
         return name in self.values and found.std <= _DETERMINED * abs(self.values[name])
 
 
@@ -111,7 +111,9 @@ def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str
 
 
 def _torque_ratios(config: Config) -> list[float]:
-    """Torque per goal according to the file over that of the fake arm's motors, per joint; 1 if that is unknown."""
+    """Torque per goal according to the file, divided by that of the fake arm's motors, per joint; 1 if the latter is
+    unknown.
+    """
     fake = config.fake
     arm = None if not config.is_fake or fake is None else fake.arm or fake.chain
     if fake is None or arm is None:

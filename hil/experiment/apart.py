@@ -2,10 +2,8 @@
 
 Two servos on one joint are coupled by their horns. A horn that slips, a loose screw or a broken gear lets one of them
 turn without the other, which the joint's angle, taken from the first servo, does not show. The difference between their
-angles is compared with what it was at the first sample, because horns are mounted at any angle.
-
-If the direction of one of them is wrong, they work against each other and the joint does not turn at all, which looks
-like an obstacle.
+angles is compared with what it was at the first sample, because horns are mounted at any angle. If the direction of one
+of them is wrong, they work against each other and the joint does not turn at all, which looks like an obstacle.
 """
 
 from collections.abc import Sequence
@@ -18,7 +16,7 @@ ALLOWED_RAD = 0.1
 
 
 def opposed(joint: Joint) -> str:
-    """Ask whether a joint's two servos work against each other; "" if it has one servo."""
+    """Return the question whether a joint's two servos work against each other; "" if it has one servo."""
     if not joint.seconds:
         return ""
     signs = [joint.direction, *(second.direction for second in joint.seconds)]
@@ -39,7 +37,8 @@ class Apart:
         self._first: dict[tuple[int, int], float] = {}
 
     def look(self, apart: Sequence[Sequence[float]]) -> tuple[int, int, float] | None:
-        """Process a sample; return joint, additional servo (both from 0) and change [rad] if they no longer agree.
+        """Process a sample. If two servos no longer agree, return joint and additional servo (both from 0) and change
+        [rad].
 
         apart: angles of each joint's other servos minus the first's [rad], NaN if one did not reply.
         """

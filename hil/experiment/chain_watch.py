@@ -3,9 +3,9 @@
 Prior knowledge is the ensemble's mean and inflated covariance. The ensemble is drawn around the description, and
 updated after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
 A joint at a standstill at its rest angle is judged only by torques that would move it towards the side on which it has
-been: on the way home it may reach its end stop before the other joints reach theirs. A joint that has been on both
-sides of its rest angle has no stop there. A joint that has not left its rest angle yet may rest against a stop on the
-side to which gravity pulls it: it is judged only while it is commanded to that side.
+been, because on the way home it may reach its end stop before the other joints do. A joint that has been on both sides
+of its rest angle has no stop there. A joint that has not left its rest angle yet may rest against a stop on the side to
+which gravity pulls it: it is judged only while it is commanded to that side.
 """
 
 import math

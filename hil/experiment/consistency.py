@@ -18,9 +18,9 @@ servo are known:
 A reading that jumps back and forth, as with a stuck bit, cancels in those memories. Therefore each single interval is
 also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
 
-A velocity that stays exactly the same was the joint's true velocity throughout, except for the last `LAG_S` at most. So
-the distance covered up to then must equal the velocity times the time. This detects a velocity that freezes near its
-peak sooner than the memories do, in which a lag could explain the difference.
+If the reported velocity stays exactly the same, it was the joint's true velocity all that time, except for the last
+`LAG_S` at most. The distance covered before these must therefore equal velocity times time. This detects a velocity
+that freezes near its peak sooner than the memories do, in which a lag could explain the difference.
 
 Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to twice the
 values estimated by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
@@ -44,7 +44,9 @@ SHORT_S, LONG_S = 0.3, 1.2
 """Time constants of the memories [s]."""
 
 LONG_EVERY_S = 0.0099
-"""Shortest interval after which the long fading memory is updated [s]: that of 100 Hz, despite rounding errors."""
+"""Shortest interval after which the long fading memory is updated [s]: that of 100 Hz, less a margin for rounding
+errors.
+"""
 
 UNSURE_RAD, LONG_UNSURE_RAD = 0.02, 0.045
 """Tolerances of the two memories [rad]: for rounding, encoder noise, and a velocity that is rounded towards zero."""
@@ -77,10 +79,10 @@ reach back by `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
-"""Velocity below which it may well stay the same while a joint sticks and slips, and its resolution [rad/s]."""
+"""Velocity below which readings may stay the same while a joint sticks and slips, and their resolution [rad/s]."""
 
 LONGEST_GAP_S = 0.06
-"""Time between two exchanges beyond which the velocity in between is unknown [s]; 20 Hz on a slow bus needs less."""
+"""Time between two exchanges beyond which the velocity in between is unknown [s]; longer than an interval at 20 Hz."""
 
 SCALE, MORE_SCALE = 0.06, 0.02
 CURVED = 0.35
@@ -89,8 +91,8 @@ samples per period, the fastest that is used, needs 0.27.
 """
 
 CURVED_AT_FIRST = 0.3
-"""That allowance as a fraction of the motion, for the first interval: over the peak of such a wave the velocity does
-not change from sample to sample, and no earlier change shows how fast it may.
+"""Allowance for the first interval, as a fraction of the motion. Around the peak of such a wave, two successive samples
+may have the same velocity, and there is no earlier change to compare with.
 """
 
 

@@ -33,9 +33,11 @@ class Deadlines:
         self._often = 0.0
         self._heard_instead = heard_instead
         self._counted = self._waited = 0
-        """Missed deadlines that make up `_often`, and those missed while waiting for a reply that never came."""
+        """Missed deadlines that `_often` counts, and how many of them were missed while waiting for a reply that never
+        came.
+        """
         self.any_missed = False
-        """Whether some missed deadlines are not yet offset by deadlines met since."""
+        """Whether some deadlines have been missed recently, i.e. are not yet offset by deadlines met since."""
 
     def missed(self, seconds: float = 0.0, *, waited: bool = False) -> None:
         """Record a missed deadline, `seconds` after the last command.

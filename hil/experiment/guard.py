@@ -42,7 +42,9 @@ BELOW_VOLTAGE = 0.9
 """Speed that is proposed as a limit, relative to one at which the supply could not drive the commanded current."""
 
 _ERRORS_IN_A_ROW = 3
-"""Consecutive replies with values and an error number at which a servo is stopped; it may not accept its goals."""
+"""Number of consecutive replies with values and an error number after which the arm is stopped: that servo may not
+accept its goals.
+"""
 
 NONE_HEARD = "No servo was heard"
 """Beginning of the message of a stop due to missing replies from all servos."""
@@ -58,8 +60,8 @@ class Guard:
 
     heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did.
 
-    left_by_a_run: whether the arm is where an immediately preceding run left it. One that was stopped at a limit may
-    have come to rest slightly beyond it: such a joint may move back in, but no farther out.
+    left_by_a_run: whether the arm is where an immediately preceding run left it. If that run was stopped at a limit, a
+    joint may have come to rest slightly beyond it: such a joint may move back in, but no farther out.
 
     recent: the exchanges so far, if another guard has checked them.
     """
@@ -130,7 +132,8 @@ class Guard:
     def look(self, state: State, watchdog_gap: float = 0.0, *, between: bool = False) -> None:
         """Check one exchange. Raises SafetyStop when a limit is exceeded or a reply is inconsistent.
 
-        watchdog_gap: time since the previous exchange [s]. between: it took place between two samples.
+        watchdog_gap: time since the previous exchange [s]. between: whether this exchange took place between two
+        samples.
         """
         self.recent.add(state)
         now = state.time_before_write
@@ -219,7 +222,9 @@ class Guard:
         said[check](index, state)
 
     def rests_at(self, positions: Sequence[float]) -> None:
-        """The joints' angles before torque was switched on [rad]; by default, those of the first sample."""
+        """Set the joints' angles before torque was switched on [rad]; by default, those of the first sample are
+        used.
+        """
         self._resting = positions
 
     def look_at_rest(self, state: State) -> None:

@@ -14,7 +14,9 @@ from hil.setup.by_hand import Moved, Pose
 
 
 def print_pose(config: Config, pose: Pose) -> None:
-    """Print the angles in the description's convention, which way each joint moves the end, and the end's position."""
+    """Print each joint's angle in the description's convention and the direction in which it moves the arm's end; then
+    print the end's position.
+    """
     arm, angles = described_arm(config), np.array(pose.angles)
     table = Table(title=f"{escape(arm.path.name)} as read from the bus", title_justify="left")
     for heading in ("joint", "ID", "angle rad", "degrees", "limits rad", "a positive angle"):

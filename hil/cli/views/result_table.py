@@ -18,7 +18,7 @@ from hil.results.parts import Quantity
 from hil.results.result import Result, SettledResult, ShootingResult
 
 _NOTHING = 0.01
-"""Fraction of a standard error below which a true value is practically 0, so that a relative error is meaningless."""
+"""A true value below this fraction of a standard error is practically 0; its relative error would be meaningless."""
 
 _MOST_NAMED = 3
 """Largest number of tried models that are all listed by name."""

@@ -1,10 +1,10 @@
 """Comparison of two identifications of one arm: which parameters changed significantly.
 
-Every common parameter is tested on its own, z = difference / sqrt(std_a^2 + std_b^2), the friction of each joint
-also as a whole (hil.estimation.changes.friction_change), and Holm's step-down correction
-keeps the probability of any false alarm in the whole table at `false_alarms` (S. Holm, Scandinavian Journal of
-Statistics 6 (1979) 65). A change must also be larger than `least_share` of the parameter's scale: standard errors cover
-noise only, and two runs of an arm with some unmodelled friction differ by a little more.
+Every common parameter is tested on its own: z = difference / sqrt(std_a^2 + std_b^2). The friction of each joint is
+also tested as a whole (hil.estimation.changes.friction_change). Holm's step-down correction keeps the probability of
+any false alarm in the whole table at `false_alarms` (S. Holm, Scandinavian Journal of Statistics 6 (1979) 65). A change
+must also be larger than `least_share` of the parameter's scale: standard errors cover noise only, and two runs of an
+arm with some unmodelled friction differ by a little more.
 """
 
 import math
@@ -29,7 +29,8 @@ _POWER_Z = 1.645
 
 @dataclass(frozen=True)
 class Change:
-    """The change of one parameter: values, standard errors, difference in combined standard errors, and p-value.
+    """The change of one parameter: values, standard errors, difference in units of the combined standard error, and
+    p-value.
 
     changed: whether it is significant after Holm's correction and larger than the minimum share of its scale.
     """
@@ -65,8 +66,8 @@ class Difference:
     detectable: Mapping[str, float] = field(default_factory=dict)
     trust: tuple[str | None, str | None] = (None, None)
     other_joints: tuple[str, ...] = ()
-    """One sentence per joint that is described differently, since the arms may differ, or on a run compared with
-    itself.
+    """Warnings: one sentence per joint with a different description (perhaps another arm), or one about a run compared
+    with itself.
     """
 
     @property
@@ -197,7 +198,7 @@ def _z(before: ArmModel, after: ArmModel, name: str) -> float:
 
 
 def _deviation(value: tuple[float, float], stds: tuple[float, float]) -> float:
-    """Difference of two values in their combined standard errors."""
+    """Difference of two values in units of their combined standard error."""
     difference = value[1] - value[0]
     std = math.hypot(*stds)
     if not math.isfinite(std):

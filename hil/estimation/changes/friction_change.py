@@ -1,15 +1,16 @@
 """Whether one joint's friction changed between two runs, tested with the joint covariance of its parameters.
 
 Coulomb friction, its rise at low speed and the speed at which it falls are known far better jointly than individually:
-a change of one of them by 10 % may be less than its own standard error and still be obvious. With d, the difference of
-the joint's friction parameters, and S, the sum of both runs' covariances of them, two kinds of question are asked.
+a change of one of them by 10 % may be less than its own standard error and still be obvious. Let d be the difference of
+the joint's friction parameters between the runs, and S the sum of their covariances in both. Two kinds of question are
+asked.
 
 one term alone    Did only term i change? The most powerful test is z_i = (S^-1 d)_i / sqrt((S^-1)_ii), and
                   (S^-1 d)_i / (S^-1)_ii is the change that this implies (generalised least squares).
 several at once   Is d anything but noise? d' S^-1 d has a chi-square distribution.
 
-The covariances are marginal ones: changes of inertia, gravity or another joint do not count. Friction itself does
-not repeat exactly from run to run, which no covariance of a single run contains: `repeatability` is added to S.
+The covariances are marginal ones: changes of inertia, gravity or another joint do not count. Friction itself varies
+slightly from run to run, which the covariance of a single run does not contain: `repeatability` is added to S.
 """
 
 import math
@@ -28,7 +29,9 @@ from hil.results.parts import Covariance
 Array = NDArray[np.float64]
 
 KINDS = ("viscous", "coulomb", "coulomb_width", "stribeck_rise", "stribeck_velocity", "load", "viscous_asymmetry")
-"""Terms of friction in motion, and the width of its step, which the data determine only together with the rise."""
+"""Terms of sliding friction, and the width of the Coulomb step, which the data determine only together with the
+rise.
+"""
 REPEATABILITY = 0.005
 """Standard deviation of a friction parameter from run to run of an unchanged arm, relative to its value."""
 
@@ -37,9 +40,9 @@ REPEATABILITY = 0.005
 class FrictionChange:
     """The friction of one joint in two runs.
 
-    term: the one whose change alone explains the difference best. before, after: its values if nothing else in the
-    joint's friction changed. std: standard error of that change [unit of the term]. z: change in standard errors.
-    p: probability of a difference like this in an unchanged joint, whatever term it shows in. stds: standard error of
+    term: the term that explains the difference best if it alone changed. before, after: its values if nothing else in
+    the joint's friction changed. std: standard error of that change [unit of the term]. z: change in standard errors.
+    p: probability of a difference like this, in any term, if the joint is unchanged. stds: standard error of
     the change of each term alone [unit of the term].
     """
 

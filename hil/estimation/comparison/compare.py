@@ -91,7 +91,9 @@ def _compare_chain(run: RunFolder, config: str, mujoco: bool) -> Comparison:
 
 
 def truth_for(peer: Peer, truth: Mapping[str, float] | None, config: Config) -> Mapping[str, float] | None:
-    """The truth, scaled like a method's result, as for `hil identify`."""
+    """Return the true parameters, scaled to the torque constants that a method's result assumes, as for `hil
+    identify`.
+    """
     return None if truth is None else in_file_unit(truth, config, peer.parameters, len(config.joints)).values
 
 

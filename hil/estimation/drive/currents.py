@@ -1,4 +1,4 @@
-"""Currents that differ from the commanded ones: clipped, or not those of this program's goals.
+"""Currents that differ from the commanded ones: they were clipped, or this program's goals did not cause them.
 
 A clipped current is smaller than a large goal, follows a small one, and never opposes it. Any other deviation has
 another cause: goals were changed on the way or by another program, or the reported current is wrong. The torque that
@@ -17,22 +17,26 @@ from hil.runs.recording import Phase
 Array = NDArray[np.float64]
 
 LARGE = 0.5
-"""Goals relative to the largest above which they are large; smaller ones say little about clipping."""
+"""Goals above this fraction of the largest one count as large; smaller ones say little about clipping."""
 
 SHORT = 0.85
 """Ratio of measured to commanded current below which the current was clipped."""
 
 OFTEN = 0.05
-"""Fraction of the samples with large goals that is reported."""
+"""Fraction of the samples with large goals from which on clipping is reported."""
 
 _RECENT = 4
 """Number of latest goals, any of which a lagging current may still follow."""
 
 _BEYOND, _BEYOND_OFTEN = 0.25, 0.02
-"""Deviation from all recent goals and from 0, relative to the largest goal, and the fraction of samples reported."""
+"""A current was not the commanded one if it deviates this much from all recent goals and from 0, relative to the
+largest goal. This is reported if it applies to more than the second value, a fraction of the samples.
+"""
 
 _SMALL, _LEAST = 0.5, 0.1
-"""Range of goals relative to the largest current that was carried, in which nothing clips."""
+"""Highest and lowest goals that cannot be clipped but are large enough to judge, relative to the largest measured
+current.
+"""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """A supply that sags under load: detected from the servos' Present Input Voltage, and its effect on the torque.
 
-The bridge of a motor that receives the voltage u (or the current i) at the velocity v draws a current proportional to
-u^2 and u v (i^2 and i v) from the supply, whose resistance turns it into a drop. The register is read only a few times
-a second, in steps of 0.1 V. A regression of its readings on these products over the whole recording nevertheless gives
-the drop at every sample.
+A motor at the velocity v draws a supply current with terms in u^2 and u v if it is driven with the voltage u, or in i^2
+and i v if it is driven with the current i. The resistance of the supply turns this current into a voltage drop. The
+register is read only a few times a second, in steps of 0.1 V. A regression of its readings on these products over the
+whole recording nevertheless gives the drop at every sample.
 
 A voltage-driven joint receives its duty cycle times the supply voltage of that moment: its torque sags with it. A
 current-driven joint is not affected as long as its servo can still drive the current.
@@ -35,8 +35,7 @@ class Sag:
     """A supply that sags.
 
     volts: voltage at each servo without load (joints,) [V]. by_square, by_product: drop per goal squared and per goal
-    times velocity of each joint (joints,). worst: drop at full load [V]. volts and goals as recorded [A, or V under
-    PWM].
+    times velocity of each joint (joints,). worst: drop at full load [V]. Goals are in A, or in V under PWM.
     """
 
     volts: Array
@@ -86,7 +85,7 @@ def by_voltage(config: Config) -> NDArray[np.bool_]:
 
 
 def torque_factor(config: Config, sag: Sag | None, samples: NDArray[np.void]) -> Array:
-    """Torque relative to that of a stiff supply (samples, joints)."""
+    """Torque relative to that with a constant supply voltage (samples, joints)."""
     if sag is None:
         return np.ones(samples["goal_current"].shape)
     return np.where(by_voltage(config), sag.remaining(samples), 1.0)

@@ -70,7 +70,8 @@ def _jumps(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> list[l
 
 
 def position_jumps(time: Array, position: Array, velocity: Array, step: float) -> list[tuple[float, float]]:
-    """Times [s] and sizes [rad] of jumps far outside the usual differences between position and integrated velocity.
+    """Find jumps: differences between position and integrated velocity far larger than usual. Returns times [s] and
+    sizes [rad].
 
     Args:
         time: sampling times (samples,) [s].

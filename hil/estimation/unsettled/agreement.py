@@ -1,4 +1,4 @@
-"""Whether several recordings show the same arm: a load changed between them must not be taken for a missing term."""
+"""Whether several recordings show the same arm: a load changed between them must not be mistaken for a missing term."""
 
 from collections.abc import Sequence
 
@@ -25,7 +25,7 @@ def disagreement(
 ) -> tuple[str, ...]:
     """A sentence if each recording by itself is explained much better than all together; () otherwise.
 
-    The encoder zeros are taken as unknown if they were in the common estimate.
+    The encoder zeros are treated as unknown if the common estimate includes them.
     """
     left = float(estimate.residual_over_noise.max())
     if not 1 < len(recordings) <= MOST or left <= UNEXPLAINED:

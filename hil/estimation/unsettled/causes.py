@@ -12,7 +12,8 @@ from hil.estimator.selection.verdict import MUCH_LEFT
 def causes(
     recordings: Sequence[Recording], names: Sequence[str], predicted: Sequence[Array], estimate: ShootingEstimate
 ) -> tuple[str, ...]:
-    """Sentences on the cause: a local defect, a torque that was limited, another clock, or at least the place.
+    """Sentences on the cause: a local defect, a clipped torque or a clock that drifts; otherwise, where the residual is
+    large.
 
     predicted: simulated positions of each recording (joints, samples) [rad].
     """

@@ -59,11 +59,11 @@ class Estimated:
 
 @dataclass(frozen=True)
 class Given:
-    """What is known of the drives and encoders beforehand.
+    """What is known about the drives and encoders beforehand.
 
-    torque_scale_std: see `hil.estimator.models.conflicts.conflicts`. zeros: whether the encoder zeros are those of a
-    configuration. names: names of the recordings. jumps: a sentence for each joint of a recording whose position
-    jumped. torque_source: what states the torques.
+    torque_scale_std: see `hil.estimator.models.conflicts.conflicts`. zeros: whether a configuration defines the encoder
+    zeros. names: names of the recordings. jumps: a sentence for each joint of a recording whose position jumped.
+    torque_source: where the torques come from.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
@@ -160,7 +160,7 @@ def estimate_any(
 
 
 def conflicts_in(estimate: ShootingEstimate, given: Given) -> tuple[Conflict, ...]:
-    """Values that are far from what is known beforehand."""
+    """Estimated values that are far from what is known beforehand."""
     names, value, std = [*estimate.names], [*estimate.value], [*estimate.std]
     if given.zeros:
         for zero, error in zip(estimate.zeros, estimate.zeros_std, strict=True):
@@ -170,7 +170,7 @@ def conflicts_in(estimate: ShootingEstimate, given: Given) -> tuple[Conflict, ..
 
 
 def joint_names(count: int) -> tuple[str, ...]:
-    """What `count` joints are called in sentences."""
+    """Names of `count` joints for use in sentences."""
     return tuple(f"joint {joint}" for joint in range(1, count + 1))
 
 

@@ -1,4 +1,5 @@
-"""Parts of a recording that no model explains although it explains the rest: where they are, and what they look like.
+"""Parts of a recording that the fitted model does not explain, unlike the rest: where they are, and what they look
+like.
 
 A reading that freezes, a torque that is missing, single wrong samples or a joint that hits a stop spoil an estimate.
 The residual alone would suggest wrong units or a missing term.
@@ -67,7 +68,9 @@ def local_defects(
 def local_residual(
     recordings: Sequence[Recording], names: Sequence[str], predicted: Sequence[Array], window: float
 ) -> tuple[str, ...]:
-    """One sentence for each joint whose residual is far above the usual one in a few places; as `local_defects`."""
+    """One sentence for each joint whose residual is far above the usual one in a few places; arguments as in
+    `local_defects`.
+    """
     return tuple(said for each in _joints(recordings, names, predicted, window) for said in _windows(each, window))
 
 

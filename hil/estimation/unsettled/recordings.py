@@ -1,4 +1,4 @@
-"""Estimates from other tools' files, whose results are in folders like those of runs."""
+"""Estimates from other tools' files; the results are stored in folders like those of runs."""
 
 import json
 import re
@@ -44,7 +44,8 @@ class _Read:
 
 
 def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder: Path | None) -> ShootingResult:
-    """The result of one or more separate recordings of the same arm; written into `folder`, which exists.
+    """Return the result of one or more separate recordings of the same arm, and write it into `folder`, which must
+    exist.
 
     Raises HilError, EstimationError.
     """

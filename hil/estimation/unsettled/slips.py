@@ -1,4 +1,4 @@
-"""Mistakes in recordings that are so clear that no estimate is made: it would take a minute and be useless."""
+"""Refusal of recordings with a clear mistake in their columns: an estimate would take a minute and be useless."""
 
 from collections.abc import Sequence
 
@@ -7,14 +7,14 @@ from hil.estimator.baselines.signs import suspect_absolute, suspect_order, suspe
 from hil.estimator.data.recording import Recording
 
 CLEAR = 0.25
-"""Largest torque residual with the mistake corrected, relative to that of the recording as given."""
+"""A mistake is clear only if its correction reduces the torque residual to less than this fraction."""
 
 WELL = 0.3
-"""Largest torque residual with the mistake corrected, relative to the torque."""
+"""A mistake is clear only if the torque residual after its correction is less than this fraction of the torque."""
 
 
 def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
-    """Raise CsvError if a sign is reversed, joints or torques are swapped, or an angle is measured from elsewhere."""
+    """Raise CsvError if a sign is reversed, joints or torques are swapped, or an angle has another origin."""
     absolute = suspect_absolute(recordings)
     if absolute is not None and _is_clear(*absolute):
         raise CsvError(

@@ -31,7 +31,7 @@ class Doubts:
 
 
 def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate, cause_known: bool = False) -> Doubts:
-    """What looks wrong in the recordings, or in how the estimate explains them.
+    """Find what looks wrong in the recordings, or in how the estimate explains them.
 
     cause_known: whether the verdict says why much of the motion is unexplained.
     """
