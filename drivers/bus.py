@@ -191,7 +191,7 @@ class ServoBus:
         """Ensure that no servo has torque on before anything is written.
 
         If one has, raises TorqueHeld, or lets the arm sink if `BusConfig.take_over` is set.
-        ours: joints that an earlier program of this user left with torque on; it is cut immediately.
+        ours: joints that an earlier program of this user left with torque on; their torque is cut immediately.
         """
         for joint in ours:
             if self._servos[joint].read("Torque Enable"):
@@ -352,7 +352,7 @@ class ServoBus:
 
     @property
     def commanded_by_another(self) -> str:
-        """Which servo held a value that this program did not write when goals were last read back; "" for none.
+        """Which servo held a value that this program did not write when goals were last read back; "" if none did.
 
         One such value does not prove another master: a servo that misses writes holds an older goal.
         """
@@ -371,7 +371,9 @@ class ServoBus:
         self.prepared.read_status_next()
 
     def check_alerts(self, state: State) -> None:
-        """Read the cause wherever a servo has raised its alert bit; raises ServoFault naming all of them."""
+        """Read the hardware error of every servo that has raised its alert bit; raises ServoFault, which names all of
+        them.
+        """
         raised = [joint for joint, error in zip(self.joints, state.error, strict=True) if error & ALERT]
         faults = [text for joint in raised if (text := self._faults(joint))]
         if faults:
@@ -467,7 +469,7 @@ class ServoBus:
         return self.torque_off_report
 
     def repeat_torque_off(self) -> None:
-        """Send torque off to all servos once more, without waiting for an answer, for one that does not answer yet."""
+        """Send torque off to all servos once more without waiting for an answer, in case a silent servo receives it."""
         tell_torque_off(self.port, self._servos)
 
     def confirm_later(self, drive: Joint) -> bool:

@@ -7,7 +7,8 @@ import time
 from typing import Protocol
 
 SPIN_S = 300e-6
-"""Before a deadline the wall clock stops sleeping this early and spins instead [s]; a sleep can end up to 0.2 ms late.
+"""Time before a deadline at which the wall clock stops sleeping and spins instead [s]: a sleep can end up to 0.2 ms
+late.
 """
 
 

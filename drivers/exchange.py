@@ -138,10 +138,10 @@ class Exchange:
         self._slow = 0
         self._late_possible = False
         self._collided = False
-        """Whether the latest goals were sent while a late reply may have been on the wire, which destroys them."""
+        """Whether a late reply may have been on the wire, and destroyed the latest goals, when they were sent."""
         self._after_loss = 0
         self._cut_off = b""
-        """What had been received of a reply when time was up in the latest exchange."""
+        """The part of a reply that had been received when time was up in the latest exchange."""
         self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
         self._off_wire = math.inf
         """Duration of the latest cycle without its wire time [s]."""
@@ -176,8 +176,8 @@ class Exchange:
     def add_read_back(
         self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[Sequence[int]]
     ) -> None:
-        """Prepare `overruled`. goal, mode: spans that end with the goal and with the settings whose values are `modes`
-        (`ReadBack`).
+        """Prepare `overruled` (see `ReadBack`). goal: spans that end with the goal. mode: spans that end with the
+        settings; `modes` are their values.
         """
         back = self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
         self._wire_s |= {read: self._port.wire_time(self._bytes(read)) for read in back.reads}

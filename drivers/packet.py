@@ -131,7 +131,7 @@ class Framer:
     """Finds packets in a stream of bytes and resynchronises after noise.
 
     A packet whose CRC does not match is counted in `bad_crc`. The host then searches for a header from the next byte
-    on, since the length may be what was corrupted. With `damaged=True` the framer behaves like a servo: it trusts the
+    on, since the length itself may be corrupted. With `damaged=True` the framer behaves like a servo: it trusts the
     length and returns the packet marked as damaged, because a servo answers it with an error.
     A LEN above `longest` is treated as noise.
     """

@@ -65,8 +65,8 @@ def open_port(url: str, baud: int) -> "Port":
 class Port:
     """An open serial port. Every method but `close` raises PortLost when the device fails.
 
-    After PortLost the same object may be used again, and fails again as long as the device is gone; a cable that was
-    replugged needs a new port. `latency` is the longest time the adapter may hold back a reply [s].
+    After PortLost the same object may be used again; it fails again as long as the device is gone. After the cable was
+    replugged, open a new port. `latency` is the longest time the adapter may hold back a reply [s].
     """
 
     overheard: bytes = b""
@@ -106,7 +106,7 @@ class Port:
     def read(self, count: int, timeout: float) -> bytes:
         """Return up to `count` bytes; fewer if they have not arrived within `timeout` [s].
 
-        A URL handler may return what has arrived before its time is up; the rest is then read in the time that is left.
+        A URL handler may return early, with only some of the bytes; the rest is then read in the remaining time.
         """
         deadline = self.clock.now() + timeout
         received = part = self._read_once(count, timeout)

@@ -13,7 +13,7 @@ class Tick(NamedTuple):
 
     deadline: when the wait should have ended [s, on the clock].
     now: when it ended [s].
-    missed: it ended a whole interval or more too late; the caller should skip this sample.
+    missed: whether it ended a whole interval or more too late; if so, the caller should skip this sample.
     """
 
     deadline: float

@@ -17,7 +17,7 @@ class SdkPort:
         self._port = port
         self._deadline = 0.0
         self._sent = b""
-        """What was written last, as long as its echo may still arrive."""
+        """The bytes written last, kept as long as their echo may still arrive."""
         self._held = b""
         """Bytes received that may be the beginning of the echo."""
 

@@ -60,13 +60,13 @@ class Servo:
         return self.read_entry(self.table[register], attempts)
 
     def read_despite_error(self, register: str, attempts: int = _ATTEMPTS) -> int:
-        """Read a register as `read` does, but accept a reply that carries its value and reports an error too."""
+        """Read a register as `read` does, but also accept a reply that carries its value and reports an error."""
         return self.read_entry(self.table[register], attempts, despite_error=True)
 
     def read_entry(self, entry: Register, attempts: int = _ATTEMPTS, *, despite_error: bool = False) -> int:
         """Read a register that is missing from the model's table; same errors as `read`.
 
-        despite_error: accept a reply that carries the value and reports an error too.
+        despite_error: also accept a reply that carries the value and reports an error.
         """
 
         def ask() -> tuple[list[int], int, int]:

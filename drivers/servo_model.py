@@ -110,8 +110,8 @@ class ServoModel:
     min_voltage: supply voltage below which it shuts down with factory settings (Min Voltage Limit) [V].
     watchdog_firmware: first firmware with a Bus Watchdog.
     fast_sync_read_firmware: first firmware that supports Fast Sync Read; None if none does.
-    senses_supply: Present Current is the supply current, that is, the motor current times the bridge's duty cycle: far
-    less than the commanded current while the joint is slow.
+    senses_supply: whether Present Current is the supply current, that is, the motor current times the bridge's duty
+    cycle: far less than the commanded current while the joint is slow.
     """
 
     name: str
@@ -148,9 +148,9 @@ class ServoModel:
     def is_out_of_voltage(self, goal: float, carried: float, velocity: float, supply: float = math.nan) -> bool:
         """Whether a current falls short of its goal because the supply cannot drive more through the turning motor.
 
-        This is taken as the cause if the motor turns in the direction of its goal and the voltage across its terminals,
-        that of its winding and its back-EMF, is about the supply's. Without torque, only the back-EMF is present. A
-        current opposite to its goal has another cause.
+        This is taken as the cause if the motor turns in the direction of its goal and the voltage across its terminals
+        (voltage drop of the winding plus back-EMF) is about the supply voltage. Without torque, only the back-EMF is
+        present. A current opposite to its goal has another cause.
 
         goal, carried: commanded and measured current [A]. velocity: velocity of the output shaft [rad/s]. supply:
         lowest measured voltage of the supply [V]; NaN if unknown, in which case the lowest plausible voltage is

@@ -80,7 +80,7 @@ _DRIVE = {Mode.CURRENT: "Present Current", Mode.PWM: "Present PWM"}
 
 
 Spans = Span | tuple[Span, ...]
-"""One span for all servos, or one per servo where they are driven in different modes."""
+"""One span for all servos, or one per servo if they are driven in different modes."""
 
 
 def spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans, Spans]:
@@ -138,7 +138,8 @@ mean.
 def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans]:
     """Return the registers that end with the goal, and those that end with SETTINGS.
 
-    They begin earlier, so that answers differ in length from those that other programs usually ask for.
+    They begin at an earlier address than necessary: the answers then differ in length from those to usual reads of
+    other programs.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
     goals = [_status_names(own)[:2] for own in modes]

@@ -19,14 +19,14 @@ def command(*words: object) -> str:
 
 
 def steps_of(path: Path) -> list[Path]:
-    """Folders of the pilot and further steps recorded in a folder whose identification never got to its full run."""
+    """Folders of the pilot's and later steps in a run folder, if its identification stopped before the full run."""
     if (path / "samples.npy").is_file() or not (path / "config.toml").is_file():
         return []
     return sorted((each.parent for each in path.glob("*/samples.npy")), key=lambda each: each.stat().st_mtime)
 
 
 def only_steps(path: Path, steps: Sequence[Path]) -> str:
-    """Explain that an identification ended before its full run, and how to look at what was recorded."""
+    """Explain that an identification stopped before its full run, and how to look at what was recorded."""
     names = ", ".join(each.name for each in steps)
     return (
         f"{path}: its identification ended before the full run, so there is no result; recorded: {names}. Identify "

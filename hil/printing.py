@@ -53,7 +53,7 @@ def print_table(console: Console, table: Table) -> None:
 
 
 def print_fitting(console: Console, table: Table) -> None:
-    """Print a table; where the terminal is too narrow, each row as a paragraph that names its columns."""
+    """Print a table; if the terminal is too narrow, print each row as a paragraph that names its columns."""
     if not console.is_terminal or natural_width(console, table) <= console.width:
         print_table(console, table)
         return

@@ -7,8 +7,8 @@ __all__ = ["rest_pose_hint", "within_limits"]
 
 
 def within_limits(position: float, limits: Sequence[float]) -> float:
-    """Return `position` if it is within the limits, otherwise the angle that is whole turns away and nearest to their
-    middle.
+    """Return `position` if it is within the limits, otherwise the angle a whole number of turns away that is nearest to
+    their middle.
 
     An encoder only measures the angle within one turn, and a servo does not count turns while it is off. `position`
     assumes the turn closest to the rest pose or to zero, but the joint must be at an angle that it can reach. If no

@@ -37,7 +37,7 @@ class Heard:
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.strangers = 0
-        """Number of packets received that this program neither sent nor asked for: another master is on the bus."""
+        """Number of received packets that this program neither sent nor requested: another master is on the bus."""
 
     def expect(self, reads: Iterable[GroupRead]) -> None:
         """From now on, treat replies to these reads as replies to this program."""
@@ -65,9 +65,9 @@ class Heard:
             self.damaged_at, self.senders = now, read.senders(received)
 
     def continued(self, before: bytes, received: bytes, now: float) -> None:
-        """Examine bytes that follow those received until time was up: the rest of a reply that came too late.
+        """Examine bytes that may be the rest of a reply that was incomplete when time was up.
 
-        before: what had been received until then.
+        before: the bytes that had been received by then.
         """
         whole = [packet for packet in _packets_within(before + received) if packet.is_status]
         if len(whole) > len(_packets_within(before)) + len(_packets_within(received)):

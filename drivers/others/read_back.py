@@ -42,10 +42,11 @@ TRY_AGAIN_S = 0.005
 """Delay after which a read-back for which a cycle left no time is tried again [s]."""
 
 LOST_GOALS, LOST_OF = 3, 6
-"""A servo that misses `LOST_GOALS` of `LOST_OF` goals does not accept them, although the next one may arrive.
+"""A servo that misses `LOST_GOALS` of `LOST_OF` goals counts as not accepting them, although the next one may
+arrive.
 
-The status, in which two consecutive goals must be missed, may not show for 0.1 s that every second goal is lost. If a
-hundredth is lost, three of six are rarer than two consecutive ones.
+The status check needs two consecutive missed goals: if every second goal is lost, it may not notice for 0.1 s. If one
+goal in a hundred is lost, missing three of six is rarer than missing two consecutive ones.
 """
 
 _FADES = 0.98
@@ -69,11 +70,11 @@ class Overruled(NamedTuple):
 class ReadBack:
     """Reads back the goals that the servos hold right before a cycle, and occasionally their settings instead.
 
-    mode: a span that ends with the registers whose values are `modes`, as many for each servo. A change of one of these
-    reverses the motor, shifts every angle, or gives goals another meaning.
+    mode: a span that ends with the settings, whose values are `modes`, equally many for each servo. A change of one of
+    these settings reverses the motor, shifts every angle, or gives goals another meaning.
 
-    Every cycle overwrites the goals of another master, so one that writes less often than this program is seen only if
-    the goals are read before every cycle.
+    Every cycle overwrites the goals of another master. A master that writes less often than this program is therefore
+    detected only if the goals are read before every cycle.
     """
 
     def __init__(
@@ -125,7 +126,7 @@ class ReadBack:
     ) -> Overruled | None:
         """Compare the answers with what was written; return what only another master can have written.
 
-        An answer with an error is no answer: a servo that refuses a read has told nothing about its goal.
+        An answer with an error is ignored: a servo that refuses a read reveals nothing about its goal.
 
         collided: whether a late reply may have destroyed the latest goals on the wire, so that a servo that holds older
         ones is not at fault.

@@ -20,7 +20,7 @@ SLOWEST_S = 0.1
 
 _TRIPS = 5
 _TIMES, _APART_S = 6, 0.05
-"""How often slow replies are measured again before they count as the adapter's, and the time in between [s]."""
+"""Number of repeated measurements before slow replies are attributed to the adapter, and the time in between [s]."""
 
 _PING_BYTES = 24  # on the wire: the ping and its status
 _STATUS_BYTES = 14

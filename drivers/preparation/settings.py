@@ -1,9 +1,9 @@
 """Servo settings: the registers that an experiment changes, and those that the servo itself changes as a consequence.
 
-Operating Mode and Current Limit are in EEPROM: they survive a power cycle, so that another program that only sets
-Torque Enable would drive the motor in the wrong mode at full current. A change of Operating Mode resets goals and gains
-(ROBOTIS e-Manual, Operating Mode). Goal Position is left out: a servo sets it to its present position when torque is
-switched on, and an old value must never move an arm.
+Operating Mode and Current Limit are in EEPROM: they survive a power cycle. If they were not restored, another program
+that only sets Torque Enable would drive the motor in the wrong mode at full current. A change of Operating Mode resets
+goals and gains (ROBOTIS e-Manual, Operating Mode). Goal Position is left out: a servo sets it to its present position
+when torque is switched on, and an old value must never move an arm.
 """
 
 from collections.abc import Mapping
@@ -40,7 +40,9 @@ _BOUNDS = {
 """The EEPROM limit of each goal: a servo refuses larger goals."""
 
 STARTUP_CONFIGURATION = Register("Startup Configuration", 60, 1)
-"""Not in the SDK's tables. Bit 0: torque on after power-up or reboot; bit 1: RAM registers restored then."""
+"""A register that the SDK's tables lack. Bit 0: torque on after power-up or reboot; bit 1: RAM registers restored
+then.
+"""
 
 TORQUE_ON_AT_STARTUP = 0x01
 WATCHDOG_TRIPPED = 0xFF
@@ -49,8 +51,8 @@ WATCHDOG_TRIPPED = 0xFF
 def read_settings(servo: Servo) -> dict[str, int]:
     """Return the registers that an experiment may change, by name [ticks]; same errors as `Servo.read`.
 
-    All are read twice, the second time in reverse order. A reply does not identify its register: one that belongs to an
-    earlier request would be stored, and later restored, as the value of another register.
+    All are read twice, the second time in reverse order. A reply does not identify its register: a reply to an earlier
+    request would be stored, and later restored, as the value of another register.
     """
     names = [name for name in (*EEPROM, *RAM) if name in servo.table]
     settings = {name: servo.read(name) for name in names}
@@ -68,10 +70,10 @@ def read_settings(servo: Servo) -> dict[str, int]:
 
 
 def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
-    """The settings with goals cut to the limits, which another program may have lowered since.
+    """The settings, with goals clamped to the limits, which another program may have lowered meanwhile.
 
-    A limit that is among the settings is restored before its goal; for any other, the servo's present value counts.
-    Same errors as `Servo.read`.
+    A limit that is among the settings is restored before its goal; for any other limit, the servo's present value
+    counts. Same errors as `Servo.read`.
     """
     cut = dict(settings)
     for goal, limit in _BOUNDS.items():
@@ -85,7 +87,7 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
     """Restore the registers that differ from `settings`; return (old, new) for those that were written.
 
     Goals are restored as far as the servo's limits allow (`attainable`). Each register is read back. Raises
-    WrongSetting while torque is on, otherwise as `Servo.write`, but only after all other registers were tried.
+    WrongSetting if torque is on. Raises the errors of `Servo.write` only after all other registers have been tried.
     """
     if servo.read_despite_error("Torque Enable"):
         raise WrongSetting(f"{servo.title}: its settings cannot be restored while its torque is on.")

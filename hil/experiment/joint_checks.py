@@ -1,4 +1,4 @@
-"""The checks that every joint undergoes in every exchange, in one compiled loop: time is scarce between two samples.
+"""The checks made on every joint in every exchange, as one compiled loop: there is little time between two samples.
 
 They are, in this order: a jump of the position, the limits of position and velocity, whether the motor carries the
 commanded current (`following`), whether position and velocity agree (`consistency`), and whether the motor turns as
@@ -29,7 +29,7 @@ FARTHER_OUT_RAD = 0.01
 MOST_OUTSIDE_RAD = 0.5
 """How far beyond its limit a joint may start if an earlier run left it there [rad].
 
-A light arm that was stopped at a limit coasts on by some tenths of a radian, and friction holds it there; an upright
+A light arm that was stopped at a limit coasts on by a few tenths of a radian, and friction holds it there; an upright
 one that has fallen is farther away.
 """
 
@@ -50,12 +50,12 @@ JOINT = np.dtype(
 )
 """One joint: limits, latest state, what the latest check found, and the state that each check keeps.
 
-low, high: position limits [rad]. fastest: velocity limit, and farthest, the fastest change of a reported position
-[rad/s]. may_start_outside, is_followed, is_worked: whether it may be found outside its limits at first, and whether
-`following` and `work` are checked. position, seen_at: latest position [rad], NaN before the first one, and its time
-[s]. found_outside: position outside the limits at which it was first seen [rad], NaN if it was inside. moved, seconds,
-most: change of the position [rad], the time that it represents [s], and the largest possible one [rad]. found: duration
-of a deviation from the goal [s], or work taken out of the arm [J].
+low, high: position limits [rad]. fastest: velocity limit [rad/s]. farthest: fastest change of a reported position
+[rad/s]. may_start_outside, is_followed, is_worked: whether the joint may be found outside its limits at first, and
+whether `following` and `work` are checked. position, seen_at: latest position [rad], NaN before the first one, and its
+time [s]. found_outside: position outside the limits at which it was first seen [rad], NaN if it was inside. moved,
+seconds, most: change of the position [rad], the time that it represents [s], and the largest possible one [rad]. found:
+duration of a deviation from the goal [s], or work taken out of the arm [J].
 """
 
 
@@ -79,7 +79,8 @@ class JointChecks:
         self._check = only_version(_look)
 
     def look(self, state: State, unsure: float) -> int:
-        """Check all joints, none of which missed this reply or the one before; return FINE or CHECKS * joint + check.
+        """Check all joints, if all have sent this reply and the one before. Returns FINE, or CHECKS * joint + check of
+        a fault.
 
         unsure: excess duration of the exchange [s]. Joints after the first faulty one are not checked.
         """

@@ -1,9 +1,9 @@
 """Stop of an arm that cannot hang freely: brake, then lower it to its rest pose while its servos accept commands.
 
 The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the path
-home; where a joint stays off the path, further torque towards it grows. Lowering is monitored like the experiment: a
-missing reply, an alert, a current that does not follow its goal or a joint that leaves the path ends it, and torque is
-cut. The damper acts on velocities that the positions confirm.
+home; if a joint stays off the path, an additional torque towards the path grows. Lowering is monitored like the
+experiment. It is aborted and torque is cut after a missing reply or an alert, if a current does not follow its goal, or
+if a joint leaves the path. The damper acts only on velocities that agree with the positions.
 """
 
 import numpy as np

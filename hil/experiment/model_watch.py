@@ -110,7 +110,9 @@ class Jolts:
         self.forget()
 
     def look(self, velocity: Sequence[float], seconds: float, now: float) -> tuple[int, float] | None:
-        """Process velocities [rad/s], `seconds` after the previous ones [s]; return the joint and change of a jolt."""
+        """Process velocities [rad/s], `seconds` after the previous ones [s]; return a jolt's joint and change
+        [rad/s].
+        """
         self._pack(self._bytes, 0, *velocity)
         joint = self._jolting(self._joints, self._former, self._velocity, seconds, now, self._least)
         return None if joint < 0 else (joint, float(self._joints["change"][joint]))

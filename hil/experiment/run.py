@@ -1,4 +1,6 @@
-"""The experiment on the bus: open, check, switch torque on, stream, and switch torque off however it ends."""
+"""The experiment on the bus: open, check, switch torque on, stream, and switch torque off, however the experiment
+ends.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -74,7 +76,8 @@ def run_experiment(
         arms: prior knowledge of the arm; by default, from the configuration.
 
     Raises:
-        HilError, DriverError: if torque was switched on, the exception carries a note that says whether it is off.
+        HilError, DriverError: if torque was switched on, the exception carries a note that says whether it is off
+            again.
     """
     is_given, plan = plan is not None, plan_of(config) if plan is None else plan
     if config.is_chain and not config.is_fake:

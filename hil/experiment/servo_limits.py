@@ -1,6 +1,7 @@
 """The servos' own current and PWM limits: read, compared with the configuration, lowered, and read back.
 
-With its own Current Limit lowered, a servo refuses larger goals even if this program fails. The session restores it.
+Once its own Current Limit is lowered, a servo refuses larger goals even if this program fails. The session restores the
+limit.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,9 +17,9 @@ from hil.setup.current_limit import current_limit_ticks
 
 @contextmanager
 def servo_limits(config: Config, bus: ServoBus, note: Callable[[str], None]) -> Iterator[None]:
-    """Lower the servos' Current Limit to `current_limit`; enter with torque off.
+    """Lower the servos' Current Limit to `current_limit`. Torque must be off.
 
-    Raises WrongSetting if a servo allows less than the configuration needs, which would silently refuse goals.
+    Raises WrongSetting if a servo allows less than the configuration needs: it would silently refuse larger goals.
     """
     for joint, described in zip(bus.joints, config.joints, strict=True):
         if joint.mode is Mode.CURRENT:

@@ -6,8 +6,8 @@ come counts as silence.
 
 A busy computer also delays what it has received: the kernel passes on the bytes of a serial port in a separate thread,
 which has to wait for a core like any other program, for 4 to 10 ms at a time. So while this program itself wakes up
-late, silence of all servos may be due to the computer, and is limited as missed deadlines are, too. If some servos are
-heard and one is not, the silence is that servo's.
+late, silence of all servos may be due to the computer, and is also limited in the same way as missed deadlines. If some
+servos are heard and one is not, that servo is silent.
 """
 
 from hil.config.schema import Config
@@ -67,15 +67,15 @@ class Silence:
         self.any_missed = any(self.counts)
 
     def all_heard(self, now: float) -> None:
-        """Record replies of all joints, none of which missed the exchange before."""
+        """Record that all joints replied, as they did in the exchange before."""
         self._last_heard = [now] * len(self.counts)
 
     def missed(self, joint: int, now: float, *, refused: bool = False, alone: bool = True) -> str | None:
         """Record a missing reply to the exchange that began at `now` [s]; return a description of a silence that is too
         long, or None.
 
-        refused: the servo answered, with an error instead of its state; one such answer is enough. alone: another servo
-        was heard.
+        refused: whether the servo answered with an error instead of its state; one such answer is enough. alone:
+        whether another servo was heard.
         """
         last = self._last_heard[joint]
         if last is None:

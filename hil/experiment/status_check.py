@@ -1,4 +1,5 @@
-"""Checks of a servo's status registers: is torque on, the watchdog armed, the goal accepted, the reply current?
+"""Checks of a servo's status registers: is torque on, is the watchdog armed, was the goal accepted, is the reply
+recent?
 
 None of this is visible in position and velocity, and it is visible in the current only if the servo has a motor current
 sensor. The registers are read back several times per 0.1 s (hil.drivers.bus), so each of these faults is detected
@@ -57,7 +58,9 @@ class StatusCheck:
 
     @property
     def is_in_doubt(self) -> bool:
-        """Whether the latest status was wrong in a way that one lost packet could explain: read it again at once."""
+        """Whether one lost packet could explain what was wrong with the latest status, which should then be read again
+        at once.
+        """
         return any(self._missed) or any(stale for *_, stale in self._clock)
 
     def sent(self, goals: Sequence[float]) -> None:

@@ -24,8 +24,8 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 class StopRequest:
     """Context manager that catches the signals; `check` raises StopRequested after a signal.
 
-    A block inside another one in the same thread shares the outer one's request. Threads other than the main one
-    receive no signals, so there is never a request.
+    A block inside another one in the same thread shares the outer one's request. Only the main thread receives signals;
+    in any other thread there is never a request.
     """
 
     _outermost: ClassVar["StopRequest | None"] = None

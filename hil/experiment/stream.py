@@ -1,6 +1,6 @@
 """The real-time loop: one exchange, one guard check and one recorded sample per tick.
 
-Where ticks are far apart, the same goals are exchanged again in between, unrecorded, so that every check sees an
+If ticks are far apart, the same goals are exchanged again in between, without recording. Every check thus sees an
 exchange at least every `hil.drivers.bus.CHECK_S`, whatever the rate of the experiment.
 
 The sequence is: rest; for each multisine a ramp in, the warm-up (only before the first), periods until two successive
@@ -129,21 +129,21 @@ class Stream:
         self._sent_at: float | None = None
         self._awake_at = float("-inf")
         self._is_undriven = True
-        """Whether nothing has driven the arm yet; a stabiliser needs a first sample before it does."""
+        """Whether nothing has driven the arm yet; a stabiliser cannot drive it before the first sample."""
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
         self._repetition = Repetition(longest, len(bus.joints), self._interval)
 
         self.modes_seen_ago = float("inf")
-        """Time from the latest read-back of the modes that found those that were set to a stop by the guard [s]."""
+        """Time from the latest correct read-back of the operating modes to a stop by the guard [s]."""
 
     def begins_at(self, positions: Sequence[float]) -> None:
-        """Process the joints' angles just before torque is switched on [rad]: the first sample must show the same."""
+        """Process the joints' angles just before torque is switched on [rad]: the first sample must agree with them."""
         self._guard.rests_at(positions)
 
     @property
     def state(self) -> State | None:
-        """The latest state, also from between two samples."""
+        """The latest state, including states read between two samples."""
         return self._state
 
     def run(self) -> None:

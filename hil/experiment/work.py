@@ -1,7 +1,7 @@
 """Work of the motors: a motor that only takes energy out of the arm turns against its command.
 
-Work is checked only without a stabiliser: such an arm starts at a stable rest pose and cannot return more work than was
-put in, so a motor that continually takes work out of it turns the wrong way.
+Work is checked only without a stabiliser. Such an arm starts at a stable rest pose and cannot return more work than was
+put in. A motor that continually takes work out of it therefore turns the wrong way.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
 that it keeps for a joint is a record of the type `MEMORY`.
@@ -18,7 +18,7 @@ TOLERANCE_RAD = 0.04
 """Work taken out of the arm, divided by the joint's largest planned torque, above which the joint's sign is considered
 wrong [rad].
 
-A healthy motor returns some because of delays: a heavy arm at 20 Hz up to 0.02 rad.
+Because of delays, even a healthy motor takes some out: up to 0.02 rad from a heavy arm at 20 Hz.
 """
 
 _OF_OTHERS = 0.5

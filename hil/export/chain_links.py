@@ -1,4 +1,6 @@
-"""The links of an identified spatial arm: physically consistent, with the identified dynamics, closest to the URDF."""
+"""The links of an identified spatial arm: of all physical ones with the identified dynamics, those closest to the
+URDF.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -71,8 +73,9 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
 def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
     """Separate a link from what its held joints move, such as a gripper's fingers, so that these keep their inertia.
 
-    If their described masses leave no physically possible body for the link itself, all of them keep the same fraction,
-    halved until one is possible, or nothing. Returns the link's body and that fraction.
+    If their described masses leave no physically possible body for the link itself, all of them keep the same fraction
+    of their masses. It is halved until a body is possible; if none ever is, it is 0. Returns the link's body and that
+    fraction.
     """
     share = 1.0
     for _ in range(HALVINGS):

@@ -22,7 +22,7 @@ def stamp_of(nanoseconds: int) -> dict[str, int]:
 
 
 def scene_message(scene: MovingScene, nanoseconds: int) -> dict[str, Any]:
-    """All shapes, one entity per frame, which persist and follow their frames."""
+    """All shapes, as one entity per frame; the entities persist and follow their frames."""
     entities = []
     for frame in scene.frames:
         rods = [rod for rod in scene.rods if rod.frame == frame.name]

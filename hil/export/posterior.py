@@ -1,10 +1,10 @@
 """Arms drawn from the posterior of an identification, for domain randomisation: one file per arm, one table for all.
 
-The parameters are drawn from a normal distribution with their covariance, together with one factor common to all
-torques, because the torque constant is known far less accurately than anything else: the motion reveals the ratio of
-the joints' constants, so one factor remains, as uncertain as the best-known joint's. The torque per goal [A or V] is
-scaled with it, so that the drawn arms move alike under the same goals, within the accuracy of the recording. The draws
-are matched so that their mean and covariance are exactly those of the posterior.
+The parameters are drawn from a normal distribution with their covariance. One factor common to all torques is also
+drawn, because the torque constant is known far less accurately than anything else. The motion reveals the ratios of the
+joints' constants, so a single factor remains, as uncertain as the best-known joint's constant. The torque per goal [A
+or V] is scaled with it, so that the drawn arms move alike under the same goals, within the accuracy of the recording.
+The draws are matched so that their mean and covariance are exactly those of the posterior.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What URDF and MJCF export share: numbers without loss of precision, comments, and the comments at the top."""
+"""Helpers shared by URDF and MJCF export: numbers without loss of precision, comments, and the comments at the top."""
 
 from xml.etree import ElementTree as ET
 

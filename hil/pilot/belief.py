@@ -41,8 +41,8 @@ MOVED_STEPS = 26
 """Smallest range of motion of a joint that counts as having moved [encoder steps]."""
 _STILL = 0.02  # rad, allowed range of a simulated joint whose real counterpart stood still
 _MOST_RAISES, _RAISE = 12, (0.05, 0.25)
-"""Maximum number of random increases of log friction, made until a simulated joint stands still too, and the range of
-each increase.
+"""If a simulated joint moves although the real one stood still, its log friction is increased at random: at most this
+many times, each time within this range.
 """
 
 _INFLATIONS = (12.0, 6.0, 4.0, 2.0)
@@ -56,9 +56,9 @@ _LEAST_SPREAD = 0.01  # relative model error, per doubling of the range of motio
 class Belief:
     """Arms that could be the real one.
 
-    coordinates: coordinates (arms, parameters): logarithms of positive parameters; parameters of either sign are
-    divided by `scale`. scale: standard deviation in the prior (parameters,). fixed: parameters that do not vary.
-    learned: number of updates.
+    coordinates (arms, parameters): logarithms of positive parameters; parameters of either sign are divided by `scale`.
+    scale: standard deviation in the prior (parameters,). fixed: parameters that do not vary. learned: number of
+    updates.
     """
 
     names: tuple[str, ...]

@@ -1,10 +1,10 @@
 """Breakaway of joints that friction holds: more torque from run to run, stopped soon after a joint begins to move.
 
 A joint that stood still reveals little more than that its friction is larger than the torque. Just above that friction,
-motion grows quickly: in a large part of the plausible arms even a few percent more torque exceeds a limit, so that an
-amplitude which is safe for a whole run can hardly be raised. Instead, the guard is given narrow limits for such joints.
-The torque can then grow by a constant ratio up to the current limit, and the run ends, braked, where the joint has
-shown its friction.
+motion grows quickly: on many of the plausible arms even a few percent more torque exceeds a limit. A torque that is
+safe for a whole run can therefore hardly be raised. Instead, the guard is given narrow limits for such joints. The
+torque can then grow by a constant ratio up to the current limit. The arm is braked and the run ends once the joint has
+moved and thus shown its friction.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
-    """Return `torque` (joints,) [N m], where joints that stood `still` get more than in the `former` run.
+    """Return `torque` (joints,) [N m], with more than in the `former` run for joints that stood `still`.
 
     most: torque that the current limits allow (joints,) [N m].
     """
@@ -43,7 +43,7 @@ def _near(joint: JointConfig, pose: float, options: PilotOptions) -> tuple[float
 
 
 def broke_free(config: Config, narrow: Config, seen: Array) -> Mask:
-    """Return which joints (joints,) only exceeded limits that `narrow` has tightened.
+    """Return which joints (joints,) exceeded only limits that are tighter in `narrow` than in the configuration.
 
     seen: lowest and highest position and largest speed of each joint (3, joints) [rad, rad/s].
     """

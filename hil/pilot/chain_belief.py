@@ -61,7 +61,7 @@ class ChainBelief:
         return cls(config, arms, inertias(arms.first(SIMULATED), _poses(config))[1].min(axis=0))
 
     def at_least(self, count: int) -> ChainArms:
-        """Return `count` arms: the first ones of the ensemble and, for a prior that is too small, further ones."""
+        """Return the first `count` arms of the ensemble. If it is a prior with fewer arms, further ones are drawn."""
         if count <= self.arms.size:
             return self.arms.first(count)
         return self.arms.and_more(prior_arms(self.config, known_chain(self.config), count - self.arms.size, seed=1))

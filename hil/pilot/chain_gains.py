@@ -1,8 +1,9 @@
 """Gains of the software spring and damper that hold a spatial arm to its path: as stiff as the sample rate allows.
 
 Both act on a state that is `DELAY_SAMPLES` old. The damper must be weak enough for the lightest joint not to oscillate.
-A delayed spring drives the motion like a negative damper, so that damping limits stiffness: at a low rate, and not by
-more, since a softer spring lets friction and unknown weights carry the arm away from its path.
+A delayed spring drives the motion like a negative damper, so at a low rate damping limits the stiffness. The stiffness
+is reduced no further than this requires, since a softer spring lets friction and unknown weights carry the arm away
+from its path.
 """
 
 from dataclasses import dataclass
@@ -44,7 +45,7 @@ class ChainGains:
 
     @classmethod
     def of(cls, config: Config, arms: ChainArms, poses: Array) -> "ChainGains":
-        """Compute the limits for any of these arms in any of these poses (poses, joints)."""
+        """Compute limits that hold for all of these arms in all of these poses (poses, joints)."""
         held, free = inertias(arms, poses)
         middle, turn = np.median(held, axis=0), 2.0 * np.pi * FREQUENCY
         usual = [len(joint.ids) * servo_prior(joint.joint.servo).viscous.median for joint in config.joints]

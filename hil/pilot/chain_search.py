@@ -35,7 +35,7 @@ from hil.setup.servo_session import servo_session
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7
 RAISED = 1.3
-"""Smallest ratio of the safe share to that of the previous run for which another step precedes the full run."""
+"""Another step precedes the full run if the safe share is at least this multiple of the previous run's share."""
 
 MOST_RAISE = 2.5
 """Largest ratio of a step's share of the amplitude to that of the previous run."""
@@ -56,7 +56,7 @@ class Said:
         self._trying = ""
 
     def trying(self, which: str) -> None:
-        """Take down which path and amplitude is simulated next."""
+        """Record which path and amplitude are simulated next."""
         self._trying = which
 
     def say(self, text: str) -> None:
@@ -150,7 +150,7 @@ class ChainSearch(SafeShares):
         return error
 
     def learn(self, config: Config, folder: RunFolder) -> None:
-        """Update the belief, and which joints lie on their own stops, with the recording in a folder."""
+        """Update the belief and the list of joints that lie on their own stops, from the recording in a folder."""
         samples = load_samples(folder.samples_path, len(config.joints))
         self.belief = self.belief.learn(config, samples)
         found = passed_rest(config, samples["position"])

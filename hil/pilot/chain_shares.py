@@ -37,7 +37,7 @@ SMALL = 0.5
 REDESIGNS = 2
 
 OTHER_SEEDS = 2
-"""Number of paths designed from other seeds where no share of a path is safe."""
+"""Number of paths designed from other seeds if no share of a path is safe."""
 
 _NEXT_SEED = 100
 
@@ -47,7 +47,7 @@ processor time with six joints.
 """
 
 STOPPED_SHARE = 0.5
-"""Effort of simulated stops, relative to that of as many arms on one path and its transitions."""
+"""Effort of simulating a stop, relative to that of simulating one arm on a path and its transitions."""
 
 RAISED_RATE = 1.6
 """Ratio of the first higher rate that is tried, for advice, to the configured one."""
@@ -74,10 +74,10 @@ class SafeShares:
     """The current belief about the arm, and the paths designed for it.
 
     last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are shares of `paths`,
-    and are converted when these are replaced. tell: called with the progress of each simulation of the arms, designing:
-    with that of each path's design, trying: with a description of each path and amplitude before it is simulated.
-    simulated: motion simulated so far [s]. passed: whether each joint was beyond its rest pose in a run, as in
-    `resting_stops`.
+    and are converted when these are replaced. tell: called with the progress of each simulation of the arms. designing:
+    called with the progress of each path's design. trying: called with a description of each path and amplitude before
+    it is simulated. simulated: motion simulated so far [s]. passed: whether each joint was beyond its rest pose in a
+    run, as in `resting_stops`.
     """
 
     given: Config
@@ -95,7 +95,7 @@ class SafeShares:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether so much was simulated that no further paths are tried."""
+        """Whether so much has been simulated that no further paths are tried."""
         return self.simulated > MOST_SIMULATED_S
 
     @property
@@ -106,7 +106,7 @@ class SafeShares:
     def safe(self, config: Config, shares: tuple[float, ...], most: float = np.inf) -> Found:
         """Find the first of the `shares` of the designed path that is safe for all simulated arms.
 
-        most: largest share; for other paths, the share with the same amplitude. The shares are scaled to it.
+        most: largest share; on other paths, the share with the same amplitude counts. `shares` are scaled to it.
 
         If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
         kept. If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.
@@ -297,7 +297,7 @@ def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
 
 
 def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
-    """Return what to change, and by how much, so that a joint no longer exceeds a limit in some of the arms.
+    """Return what to change, and by how much, if a joint exceeds a limit on some of the simulated arms.
 
     stiffness: of each joint's stabiliser at this rate, relative to that at a high rate (joints,).
     """

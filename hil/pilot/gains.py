@@ -27,7 +27,9 @@ def needs_stabiliser(config: Config, belief: Belief) -> bool:
 
 
 def wandering(config: Config, belief: Belief) -> NDArray[np.bool_]:
-    """Joints that need a spring (joints,): all of an arm that falls over or lies flat, else those held by friction."""
+    """Joints that need a spring (joints,): all joints of an arm that falls over or lies flat, otherwise those held by
+    friction.
+    """
     arm = belief.middle
     stiffness = gravity_stiffness(config, arm)
     if float(np.linalg.eigvalsh(stiffness).min()) <= 0.0:
@@ -45,7 +47,7 @@ def falls_over(config: Config, belief: Belief) -> bool:
 def with_stabiliser(config: Config, belief: Belief, springs: NDArray[np.bool_] | None = None) -> Config:
     """Add gains to a configuration that needs a stabiliser and has none.
 
-    springs: joints that get one in any case (joints,).
+    springs: joints that get a spring in any case (joints,).
     """
     at = wandering(config, belief) if springs is None else springs | wandering(config, belief)
     if config.stabiliser is not None or not at.any():

@@ -10,13 +10,13 @@ class PilotOptions:
     arms: int = 96
     """Number of arms in the belief's ensemble."""
     pilot_shares: tuple[float, ...] = (0.45, 0.6, 0.75, 0.9)
-    """Fraction of the limits that successive pilots may use; the last one applies to all further pilots."""
+    """Fractions of the limits that successive pilots may use; the last value applies to all further pilots."""
     pilot_share_known: float = 0.75
     """Fraction of the limits that the first pilot may use if the belief comes from an earlier result."""
     max_steps: int = 12
     """Maximum number of runs between the last pilot and the full run."""
     max_pilots: int = 40
-    """Maximum number of pilots; a still joint reaches its current limit in far fewer."""
+    """Maximum number of pilots; a joint that does not move reaches its current limit in far fewer."""
     certain_share: float = 0.85
     """Fraction of a limit that a typical arm should reach; below it, uncertainty wastes too much of the range."""
     certain_share_known: float = 0.68
@@ -43,20 +43,22 @@ class PilotOptions:
     torque_after_limit: float = 0.85
     """Cap on further torque, relative to the torque at which a limit was exceeded."""
     torque_after_unsettled: float = 0.85
-    """Cap on further torque after a run that never settled, as a large motion with little friction may, relative to its
-    torque.
+    """Cap on further torque after a run that never settled, relative to that run's torque. A large motion with little
+    friction may never settle.
     """
     torque_over_friction: float = 1.8
-    """Ratio of a joint's torque to its Coulomb friction up to which a run that never settled does not lower it."""
+    """After a run that never settled, a joint's torque is not lowered if it is at most this multiple of its Coulomb
+    friction.
+    """
     worthwhile_raise: float = 1.15
     """Minimum ratio of torques that justifies another run if little of the range is unused."""
     worthwhile_raise_far: float = 1.03
     """Minimum ratio of torques that justifies another run if more of the range is unused."""
     fair_share: float = 0.7
-    """Fraction of a limit, reached by a typical arm, above which little of the range counts as unused."""
+    """If a typical arm reaches more than this fraction of a limit, little of the range counts as unused."""
 
     wide_range: float = 0.74
-    """Fraction of the position range, of the joint that uses least, below which other waves are tried."""
+    """Other waves are tried if a joint uses less than this fraction of its position range."""
     other_waves: int = 7
     """Maximum number of other waves: either sign of each joint, and all of these reversed in time."""
 
@@ -70,7 +72,7 @@ class PilotOptions:
     min_falling_torque: float = 0.05
     """Torque that an arm that falls over may receive in any case, as a fraction of what the current limit allows."""
     start_inside: float = 0.95
-    """Fraction of the limits within which an arm that a stopped run left beyond them is assumed to start."""
+    """An arm that a stopped run left beyond its limits is assumed to start within this fraction of them."""
 
     max_full_runs: int = 6
     """Maximum number of full runs if one exceeds a limit or does not settle; each has less torque than the last."""

@@ -63,7 +63,9 @@ class Search:
     fast: NDArray[np.bool_] = field(init=False)
     """Joints that exceeded their velocity limit in the last run before they had moved (joints,)."""
     calm: Array = field(init=False)
-    """Cap on the torque (joints,) [N m], below that of all runs in which a joint did so; infinite if none did."""
+    """Cap on the torque (joints,) [N m], below that of all runs in which a joint exceeded its velocity limit before it
+    had moved; infinite if there were none.
+    """
 
     def __post_init__(self) -> None:
         self.fast = np.zeros(len(self.config.joints), dtype=np.bool_)

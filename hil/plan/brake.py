@@ -1,8 +1,8 @@
 """The first part of a stop, if possible: braking, with a current opposing each joint's velocity.
 
 Braking lasts a bounded time, within the current limits. It ends at once when a reply is missing, a servo raises an
-alert, a deadline is missed, a second signal arrives, or a joint accelerates, by its velocity or its positions, as it
-does if its motor turns the wrong way. Torque is cut afterwards in any case.
+alert, a deadline is missed, a second signal arrives, or a joint accelerates according to its velocity or its positions,
+as it does if its motor turns the wrong way. Torque is cut afterwards in any case.
 
 A joint is braked against its reported velocity only as far as the change of its position confirms it
 (`hil.plan.recent_motion`), so that no current acts in the direction in which its position moves.

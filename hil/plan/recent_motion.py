@@ -80,8 +80,8 @@ class RecentMotion:
         return found
 
     def contradicts(self, joint: int, velocity: float) -> bool:
-        """Whether a velocity cannot be the joint's: none of its changes of position allows it, or none is known
-        and no servo turns that fast.
+        """Whether a velocity cannot be the joint's. Either no known change of its position allows it, or no change is
+        known and no servo turns that fast.
         """
         travels = self.travels(joint)
         if not travels:

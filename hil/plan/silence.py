@@ -41,7 +41,7 @@ def late_limit(config: Config) -> Limit:
 
 
 def is_missing_too_long(count: int, seconds: float, limit: Limit) -> bool:
-    """Whether `count` consecutive missing replies, the last reply being `seconds` ago, exceed the limit."""
+    """Whether `count` consecutive missing replies exceed the limit. seconds: time since the last reply [s]."""
     return count >= _FEWEST_MISSING and seconds >= limit.seconds - _ROUNDING_S
 
 

@@ -78,8 +78,8 @@ class Stabiliser:
 def too_slow(config: Config) -> str:
     """Why the rate is too low for the stabiliser, and what to do; "" if it is not.
 
-    A spring that acts `delay` late drives the motion like a negative damper of stiffness times `delay`. Damping, the
-    configured one and the typical viscous friction of the servo, must outweigh it, or the joint oscillates.
+    A spring that acts `delay` late drives the motion like a negative damper of stiffness times `delay`. The joint
+    oscillates unless the configured damping and the servo's typical viscous friction together outweigh it.
     """
     if config.stabiliser is None:
         return ""

@@ -1,4 +1,6 @@
-"""Reduction of a recording with periodic torque to the mean period of its settled part: less simulation, less noise."""
+"""Reduction of a recording with periodic torque to the mean period of its settled part, which saves simulation and
+averages out noise.
+"""
 
 from dataclasses import dataclass
 

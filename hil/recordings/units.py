@@ -68,7 +68,7 @@ def split_head(head: str) -> tuple[str, str | None]:
 
 
 def wrapped(values: NDArray[np.float64], sizes: Sequence[int]) -> int | None:
-    """The size [bits] of the signed register that was read as an unsigned number; None if there is no sign of that.
+    """The size [bits] of the signed register that was read as an unsigned number; None if nothing indicates that.
 
     Negative numbers then lie in the uppermost quarter of the range, and none in the two middle ones.
     """

@@ -19,7 +19,7 @@ truth_scaled the same in the unit of `parameters`, only if the file's torque con
 physical     masses, centres and inertias, if [known] gives any quantity
 stabiliser   its share of the torque, if there was one
 steps        with a pilot: predicted and measured peaks of each step
-zeros, recordings, notes   only of recordings made elsewhere; notes: what was guessed, corrected or averaged
+zeros, recordings, notes   only for recordings made elsewhere; notes: what was guessed, corrected or averaged
 """
 
 import math

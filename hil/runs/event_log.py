@@ -18,8 +18,8 @@ LATE_NAME = "events-late.jsonl"
 class EventLog:
     """Events of one run.
 
-    On exit it waits a moment until all events are written; those that events.jsonl did not accept in time, because it
-    blocks, go to events-late.jsonl.
+    On exit it waits a moment until all events are written. Events that could not be written in time, because
+    events.jsonl blocks, go to events-late.jsonl.
     """
 
     def __init__(self, run: RunFolder) -> None:

@@ -34,7 +34,7 @@ class ExchangeMode:
     """Measured timing of one exchange mode.
 
     median_s, longest_s: round trips [s]. usual_s: time within which 90 % of the exchanges with the slowest kind of read
-    return [s]. lost: replies out of CYCLES that were lost, not just late.
+    return [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
     """
 
     one_write: bool
@@ -134,7 +134,7 @@ def goal_register(joint: Joint) -> str:
 def goals_taken(bus: ServoBus) -> list[Joint]:
     """The drives, one per servo, that accept goals from a Sync Write. Only with torque off. Raises DriverError.
 
-    Each is sent a goal different from its present one, which is read back and then restored.
+    Each is sent a goal that differs from its present one. The goal is read back, then the previous one is restored.
     """
     before = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
     other = [goal - 1 if goal > 0 else goal + 1 for goal in before]

@@ -1,7 +1,7 @@
 """The pose read from the bus, compared with the arm's description: each joint in turn is moved by hand, torque off.
 
-An identification cannot detect wrong IDs, directions, zeros or axes: a chain's parameters do not absorb a wrong
-geometry, they become wrong. A person notices at once.
+An identification cannot detect wrong IDs, directions, zeros or axes: they only make the parameters of a spatial arm
+wrong. A person who moves the joints notices them at once.
 """
 
 from collections.abc import Callable, Iterator

@@ -16,7 +16,7 @@ _MODE, _DELAY = "Operating Mode", "Return Delay Time"
 _REGISTERS = (_MODE, "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _DELAY)
 
 WRITTEN = frozenset({"Operating Mode", "Current Limit"})
-"""Those that this program writes itself."""
+"""Settings that this program writes itself."""
 
 _LATE = frozenset({Cause.LATE, Cause.MISSING})
 """Causes of a stop that a longer Return Delay Time can explain."""
@@ -45,7 +45,8 @@ _AT_A_LIMIT = frozenset({Cause.POSITION, Cause.VELOCITY})
 """Causes of a stop that need no other explanation than too much torque."""
 
 _MODES_SEEN_S = 0.06
-"""Largest time from a read-back of the modes to a stop for which a change of a mode may as well have come after it [s].
+"""If at most this much time passed from a read-back of the modes to a stop, a mode may also have changed after the stop
+[s].
 """
 
 Settings = Mapping[tuple[Joint, str], int]
@@ -105,7 +106,7 @@ def _by_joint(settings: Settings) -> dict[Joint, dict[str, int]]:
 def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago: float) -> str:
     """A sentence to add to a stop at a limit if the only change may have come after it; "" if the change explains it.
 
-    modes_seen_ago: time from the latest read-back that found the modes that were set to the stop [s].
+    modes_seen_ago: time from the latest correct read-back of the operating modes to the stop [s].
     """
     changed = {each[1] for each, value in before.items() if after.get(each, value) != value}
     if changed != {_MODE} or cause not in _AT_A_LIMIT or modes_seen_ago > _MODES_SEEN_S:

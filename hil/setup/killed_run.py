@@ -1,7 +1,7 @@
 """Settings that a killed program left on the servos: what can be restored, and what another program has changed.
 
 A register that holds neither the value that the killed program set nor the one that it found was changed by something
-else. It is left as it is, since a person may want it so, and named with the value that it had before.
+else. It is not restored, since a person may have wanted the change, but reported with its earlier value.
 """
 
 from collections.abc import Mapping
@@ -58,7 +58,9 @@ class Left:
         )
 
     def is_refused(self, needed: Mapping[str, int]) -> bool:
-        """Whether a run that needs these values cannot start with the Current Limit that another program lowered."""
+        """Whether another program has lowered the Current Limit below what a run with these values needs, so that it
+        cannot start.
+        """
         return self.changed.get(_CURRENT_LIMIT, 0) < needed.get(_CURRENT_LIMIT, 0) and _CURRENT_LIMIT in self.changed
 
 
@@ -89,7 +91,8 @@ class Restored:
 def recover(servo: Servo, port: str) -> Restored:
     """Restore settings that a terminated program left changed; raises as `Servo.write`.
 
-    The file stays as long as another program's value prevents a register from being restored.
+    The file with the earlier settings is kept as long as another program's value prevents the restoration of a
+    register.
     """
     kept = settings_file.load(port, servo.id, servo.table.model)
     if kept is None or not kept.may_restore:

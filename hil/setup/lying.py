@@ -1,4 +1,4 @@
-"""Where a spatial arm lies before a run: the motion starts and ends there, which need not be exactly arm.rest_pose.
+"""The pose in which a spatial arm lies before a run. The motion starts and ends there, not exactly at arm.rest_pose.
 
 Otherwise the stabiliser would pull the arm to arm.rest_pose at once when torque comes on, perhaps against a stop.
 """

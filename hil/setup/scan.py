@@ -40,7 +40,8 @@ class Found(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """The replies at one baud rate: over TCP the one that the servos are set to, or the first one if none answered.
+    """The replies at one baud rate. Over TCP, it is the rate that the servos are set to, or the first one if none
+    answered.
 
     trouble: description of a problem on the whole bus; empty if there is none.
     """
@@ -73,8 +74,8 @@ def scan(port: Port, bauds: Sequence[int] = BAUD_RATES, watch: Watch = lambda _:
     """Scan at each baud rate in turn. Raises PortLost.
 
     Baud rates that the adapter does not support are reported as trouble. Over TCP, where the remote end sets the baud
-    rate, servos are asked once, and each says which baud rate it is set to. watch: called while waiting, and with each
-    servo that answers.
+    rate, servos are asked once, and each reports which baud rate it is set to. watch: called while waiting, and with
+    each servo that answers.
     """
     if not port.has_baud:
         heard = listen(port, watch=watch)

@@ -1,8 +1,8 @@
 """A session with the arm's servos: their settings are saved before the first write and restored after the last.
 
 A session holds the port. A session inside another one for the same arm shares it, so that the steps of a pilot write
-each EEPROM register only once, and restore it once, when the outermost block is left for whatever reason. If a killed
-program left saved settings behind, these count as the servos' own and are restored at the end (`killed_run`).
+each EEPROM register only once. It is also restored only once, when the outermost block is left for whatever reason. If
+a killed program left saved settings behind, these count as the servos' own and are restored at the end (`killed_run`).
 """
 
 import sys
@@ -99,7 +99,7 @@ class ServoSession:
     def begin(self, config: Config, folder: Path | None) -> None:
         """Check that the servos answer and that nobody holds the arm, then save their settings.
 
-        Nothing is written to a servo before its settings are on disk. Same errors as `ServoBus.open`.
+        Nothing is written to a servo before its settings are on disk. Raises the same errors as `ServoBus.open`.
         """
         bus = self.bus
         self._left = {joint: kept for joint in bus.drives if (kept := left_behind(bus.port.url, joint)) is not None}
@@ -170,7 +170,7 @@ class ServoSession:
         clock.wait_until(clock.now() + COUNT_DOWN_S)
 
     def end(self) -> list[str]:
-        """Restore every servo's settings; return a message for each reason why some cannot be.
+        """Restore every servo's settings; return one message per reason for which some could not be restored.
 
         Never raises DriverError.
         """
@@ -283,10 +283,10 @@ _outermost: ContextVar[ServoSession | None] = ContextVar("_outermost", default=N
 def servo_session(config: Config, folder: Path | None = None, say: Say = to_stderr) -> Iterator[ServoBus]:
     """Open the bus with every servo in its mode and torque off, prepared for exchanges; restore settings at the end.
 
-    Raises ExperimentError at the end if a setting is not as it was and nothing else has ended the block.
+    Raises ExperimentError at the end if a setting could not be restored and no other error has ended the block.
 
-    A TorqueNotOff that leaves the block reports the final state: servos that answer again are read back. If all have,
-    what ended the block before is raised in its place.
+    A TorqueNotOff that leaves the block reports the final state: servos that answer again are read back. If torque is
+    off on all servos, the error that ended the block before is raised instead.
 
     folder: run folder that receives a copy of the settings. say: receives messages for the user. Same
     errors as `ServoBus.open`, and RunFolderError.
@@ -330,9 +330,9 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
 
 
 def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
-    """What to raise in place of `error` if torque is off on all servos by now; None if it is not.
-
-    That is what cut torque, or an ExperimentError if nothing but the silence of servos did, with a note about torque.
+    """The exception to raise in place of `error` if torque is off on all servos by now; None if it is not. This is the
+    exception because of which torque was cut, or an ExperimentError if only the silence of servos was the reason. It
+    has a note about torque.
     """
     report = bus.torque_off_report
     error.args = (str(report),)

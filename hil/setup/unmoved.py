@@ -1,7 +1,7 @@
-"""Whether the arm stays where it was first read until torque comes on.
+"""Check that the arm stays in the pose in which it was first read until torque is switched on.
 
-Without torque only a hand or gravity moves it. Otherwise its readings are no longer right: a horn slips, another servo
-answers, or another program changes Homing Offset. From then on every angle would be wrong.
+Without torque, only a hand or gravity can move it. Any other change means that its readings are no longer right: a horn
+slips, another servo answers, or another program changes Homing Offset. From then on every angle would be wrong.
 """
 
 import math
@@ -14,10 +14,10 @@ from hil.errors import ExperimentError
 __all__ = ["MOST_RAD", "Lies", "has_stirred", "refuse_moved", "where_it_lies"]
 
 MOST_RAD = 0.05
-"""Largest motion before torque is switched on [rad]; the guard allows as much before the start."""
+"""Largest motion before torque is switched on [rad]; the guard allows the same motion before the start."""
 
 STIRRED_RAD = 0.004
-"""Motion that noise of an encoder does not explain: the arm is not at rest [rad]."""
+"""Motion that encoder noise cannot explain [rad]: the arm is not at rest."""
 
 Lies = Mapping[Joint, int]
 """Present Position of each servo [ticks]."""

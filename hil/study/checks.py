@@ -20,7 +20,9 @@ _LOOKED_AT = 32
 
 
 def check_study(study: Study, out: Path) -> int:
-    """Number of runs. Raises ConfigError for an unknown field, an invalid value, or insufficient disk space."""
+    """Check a study; return its number of runs. Raises ConfigError for an unknown field, an invalid value, or
+    insufficient disk space.
+    """
     runs = run_count(study)
     if study.study.task in ON_ARM:
         step = max(1, runs // _LOOKED_AT)

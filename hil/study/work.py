@@ -37,9 +37,9 @@ _ONE_AT_A_TIME = threading.Lock()
 class Spec:
     """Specification of one run.
 
-    toml: the arm's file with this run's values in it, or "". versions: what the worker must have. seconds: processor
-    time after which the run has failed. recording: the run folder to estimate, or None. keep_in: where the run folder
-    stays, None for nowhere.
+    toml: the arm's file with this run's values in it, or "". versions: package versions that the worker must have.
+    seconds: processor time after which the run has failed. recording: the run folder to estimate, or None. keep_in:
+    where the run folder stays, None for nowhere.
     """
 
     run: int
