@@ -52,8 +52,9 @@ LEAST_OF_MEASURED = 0.75
 """`LEAST_SUPPLY` if the supply was measured: it may sag between two readings, and motors differ."""
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
-"""Fraction of the goal below which a current may as well be that of a servo without torque, and the voltage ratio
-then."""
+"""Fraction of the goal below which a servo without torque may also carry the current, and the `LEAST_OF_MEASURED` that
+applies then.
+"""
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Baud rates by the value of the register Baud Rate. The 330 models only go up to 4 MBd."""

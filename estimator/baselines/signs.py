@@ -113,7 +113,8 @@ def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | No
 def suspect_order(recordings: Sequence[Recording]) -> tuple[float, float] | None:
     """Return evidence that both the angles and the torques of two joints are in the opposite order.
 
-    As `suspect_swapped`. The zero of the outer joint's angle may be known only after the exchange.
+    The result is as for `suspect_swapped`. The zero of the outer joint's angle may be known only after the exchange of
+    columns.
     """
     if recordings[0].joints != 2:
         return None

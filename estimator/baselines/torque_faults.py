@@ -1,6 +1,7 @@
-"""Detection of torques that were not those of the column: clipped by the drive, or logged by another clock.
+"""Detection of motor torques that differ from the torque column: clipped by the drive, or logged with another clock.
 
-As for reversed columns (`hil.estimator.baselines.signs`), inverse dynamics judges the torque as given and as changed.
+As for reversed columns (`hil.estimator.baselines.signs`), the residual of inverse dynamics is compared for the torque
+as given and as changed.
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 
 BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
-"""Fractions of the samples beyond the levels at which clipping is tried."""
+"""Clipping is tried at the levels that these fractions of the samples exceed."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
 EVALUATIONS = 30  # of the search for delay and drift

@@ -60,7 +60,7 @@ class ChainChoice:
 def choose_chain(
     periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior, options: ChoiceOptions = OPTIONS
 ) -> ChainChoice:
-    """Estimate under `model`, and under richer ones if its residual is more than noise; choose the best supported.
+    """Fit `model`, and richer models if its residual is more than noise; choose the best-supported estimate.
 
     Raises whatever `identify_chain` raises for `model` itself.
     """

@@ -30,8 +30,8 @@ SYSTEMATIC = 1.1
 model error rather than noise.
 
 It is 0.6 to 0.9 for encoder rounding and noise. Torque ripple of 0.2 %, or load-dependent friction of 0.3 % of the
-torque, raises it to 2 or 3, while the residual still exceeds the noise by less than a tenth; friction of one joint that
-depends on its load, with a noisy encoder, to 1.5 or more.
+torque, raises it to 2 or 3, while the residual still exceeds the noise by less than a tenth. With a noisy encoder,
+load-dependent friction of one joint raises it to 1.5 or more.
 """
 
 SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005
@@ -169,7 +169,7 @@ def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int
 def largest_ratio(one: Array, other: Array) -> float:
     """Return the largest ratio of two vectors of standard errors, over the finite ones; infinite if there are none.
 
-    The largest and not the median: an effect that the model lacks may act in one joint alone.
+    The largest ratio is used, not the median, because an effect that the model lacks may act in one joint alone.
     """
     known = np.isfinite(one) & np.isfinite(other)
     return float(np.max(one[known] / other[known])) if known.any() else np.inf

@@ -35,7 +35,7 @@ VELOCITY_SAMPLES = 9  # at the beginning, from which the initial velocity is tak
 class MotionPiece(SettledPeriod):
     """A recording sampled at equal intervals, for the likelihood of settled periods. Its motion need not be periodic.
 
-    The torque before the first sample is taken to be the last one; the initial state absorbs the difference.
+    The torque before the first sample is assumed to equal the last one; the initial state absorbs the error.
     """
 
     def __post_init__(self) -> None:

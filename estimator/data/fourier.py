@@ -33,7 +33,8 @@ def lines_of(signal: Array) -> Lines:
 
 
 def noise_power(lines: Lines) -> Array:
-    """Return the mean |c|^2 of the noise per line (joints,), from the upper half of the lines, without excitation.
+    """Return the mean |c|^2 of the noise per line (joints,), from the upper half of the lines, which are not
+    excited.
 
     The median of an exponentially distributed power is log 2 times its mean and robust to a few outlying lines. Odd and
     even lines are evaluated separately: the rounding error of a motion whose second half mirrors its first has no even

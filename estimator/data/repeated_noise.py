@@ -73,8 +73,8 @@ def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
     """Return the standard deviation of one mean sample's noise in excess of white noise (joints,) [rad].
 
     It is 0 unless significant. On the lines on which the motion may have changed from pass to pass, the noise is
-    assumed to exceed that of the octave above by as much as that exceeds the next one's; if its correlation is long, it
-    is underestimated. Arguments and None: as for `repeated_noise`.
+    extrapolated: it is assumed to rise from the octave above by as much as it rises from the next octave to that one.
+    Noise with a long correlation is underestimated. Arguments and None: as for `repeated_noise`.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None
@@ -133,9 +133,11 @@ def _beyond_fast(power: Array, slow: int) -> Array:
 
 
 def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:
-    """Return the noise (joints,) [rad] from two upper bounds of it: their mean where they agree, else the smaller.
+    """Return the noise (joints,) [rad] from two upper bounds of it: their mean if they agree, otherwise the smaller
+    one.
 
-    Each is the median of a few lines and so has an error of its own; the smaller of two would be too small.
+    Each bound is the median of a few lines and has an error of its own, so the smaller of two that agree would be too
+    small.
 
     Args:
         white: bound from the fastest lines of a period of `samples` samples (joints,) [rad].

@@ -53,7 +53,9 @@ class SettledPeriod:
     (`hil.estimator.data.repeated_noise`).
     """
     coloured_noise: Array | None = None
-    """The part of that error which is not white (joints,) [rad], from the same difference, if known."""
+    """Standard deviation of the part of that error that is not white (joints,) [rad], from the same difference, if
+    known.
+    """
     stabiliser: Stabilised | None = None
     """The software stabiliser, if one produced part of `torque`.
 
@@ -71,7 +73,7 @@ class SettledPeriod:
     """Standard deviation of one sample's error (joints,) [rad]: the measured white noise, at least that of rounding,
     and coloured noise.
 
-    The fastest lines of a motion sampled slowly are not noise: what repeats from period to period does not count.
+    If a motion is sampled slowly, its fastest lines are not only noise: what repeats from period to period is left out.
     """
 
     def __post_init__(self) -> None:
@@ -112,11 +114,11 @@ class SettledPeriod:
 def without_spikes(period: SettledPeriod) -> SettledPeriod:
     """Return the period with single outliers (such as a bit error on the bus) marked as missing.
 
-    A reading is an outlier if its distance from the median of itself and two neighbours on either side, and that from
-    a cubic through its neighbours, exceed SPIKE encoder steps and SPIKE times the typical distance from the median. The
-    median alone would take every fast reversal at a low rate for an outlier, since most readings of a steadily moving
-    joint are the median themselves. If the fraction of such readings exceeds MOST_SPIKES, they are not outliers: the
-    joint moves fast compared with the sample rate.
+    Two distances of a reading are computed: from the median of itself and two neighbours on either side, and from a
+    cubic through its neighbours. It is an outlier if both exceed SPIKE encoder steps and SPIKE times the typical
+    distance from the median. The median alone would take every fast reversal at a low rate for an outlier, since most
+    readings of a steadily moving joint are the median themselves. If the fraction of such readings exceeds MOST_SPIKES,
+    they are not outliers: the joint moves fast compared with the sample rate.
     """
     from scipy.ndimage import median_filter
 

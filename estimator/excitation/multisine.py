@@ -66,7 +66,7 @@ class Multisine:
 
 
 def counted(count: int, noun: str) -> str:
-    """The number and the noun, in the plural unless there is one."""
+    """Return the number followed by the noun, in the plural unless the number is 1."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 

@@ -56,7 +56,7 @@ class Scatter:
 def correlation_time(residuals: Sequence[Array], options: CovarianceOptions = DEFAULTS) -> int:
     """Return twice the lag [samples] beyond which no residual (joints, samples) of any run is correlated.
 
-    That is where the autocorrelation first falls into the range expected of white noise.
+    At this lag the autocorrelation first falls into the range expected of white noise.
     """
     longest = options.min_lag
     for residual in residuals:
@@ -101,7 +101,7 @@ def robust_covariance(
     structured: float = 0.0,
     expected: Array | None = None,
 ) -> Array:
-    """Return the covariance of the first `count` coordinates (count, count), the others being unknown as well.
+    """Return the covariance of the first `count` coordinates (count, count); the others count as unknown, too.
 
     It is the larger of the sandwich and the covariance for independent errors, direction by direction, since a short
     recording cannot prove that its errors cancel. It is infinite for a coordinate without influence on the residual.
@@ -133,7 +133,7 @@ def robust_covariance(
 
 
 def is_unpredictable(at: Quadratic, samples: int) -> bool:
-    """Return whether the motion is so sensitive that its derivatives are only valid for the smallest changes.
+    """Return whether the motion is so sensitive that its derivatives are valid only for extremely small changes.
 
     Coordinates are of order 1. If a change of 1e-6 alters a sample by ten times the noise, the simulation diverges; its
     standard errors would be tiny and meaningless.
@@ -145,7 +145,7 @@ def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: fl
     """Return the factor (coordinates,) by which each coordinate's variance exceeds that under independent errors.
 
     That is the ratio of the variances from the data alone, with and without what `robust_covariance` adds for
-    correlated errors and model errors; the arguments are the same.
+    correlated errors and model errors. It takes the same arguments.
     """
     if is_unpredictable(at, samples):
         return np.ones(len(at.normal))

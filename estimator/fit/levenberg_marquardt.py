@@ -59,8 +59,8 @@ def minimise(
 ) -> Minimum:
     """Minimise a sum of squares from `start`, in coordinates of order 1.
 
-    Where the sum alone is much cheaper to compute than its normal equations, `cost` avoids computing these for rejected
-    steps, and a step that succeeds is compared with less damped ones.
+    If the sum alone is much cheaper to compute than its normal equations, pass `cost`: normal equations are then not
+    computed for rejected steps, and a step that succeeds is compared with less damped ones.
 
     Damped steps are short along weakly determined directions and would end the iteration too early there: near the
     minimum, `damping` should start at `options.min_damping`.

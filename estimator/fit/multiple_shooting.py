@@ -8,9 +8,9 @@ them.
 
 Short segments are fitted first, since they converge even from a poor initial guess; a subset of them suffices to get
 close to the minimum. Longer segments then refine the result, first with coarse integration steps. A segment whose
-residual is larger than usual is downweighted accordingly, for instance if a joint stuck in it, which no smooth friction
-reproduces: with equal weights, the segments that the model explains worst would dominate. The typical size of small
-terms (`Term.spread`) serves as a prior, weighted relative to the residual.
+residual is larger than usual is downweighted accordingly. An example is a segment in which a joint stuck, which no
+smooth friction reproduces. With equal weights, the segments that the model explains worst would dominate. The typical
+size of small terms (`Term.spread`) serves as a prior, weighted relative to the residual.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -304,8 +304,8 @@ def estimate_by_shooting(
         start: initial guess of the base parameters (base parameters,) [SI], such as that of
             `hil.estimator.baselines.idim`.
         length: nominal length of a segment [s].
-        zeros: also estimate the encoders' zero errors, one per joint and recording, for servos whose zero is set again
-            at every start. They can only be determined with gravity.
+        zeros: also estimate the encoders' zero errors, one per joint and recording, for servos that set their zero
+            again at every start. They can only be determined with gravity.
         of: which segments of each recording to fit; the others are left for validation.
         near: estimate with another model or other segments of the same recordings, used as the only initial guess.
         options: tolerances and limits.

@@ -1,8 +1,8 @@
 """Unconstrained coordinates for the likelihood: no step can leave the physical range.
 
 The range, scale and longest step of each parameter are declared in `hil.estimator.models.terms`. Positive parameters
-are exponentials. Coupling is a fraction of its bound, sqrt(inertia_1 inertia_2) tanh(z), which holds for every arm with
-positive masses and keeps the mass matrix positive definite; likewise the asymmetry of viscous friction, viscous
+are exponentials. Coupling is a fraction of its bound, sqrt(inertia_1 inertia_2) tanh(z). This bound holds for every arm
+with positive masses and keeps the mass matrix positive definite. Likewise, the asymmetry of viscous friction is viscous
 tanh(z), which keeps friction positive in both directions. The width of the smoothed Coulomb step stays above a floor.
 """
 

@@ -20,7 +20,9 @@ from hil.estimator.options import LinearOptions
 
 Wave = Literal["ripple", "cogging"]
 WAVES: tuple[Wave, ...] = get_args(Wave)
-"""Options that are waves over the joint's angle: a torque proportional to the motor's (ripple), or not (cogging)."""
+"""Options that are waves over the joint's angle: a torque proportional to the motor's (ripple) or independent of it
+(cogging).
+"""
 CYCLES = np.arange(3.0, 40.01, 0.25)  # per turn of the joint; slower variations come from gravity, cables, encoders
 COULOMB_WIDTH = LinearOptions().coulomb_width
 STRIBECK_VELOCITY = 0.15  # rad/s: a rough value suffices to separate the Stribeck rise from the ripple

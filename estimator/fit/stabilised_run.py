@@ -6,7 +6,7 @@ simulation uses the commanded torque and this spring instead of the loop: an arm
 to the real one, and where model and arm agree the spring has no effect. The stabiliser's damper is left out: it only
 determines how fast deviations decay.
 
-The springs pull the simulated joints to where the real ones were, so the encoders' errors, as far as the model has any,
+The springs pull the simulated joints to where the real ones were. Therefore the encoder errors that the model includes
 are removed from the measured angles; otherwise a spring would exert a torque that never acted on the arm.
 """
 

@@ -1,8 +1,8 @@
 """Parameters at a bound of their range, although the data favour values beyond it.
 
 A fit cannot leave the physical range: an inertia stays positive, a coupling below the geometric mean of its inertias.
-Where the model is wrong or the recording carries little information, the best value may lie outside. The fit then ends
-at the bound, which its standard error does not reflect, and the other parameters absorb the difference. A parameter
+Where the model is wrong or the recording carries little information, the best value may lie outside. The fit then stops
+at the bound, which the standard errors do not reflect, and the other parameters absorb the difference. A parameter
 whose true value is zero, such as the Stribeck term of a joint without Stribeck friction, also ends there but does no
 harm: the undamped step of the normal equations, in the parameters themselves, distinguishes the two cases.
 """
@@ -42,8 +42,8 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
 def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Array) -> Mask:
     """Return which parameters (parameters,) lie at a bound, `lower` or `upper`, and are driven beyond it by the data.
 
-    std: standard errors for independent errors. Those that account for the misfit would hide it where the bound itself
-    causes the misfit.
+    std: standard errors for independent errors. Standard errors that account for the misfit would hide this if the
+    bound itself causes the misfit.
     """
     best, near = value + step, NEAR * np.abs(step)
     below: Mask = (best < lower - SURE * std) & (value - lower <= near)
@@ -52,9 +52,10 @@ def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Arr
 
 
 def finite_std(std: Array, white: Array) -> Array:
-    """Return standard errors `std` (parameters,), replaced where they are infinite, as at a bound.
+    """Return the standard errors `std` (parameters,), with finite values in place of infinite ones, such as those at a
+    bound.
 
-    white: standard errors for independent errors, which are widened there as those of the other parameters are.
+    white: standard errors for independent errors. They are used there, widened as those of the other parameters are.
     """
     known = np.isfinite(std) & (white > 0.0)
     wider = float(np.median(std[known] / white[known])) if known.any() else 1.0
@@ -63,8 +64,8 @@ def finite_std(std: Array, white: Array) -> Array:
 
 
 def matters(names: tuple[str, ...], beyond: Mask, step: Array, std: Array) -> bool:
-    """Return whether a base parameter, other than offsets, is at its bound (`beyond`) or would move by more than its
-    standard error `std`, which accounts for the misfit; a parameter's own bound may be what causes that misfit.
+    """Return whether a base parameter, other than an offset, is at its bound (`beyond`) or would move by more than its
+    standard error `std`. The latter accounts for the misfit, which a parameter's own bound may have caused.
     """
     base = np.array([term_of(name).part == "base" and kind_of(name) != "offset" for name in names])
     return bool(beyond[base].any() or np.any(np.abs(step[base]) > MOVED * std[base]))

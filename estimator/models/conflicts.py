@@ -15,8 +15,8 @@ from hil.estimator.models.terms import kind_of, term_of
 
 FAR = 4.0  # standard deviations
 LARGE_RATIO, LARGE_ANGLE = 0.35, 0.3
-"""Relative and absolute deviations [1, rad] of what the file gives that neither a magnet's temperature nor a tolerance
-nor one tooth of a horn explains.
+"""Smallest relative and absolute deviation [1, rad] from a value in the file that is too large to be due to a magnet's
+temperature, a tolerance, or one tooth of a horn.
 """
 LARGE_SPREAD = 0.3  # standard deviation of a logarithm that is printed as a factor
 Trust = Literal["yes", "with care", "no"]

@@ -5,8 +5,8 @@ Evolutionary Computation 9 (2001) 159, with one step size for all) on the finite
 `hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation is scaled to the
 limits of position and speed and then shrunk until `allowed` accepts it.
 
-Friction is unknown too, and its model is no better than that of the links. Otherwise slow, creeping motion would seem
-to identify a light joint, whose torque is mostly friction.
+Friction is treated as unknown too, with a model no better than that of the links. If it were known, slow, creeping
+motion would seem to identify a light joint, whose torque is mostly friction.
 
 This designer is for the pilot, which knows only limits: it also chooses the centre and the width of the motion. For a
 box that the user has chosen, `fourier_path.design_path` is simpler; its criterion, the prediction of other motions in
@@ -173,7 +173,7 @@ class PathDesigner:
     def widest(self, centre: Array, seed: int, tries: int = WIDEST_OF) -> Design:
         """Return the random path about a centre that maximises the range of the joint that moves least, for validation.
 
-        A prediction cannot be verified to be more accurate than encoder rounding relative to the motion. Raises
+        Validation needs a wide motion, because it cannot resolve prediction errors below encoder rounding. Raises
         ExcitationError if no path is allowed.
         """
         random = np.random.default_rng(seed)

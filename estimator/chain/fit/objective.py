@@ -66,8 +66,8 @@ class ChainProblem:
     finer: int = 1
     """Number of smaller integration steps that replace one where a joint may be near standstill."""
     every: int = 1
-    """Only every `every`-th sample is compared, with integration steps longer by that factor; above 1 only if `steps`
-    is 1.
+    """Only every `every`-th sample is compared, with integration steps longer by that factor; it may exceed 1 only if
+    `steps` is 1.
     """
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; less near the minimum."""

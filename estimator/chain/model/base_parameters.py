@@ -25,15 +25,15 @@ ORDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0)  # of a link's parameters: moments, i
 SAMPLES = 150
 KINDS = (slice(1, 4), slice(4, 10), slice(10, 11), slice(0, 1))  # moments, inertias, armature, mass
 CLEARLY_INDEPENDENT = 0.1
-"""Norm of the part of a column that the columns kept so far do not explain, above which the column is kept at once.
+"""A column is kept at once if the part that the columns kept so far do not explain has a norm above this value.
 
-It is relative to the largest column of the same link and kind.
+The norm is relative to the largest column of the same link and kind.
 """
 INDEPENDENT = 2e-3
-"""Norm of that part, on the same scale, above which the column is kept in the end.
+"""A column is kept in the end if the norm of that part, on the same scale, is above this value.
 
-Angles such as 1.57 or 1.5708 in a description make every parameter slightly independent, but change no torque by more
-than this fraction of what the parameter contributes where it counts. No recording would determine such a parameter.
+Rounded angles such as 1.57 or 1.5708 in a description make every parameter slightly independent. They change no torque
+by more than this fraction of the parameter's contribution, so no recording would determine such a parameter.
 """
 LEAST_FACTOR = 1e-7  # of a group
 NOTHING = 1e-9

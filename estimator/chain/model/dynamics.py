@@ -73,7 +73,9 @@ def regressor(
 
 
 def places(joints: int, chosen: Columns) -> Columns:
-    """Return the index of each link's parameters among the chosen ones (joints, 11); for others, the number chosen."""
+    """Return the index of each link's parameters among the chosen ones (joints, 11). The index of any other parameter
+    is the number of chosen ones.
+    """
     column = np.full(TERMS * joints, chosen.size)
     column[chosen] = np.arange(chosen.size)
     return column.reshape(joints, TERMS)

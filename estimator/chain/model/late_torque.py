@@ -2,8 +2,8 @@
 
 The back-EMF passes the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the product of
 its back-EMF and its lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due to
-it. No lag of a winding makes a joint lighter by more than half of its inertia, where the poles of the equivalent motor
-meet, so parameters that ask for more, far from the minimum of a fit, are limited to that.
+it. The lag of a winding makes a joint lighter by at most half of its inertia, where the poles of the equivalent motor
+meet. Parameters that imply more, far from the minimum of a fit, are limited to that.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
 """Meanings of the kinds of parameters that only chains have."""
 PART = 0.1
-"""Smallest share of a joint in the motion that loses inertia, for the joint to be named."""
+"""A joint is named if its share in the motion that loses inertia is at least this large."""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
 _ARMATURE = 10  # of a link's parameters
@@ -85,7 +85,8 @@ of the parameters on which its lagging back-EMF depends, by their index.
 
 
 def losses(base: BaseParameters, parameters: Mapping[str, float], names: tuple[str, ...]) -> Losses:
-    """Return how the arm of `as_moving` depends on what makes it lighter, for `complete`.
+    """Return how the inertias of the arm of `as_moving` depend on the parameters that make it lighter, for
+    `complete`.
 
     names: the parameters with respect to which to differentiate; the base parameters come first.
     """
@@ -108,8 +109,9 @@ def losses(base: BaseParameters, parameters: Mapping[str, float], names: tuple[s
 
 
 def complete(lost: Losses, derivative: Array) -> None:
-    """Convert derivatives of positions (samples, joints, parameters) in place, from those with respect to the
-    parameters of the arm of `as_moving` to those with respect to the actual arm's. lost: the result of `losses`.
+    """Convert derivatives of positions (samples, joints, parameters) in place: they are given with respect to the
+    parameters of the arm of `as_moving`, and are needed with respect to those of the actual arm. lost: the result of
+    `losses`.
     """
     for rotor_, changes in lost:
         by_rotor = derivative[:, :, : rotor_.size] @ rotor_

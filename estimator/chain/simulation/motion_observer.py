@@ -4,9 +4,9 @@ Angles, velocities and commanded torques pass the same first-order low-pass filt
 The residual torque, `torque - Y(q, v, a) theta`, is compared with its uncertainty, due to the parameters' covariance,
 rounding of the velocities, and noise that is estimated while the arm moves. The parameters are updated as well (a
 Kalman filter for slowly drifting constants), so the tolerance narrows over time. As in
-`hil.estimator.models.momentum_observer`, which planar arms use, an alarm requires a residual that, after subtraction of
-the friction that can hold a joint at rest, exceeds `TIMES` standard deviations and a fraction of the largest planned
-torque for `HOLD_S`; large residuals raise it sooner.
+`hil.estimator.models.momentum_observer`, which planar arms use, the friction that can hold a joint at rest is
+subtracted from the residual. There is an alarm if the rest exceeds `TIMES` standard deviations and a fraction of the
+largest planned torque for `HOLD_S`; large residuals raise it sooner.
 
 The noise estimate describes motion, so it only learns from motion: the residual of a joint at rest is due to friction,
 or to something that blocks it, and would otherwise widen the tolerance until nothing exceeded it. A joint at rest is
@@ -61,7 +61,7 @@ class ChainObserver:
     covariance: covariance of `mean`.
     largest: largest planned torque of each joint (joints,) [N m].
     interval: sampling interval [s].
-    frictions: multiple of dry friction, as far as it is known, that serves as a lower bound on this torque scale.
+    frictions: `largest` is raised to at least this multiple of dry friction, as far as that is known.
 
     Raises ValueError for arrays of other shapes.
     """

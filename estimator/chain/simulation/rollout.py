@@ -1,4 +1,5 @@
-"""Closed-loop simulation of chains under goal torques: what an experiment would do to arms that may be the real one.
+"""Closed-loop simulation of chains under goal torques: how arms that may be the real one would move in an
+experiment.
 
 At each sample, a goal torque is added to the torque of a software spring and damper, which is computed from angles and
 velocities of the previous sample as in the real loop. In between, the motion is integrated by the linearly implicit
@@ -77,9 +78,8 @@ class Loop:
     pose: rest pose (joints,) [rad], on a surface that stops joints from being moved further down by gravity.
     limit: largest commanded torque (joints,) [N m].
     stops: side on which a joint lies on its own stop in the rest pose (joints,), -1, 1, or 0 if it does not; None if
-    none does. A stop supports its joint instead of the surface, and wherever the other joints are. Nothing supports a
-    joint whose largest torque is 0.
-    pull: added to the spring and damper; None if they act alone.
+    none does. A stop supports its joint instead of the surface, whatever the angles of the other joints. Nothing
+    supports a joint whose largest torque is 0. pull: added to the spring and damper; None if they act alone.
     """
 
     rate: float
@@ -120,7 +120,7 @@ class Motions:
 def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = None) -> Motions:
     """Return the motions of all arms from angles `start` (joints,) or (arms, joints) [rad].
 
-    They start at rest unless `speed` is given, of the same shape [rad/s].
+    They start at rest unless `speed` [rad/s] is given, which has the same shape as `start`.
     """
     n, samples = arms.base.chain.joints, len(loop.goal)
     at = np.broadcast_to(start, (arms.size, n))

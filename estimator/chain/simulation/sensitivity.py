@@ -106,8 +106,8 @@ class Simulation:
     def go_on(self, run_: ChainRun, piece: slice) -> tuple[Array | None, Array]:
         """Simulate the next `piece` of the samples.
 
-        Returns the angles (samples, joints) [rad], None if the motion diverges, and their derivatives (samples, joints,
-        causes).
+        Returns the angles (samples, joints) [rad], None if the motion diverges, and their derivatives with respect to
+        `names` and the initial state (samples, joints, causes).
         """
         torque, measured = run_.torque[piece], run_.measured[piece]
         position = np.empty(measured.shape)
