@@ -155,8 +155,8 @@ class LikelihoodOptions:
     """Maximum relative decrease of a Coulomb width per iteration with coarse steps, far from the minimum."""
 
     same_motion: float = 0.02
-    """Relative difference between the sums of squares with coarse and with fine steps up to which coarse ones may
-    continue.
+    """Coarse steps may continue as long as their sum of squares differs from that with fine steps by less than this
+    fraction.
     """
     same_cost: float = 1.0
     """Minima whose sums of squares differ by less than this count as the same."""
@@ -167,7 +167,9 @@ class LikelihoodOptions:
     hopeless_cost: float = 2.0
     """Cost per sample above which a coarse fit is abandoned."""
     refine_ratio: float = 1.01
-    """Ratio to the best sum of squares up to which another candidate may still end lower."""
+    """A candidate with up to this multiple of the best sum of squares may still reach a lower one when it is
+    refined.
+    """
     outlier_threshold: float = 4.0
     """Residual in standard deviations above which a sample is downweighted; rounding alone stays below 1.7."""
     threads: int = 8
@@ -241,7 +243,7 @@ class SelectionOptions:
     """Options for choosing a friction model by held-out error."""
 
     keep_ratio: float = 0.98
-    """Error relative to the best model so far that a richer model must reach to be kept."""
+    """A richer model is kept only if its error is below this fraction of the error of the best model so far."""
     explained_error: float = 1.05
     """RMS prediction error in units of the noise below which no further term is tried."""
     explained_residual: float = 1.02
@@ -259,7 +261,9 @@ class SelectionOptions:
     max_restarts: int = 6
     """Maximum number of fits from other initial guesses."""
     overrule_ratio: float = 0.8
-    """Prediction error relative to the chosen model's that another model must reach to replace it."""
+    """Another model replaces the chosen one only if its prediction error is below this fraction of the chosen
+    model's.
+    """
     wave_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))
     """Numbers of ripple and cogging cycles per turn that are tried."""
     max_wave_peaks: int = 3

@@ -188,7 +188,9 @@ def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def found_beside(folder: Path, name: str) -> Path:
-    """Return the file meant by the path `name` in a TOML file in `folder`: that path, or the same name in `folder`."""
+    """Return the file at the path `name`, which a TOML file in `folder` gives; if there is none, the same name in
+    `folder`.
+    """
     named = folder / name
     return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name
 
@@ -224,7 +226,7 @@ def load_fake(path: Path | str) -> FakeArm:
 def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
     """Return the described bus: servos switched on at the clock's current time, the arm at rest in its initial pose.
 
-    Raises PlantError if a custom plant is described and cannot be created, or lacks what its faults or moves need.
+    Raises PlantError if a custom plant cannot be created, or does not support the faults or moves that are described.
     """
     servos = [
         EmulatedServo(

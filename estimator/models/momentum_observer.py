@@ -19,8 +19,9 @@ range. A deviation that may become an alarm enters that estimate only once it ha
 that is held for long would widen the range until nothing exceeds it. While a joint stands still its noise is lower,
 since most of it needs motion.
 
-What friction can hold includes the viscous friction at the speeds of the usual motion: over a small motion, in which
-the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once it stands.
+What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which the
+gear's presliding softens every reversal, dry friction looks viscous. It nevertheless holds the joint once it stands
+still.
 
 Errors of the model last longer than the interval between two updates, and so does the rounding of a velocity that stays
 below one tick: they are not new information each time. Therefore each update counts only as a fraction of one.
@@ -91,7 +92,7 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: multiple of dry friction, as far as it is known, that serves as a lower bound on this torque scale: near
+    frictions: lower bound on this torque scale, as a multiple of dry friction, as far as that is known: near
     standstill, friction behaves differently from the model.
     """
 
@@ -138,7 +139,7 @@ class MomentumObserver:
 
     @property
     def lacking(self) -> list[float]:
-        """Commanded torque minus that which explains the latest motion (joints,) [N m]."""
+        """Commanded torque minus the torque that explains the latest motion (joints,) [N m]."""
         return [float(value) for value in self._memory[_SINGLE, _LACKING : _LACKING + self._joints]]
 
     @property

@@ -5,9 +5,10 @@ Where the band lies depends on gravity and offsets, which may be poorly known; i
 is compared with the largest and the smallest one since the joint came to rest: at an unchanged angle, gravity and
 offset cancel in their difference, and so do their errors. Only what other joints' motion changes has to be modelled.
 
-A torque outside the band accelerates a free joint. The joint is blocked once it would have gained a momentum that shows
-in the velocity register, wherever the band lies: half of the excess may be on its other side. A joint that does move
-again was held by friction: a torque that it withstood until then never raises an alarm again.
+A torque outside the band accelerates a free joint. The joint counts as blocked once a free joint would have gained
+enough momentum to show in the velocity register. Half of the excess may be on the other side of the band, since its
+position is unknown. If a joint does move again, it had been held by friction: a torque that it withstood before never
+raises an alarm again.
 
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """
@@ -23,10 +24,12 @@ WITHIN_RAD = 0.004
 """Largest change of the angle of a joint that is at rest [rad]: noise of the encoder and the play of a gear."""
 
 AT_REST = 0.95
-"""Filtered indicator of standstill above which a joint counts as at rest: deceleration has left the filters."""
+"""Filtered indicator of standstill above which a joint counts as at rest; by then, its deceleration has decayed in the
+filters.
+"""
 
 HOLD_S = 0.03
-"""Shortest time for which the torque must lie outside the band [s]: a gear crosses its play."""
+"""Shortest time for which the torque must lie outside the band [s], so that a gear can cross its play."""
 
 _SINGLES = 9
 # Scalars of a joint, before its two equations: angle at which it came to rest, whether an equation is stored, half of

@@ -32,7 +32,7 @@ from hil.estimator.options import IntegrationOptions
 MAX_LAG_SHARE = 0.05  # fraction of the samples over which a residual's autocorrelation is summed
 INTEGRATION = IntegrationOptions()
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
-"""Terms that vanish smoothly, so that including them adds little cost to a fit."""
+"""Terms whose effect vanishes smoothly at zero, so that including them adds little cost to a fit."""
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,7 @@ def simulated_run(period: SettledPeriod) -> Run:
 
 
 def colour(residual: Array) -> float:
-    """Return the integrated autocorrelation of a residual (joints, samples), worst joint; 1 is white.
+    """Return the integrated autocorrelation of a residual (joints, samples), for the worst joint; 1 is white.
 
     Missing samples count as 0.
     """
@@ -286,8 +286,8 @@ def _sizes(period: SettledPeriod, estimate: Estimate) -> Sizes:
 
 
 def by_parameters(period: SettledPeriod, estimate: Estimate) -> Array:
-    """Return the derivatives of positions with respect to all causes (joints, samples, causes), over the residual's
-    RMS.
+    """Return the derivatives of positions with respect to all causes (joints, samples, causes), divided by the
+    residual's RMS.
 
     The causes are the estimate's parameters, followed by the initial state, as in `Linearised`.
     """

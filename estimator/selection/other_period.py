@@ -19,7 +19,7 @@ def predict_period(estimate: Estimate, other: SettledPeriod) -> Array:
     on: a motion that counts as settled may still contain the end of a transient, which depends on where friction held
     the arm before. If that state is not known, the arm is simulated from rest until its motion repeats.
 
-    Raises PeriodicityError if it does not.
+    Raises PeriodicityError if that motion never repeats.
     """
     if other.before is not None:
         return _from_before(Physics.of(estimate.parameters), other, other.before)

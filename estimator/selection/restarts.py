@@ -1,6 +1,6 @@
 """Other initial guesses for an estimate that may be a local minimum.
 
-The likelihood has several minima where a term acts in a narrow range: the width of the Coulomb step, the stiffness of
+The likelihood has several minima if a term acts in a narrow range: the width of the Coulomb step, the stiffness of
 bristles (once they are too stiff to bend, the data do not reveal how stiff), and the periods of torque ripple and
 cogging.
 """

@@ -34,7 +34,8 @@ def friction_torque(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def steadied(period: SettledPeriod, estimate: Estimate, drift: Drift) -> SettledPeriod:
-    """Return `period` with the torque that its motion would have needed if friction had stayed as it was in its middle.
+    """Return `period` with the torque that its motion would have needed if friction had always been that in
+    mid-period.
 
     estimate: fitted to this period, or to one under the same friction. drift: change of friction over `drift.seconds`.
     """

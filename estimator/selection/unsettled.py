@@ -29,7 +29,7 @@ from hil.estimator.selection.segments import held_out_errors, missing_terms
 DEFAULTS = SelectionOptions()
 FITTED, PREDICTED = slice(0, None, 2), slice(1, None, 2)
 SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable")
-"""Terms that vanish smoothly, so that including them adds little cost to a fit."""
+"""Terms whose effect vanishes smoothly at zero, so that including them adds little cost to a fit."""
 FINE = ShootingOptions()
 QUICK = ShootingOptions(ftol=1e-3, max_step=FINE.coarse_step, reweightings=1)
 """Options of fits that are only compared with each other."""
@@ -45,7 +45,9 @@ class SegmentTrial:
     held_out: Array | None
     """RMS error relative to the motion's RMS (joints,); None if the fit did not converge."""
     score: float
-    """Median of the segments' relative errors over all joints; one in which the arm tumbles can be far off."""
+    """Median of the segments' relative errors over all joints, since the error of one in which the arm tumbles can be
+    huge.
+    """
     seconds: float
 
 

@@ -60,18 +60,17 @@ class Evidence:
     """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,), excluding encoder
     noise.
 
-    Where friction has changed since the fitted motion, the prediction uses one factor per joint taken from the held-out
+    If friction has changed since the fitted motion, the prediction uses one factor per joint taken from the held-out
     motion itself.
     """
     held_out_as_fitted: Array | None = None
-    """Like `held_out`, but with friction as it was in the fitted motion (joints,); None where it has not changed.
-    """
+    """Like `held_out`, but with friction as it was in the fitted motion (joints,); None if it has not changed."""
     candidates: Sequence[Candidate] = ()
     """Missing terms, most significant first."""
     drift: Drift | None = None
     """Change of friction while the arm moved."""
     torque: TorqueChange | None = None
-    """Constant torque in the held-out motion, where that explains it better than a change of friction."""
+    """Constant torque in the held-out motion, if that explains the motion better than a change of friction."""
     disturbances: tuple[str, ...] = field(default=())
     """Faults of the recording itself, as sentences; they explain the residual and any change of friction."""
     doubts: tuple[str, ...] = field(default=())

@@ -15,8 +15,8 @@ from hil.estimator.selection.candidates import columns_of, simulated_run
 
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 COMPARABLE = 0.3
-"""Other numbers of cycles are tried too if they decrease the sum of squares by at least this fraction of what the best
-one does.
+"""Other numbers of cycles are tried too if they decrease the sum of squares by at least this fraction of the largest
+decrease.
 """
 
 
@@ -30,9 +30,9 @@ def wave_peaks(
     """Return the numbers of `cycles` per turn at which a wave explains more than at neighbouring ones, best first.
 
     The part that the fitted parameters explain is removed first. The result is by parameter name. If the estimate's
-    model includes a wave that is sought, that wave is disabled first. While other terms have absorbed part of a wave,
-    the best number may be wrong: those that explain at least the fraction `COMPARABLE` of what it explains are returned
-    as well.
+    model includes a wave that is sought, that wave is disabled first. If other terms have absorbed part of a wave, the
+    best number may be wrong. Numbers that explain at least the fraction `COMPARABLE` of what the best one explains are
+    therefore returned as well.
 
     only: joints, from 1, that are considered; by default all.
     """

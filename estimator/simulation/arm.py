@@ -118,8 +118,8 @@ def bump_at(ratio: float) -> float:
 
 
 def bend_at(v: float, sharp: float) -> tuple[float, float]:
-    """Return tanh(v sharp) and its derivative with respect to v, from one exponential: the library's takes twice as
-    long.
+    """Return tanh(v sharp) and its derivative with respect to v, from one exponential; the library's tanh takes twice
+    as long.
     """
     past = 2.0 * abs(v) * sharp
     if not past < FADED:

@@ -3,11 +3,11 @@
 Bytes take wire time (ten bits each). A packet takes effect when its last byte arrives: the plant is advanced to that
 moment with the previous motor currents, then the addressed servos act. Replies start after the servo's return delay and
 reach the host `adapter_latency_us` later. When the host writes, everything up to the last packet of that write is
-computed, even where it lies ahead of the clock. Between two packets only Bus Watchdogs, the servos' own loops and
-faults can act, and the plant's advance is split at the moment they do.
+computed, even if it lies ahead of the clock. Between two packets only Bus Watchdogs, the servos' own loops and faults
+can act, and the plant's advance is split at the moment they do.
 
-When two transmit at once, host and servo or two servos, both are lost: the later packet, and the rest of the earlier
-one. Which servos act and reply is decided in `hil.fakes.bus.instructions`.
+When host and servo, or two servos, transmit at once, the later packet and the rest of the earlier one are lost. Which
+servos act and reply is decided in `hil.fakes.bus.instructions`.
 """
 
 import math
