@@ -64,7 +64,7 @@ class Servo:
         return self.read_entry(self.table[register], attempts, despite_error=True)
 
     def read_entry(self, entry: Register, attempts: int = _ATTEMPTS, *, despite_error: bool = False) -> int:
-        """Read a register that is missing from the model's table; same errors as `read`.
+        """Read a register that is missing from the model's table. Raises the same errors as `read`.
 
         despite_error: also accept a reply that carries the value and reports an error.
         """
@@ -98,7 +98,8 @@ class Servo:
         return entry.decode(bytes(self._try(f"reading {entry.name}", ask, attempts, is_read=True)))
 
     def write(self, register: str, value: int, attempts: int | None = None) -> None:
-        """Write a register and read it back; same errors as `read`, and ServoRefused if another value is read back.
+        """Write a register and read it back. Raises the same errors as `read`, and ServoRefused if another value is
+        read back.
 
         attempts: how often the write, and then the read, may be tried; by default as often as in all set-up work.
         """
@@ -128,7 +129,9 @@ class Servo:
             raise refused or _not_held(self.title, register, value, actual)
 
     def write_only(self, register: str, value: int, attempts: int = _ATTEMPTS) -> None:
-        """Write a register without reading it back, as needed for ID and Baud Rate; same errors as `read`."""
+        """Write a register without reading it back, as needed for ID and Baud Rate. Raises the same errors as
+        `read`.
+        """
         entry = self.table[register]
         data = list(entry.encode(value))
 
@@ -139,7 +142,7 @@ class Servo:
         self._try(f"writing {value} to {register}", send, attempts)
 
     def hardware_error(self) -> HardwareError:
-        """Return the Hardware Error Status, the reason for a raised alert bit; same errors as `read`."""
+        """Return the Hardware Error Status, the reason for a raised alert bit. Raises the same errors as `read`."""
         return HardwareError(self.read("Hardware Error Status"))
 
     def _try(

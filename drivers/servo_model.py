@@ -52,8 +52,8 @@ LEAST_OF_MEASURED = 0.75
 """`LEAST_SUPPLY` if the supply was measured: it may sag between two readings, and motors differ."""
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
-"""Fraction of the goal below which a servo without torque may also carry the current, and the `LEAST_OF_MEASURED` that
-applies then.
+"""A current below the first fraction of its goal may also be that of a servo without torque; the second value then
+replaces `LEAST_OF_MEASURED`.
 """
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
@@ -183,7 +183,7 @@ class ServoModel:
         """Torque at the output shaft at rest per volt [N m/V]: stall torque over supply voltage.
 
         In PWM mode the motor's torque is this times the applied voltage, minus the effect of the back-EMF; an
-        identified viscous friction then includes the latter.
+        identified viscous friction then includes the back-EMF.
         """
         return _spread([stall.torque / stall.voltage for stall in self.stalls])
 

@@ -138,8 +138,8 @@ mean.
 def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans]:
     """Return the registers that end with the goal, and those that end with SETTINGS.
 
-    They begin at an earlier address than necessary: the answers then differ in length from those to usual reads of
-    other programs.
+    They begin at an earlier address than necessary: the answers then differ in length from those that other programs
+    usually request.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
     goals = [_status_names(own)[:2] for own in modes]

@@ -7,7 +7,7 @@ as its Bus Watchdog waits: every packet feeds the watchdog of a servo that recei
 refuses instructions or its ID has changed. For the same reason servos that did not answer the last exchange are not
 polled before that. Then the remaining servos are tried again, several times.
 
-Ctrl-C raises KeyboardInterrupt wherever the program happens to be, even between two servos while torque is being cut. A
+Ctrl-C raises KeyboardInterrupt at any point of the program, even between two servos while torque is being cut. A
 program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
 signals back while torque is cut.
 """
@@ -168,8 +168,8 @@ def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseExcepti
 def cut_again(servo: Servo, *, armed: bool) -> bool:
     """Cut the torque of a servo that did not answer before; return whether it was rebooted.
 
-    armed: whether its Bus Watchdog was armed before torque was switched on; if so, it is switched off.
-    Same errors as `Servo.write`.
+    armed: whether its Bus Watchdog was armed before torque was switched on; if so, it is switched off. Raises the same
+    errors as `Servo.write`.
     """
     if servo.read_despite_error("Torque Enable"):
         servo.write_despite_error("Torque Enable", 0)

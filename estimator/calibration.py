@@ -1,7 +1,7 @@
 """Torque constants from a known mass: a joint likelihood of two settled periods, without and with the mass.
 
-Every parameter of a joint scales with its torque constant, so a single experiment cannot determine the latter. A mass M
-bolted to the last link at a known distance changes the arm's parameters by amounts that are known in kilograms and
+Every parameter of a joint scales with its torque constant, so a single experiment cannot determine the constant. A mass
+M bolted to the last link at a known distance changes the arm's parameters by amounts that are known in kilograms and
 metres:
 
     gravity_2 + M d g    inertia_2 + M d^2 + J    coupling + M l1 d    gravity_1 + M l1 g    inertia_1 + M l1^2

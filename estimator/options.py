@@ -64,7 +64,7 @@ class CoordinateOptions:
     max_initial_share: float = 0.95
     """Maximum initial value of a parameter that is a share of two others, as a fraction of its bound."""
     min_width: float = 1e-3
-    """Minimum distance of a width from its lower bound, as a fraction of the latter, so that it can grow again."""
+    """Minimum distance of a width from its lower bound, as a fraction of that bound, so that it can grow again."""
     max_relative_increase: float = 2.0
     """Maximum relative increase of a width per iteration."""
 
@@ -142,7 +142,7 @@ class LikelihoodOptions:
     An arm that swings past the upright pose amplifies parameter errors, so it is first held to the measured motion.
     """
     tracking_loss: float = 1.5
-    """Ratio of free to tracking cost above which the run's beginning is fitted before the whole."""
+    """The run's beginning is fitted before the whole if the free cost exceeds the tracking cost by this factor."""
     horizons: tuple[float, ...] = (0.125, 0.25, 0.5)
     """Lengths of the beginnings that are fitted before the whole run, as fractions of it, in this order."""
     min_horizon_samples: int = 10
@@ -249,7 +249,9 @@ class SelectionOptions:
     explained_residual: float = 1.02
     """RMS residual in units of the noise below which no further term is tried."""
     near_residual: float = 5.0
-    """RMS residual in units of the noise below which a richer model's minimum is sought near the simpler one's."""
+    """If the RMS residual, in units of the noise, is below this, a richer model's minimum is sought near the simpler
+    one's.
+    """
     steady_residual: float = 5.0
     """RMS residual in units of the noise below which a change of friction is sought: worse models may mimic one."""
     presliding_residual: float = 1.2
@@ -269,7 +271,7 @@ class SelectionOptions:
     max_wave_peaks: int = 3
     """Maximum number of cycles per turn from which a fit with ripple or cogging is started."""
     wave_evidence: float = 0.05
-    """Evidence in the score test at which ripple or cogging is tried.
+    """Ripple or cogging is tried if the evidence in the score test is at least this.
 
     It is lenient because the test only finds the wave's period roughly; a fit that includes the wave explains more.
     """

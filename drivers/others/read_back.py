@@ -39,7 +39,7 @@ _UNSURE_S = 0.01
 """Minimum time between the first and the last of these three [s], in which the status is read."""
 
 TRY_AGAIN_S = 0.005
-"""Delay after which a read-back for which a cycle left no time is tried again [s]."""
+"""If a cycle leaves no time for a read-back, the read-back is tried again after this delay [s]."""
 
 LOST_GOALS, LOST_OF = 3, 6
 """A servo that misses `LOST_GOALS` of `LOST_OF` goals counts as not accepting them, although the next one may
@@ -115,7 +115,7 @@ class ReadBack:
 
     @property
     def read(self) -> GroupRead:
-        """The group read to send next: that of the goals or that of the operating modes."""
+        """The group read to send next: of the goals, or of the operating modes."""
         return self.reads[self.is_of_modes]
 
     def took(self, seconds: float) -> None:

@@ -22,7 +22,7 @@ _STILL_TICKS = 2  # Present Velocity below which a joint counts as still
 
 
 def is_held(servo: Servo) -> bool:
-    """Return whether the servo has torque on that holds or drives its joint; same errors as `Servo.read`.
+    """Return whether the servo has torque on that holds or drives its joint. Raises the same errors as `Servo.read`.
 
     A tripped Bus Watchdog has zeroed the goal, so that in current and PWM mode the joint moves freely.
     """
@@ -33,7 +33,7 @@ def is_held(servo: Servo) -> bool:
 
 
 def refuse_held(servos: Mapping[Joint, Servo]) -> None:
-    """Raise TorqueHeld if any joint is held; otherwise the same errors as `Servo.read`."""
+    """Raise TorqueHeld if any joint is held. Also raises the errors of `Servo.read`."""
     held = [joint for joint, servo in servos.items() if is_held(servo)]
     if held:
         raise TorqueHeld(
@@ -46,7 +46,8 @@ def refuse_held(servos: Mapping[Joint, Servo]) -> None:
 def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
     """Reduce the output of held servos to zero step by step, wait until the joints no longer sink, then cut torque.
 
-    With zero PWM and torque on, the motor's terminals are shorted and it brakes. Same errors as `Servo.write`.
+    With zero PWM and torque on, the motor's terminals are shorted and it brakes. Raises the same errors as
+    `Servo.write`.
     """
     held = {joint: servo for joint, servo in servos.items() if is_held(servo)}
     goals = {joint: _what_drives(servo) for joint, servo in held.items()}

@@ -49,7 +49,7 @@ WATCHDOG_TRIPPED = 0xFF
 
 
 def read_settings(servo: Servo) -> dict[str, int]:
-    """Return the registers that an experiment may change, by name [ticks]; same errors as `Servo.read`.
+    """Return the registers that an experiment may change, by name [ticks]. Raises the same errors as `Servo.read`.
 
     All are read twice, the second time in reverse order. A reply does not identify its register: a reply to an earlier
     request would be stored, and later restored, as the value of another register.
@@ -73,7 +73,7 @@ def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
     """The settings, with goals clamped to the limits, which another program may have lowered meanwhile.
 
     A limit that is among the settings is restored before its goal; for any other limit, the servo's present value
-    counts. Same errors as `Servo.read`.
+    counts. Raises the same errors as `Servo.read`.
     """
     cut = dict(settings)
     for goal, limit in _BOUNDS.items():
@@ -112,7 +112,9 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
 
 
 def arms_itself(servo: Servo) -> bool:
-    """Return whether this servo switches torque on by itself at power-up or reboot; same errors as `Servo.read`."""
+    """Return whether this servo switches torque on by itself at power-up or reboot. Raises the same errors as
+    `Servo.read`.
+    """
     with suppress(DriverError):
         return bool(servo.read_entry(STARTUP_CONFIGURATION) & TORQUE_ON_AT_STARTUP)
     return False  # older firmware has no such register

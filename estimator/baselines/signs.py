@@ -50,7 +50,8 @@ class Suspicion:
     """Columns that seem reversed.
 
     signs: the combination that explains the recordings.
-    residual, residual_given: relative RMS of the torque residual with it and with the signs as given, worst joint.
+    residual, residual_given: relative RMS of the torque residual of the worst joint, with these signs and with the
+    signs as given.
     """
 
     signs: Signs
@@ -85,7 +86,7 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
 def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | None:
     """Return evidence that joint 2's angle is measured from a fixed direction instead of from link 1.
 
-    This is the relative RMS of the torque residual, worst joint, with angle 2 minus angle 1 and with the angles as
+    This is the relative RMS of the worst joint's torque residual, with angle 2 minus angle 1 and with the angles as
     given; None if the difference does not explain the recordings much better.
     """
     if recordings[0].joints != 2:
@@ -102,7 +103,7 @@ def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | N
 def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | None:
     """Return evidence that the torques of two joints are swapped.
 
-    This is the relative RMS of the torque residual, worst joint, with the torques swapped and as given; None if that
+    This is the relative RMS of the worst joint's torque residual, with the torques swapped and as given; None if that
     does not explain the recordings much better.
     """
     if recordings[0].joints != 2:

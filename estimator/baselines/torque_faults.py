@@ -41,8 +41,8 @@ class Clipped:
 class ClockDrift:
     """A delay of the torque that changes steadily from `start` to `end` [s] in the course of the longest recording.
 
-    residual, residual_given: relative RMS of the torque's residual, worst joint, with it and with the best constant
-    delay.
+    residual, residual_given: relative RMS of the worst joint's torque residual, with this drift and with the best
+    constant delay.
     """
 
     start: float

@@ -1,6 +1,6 @@
 """Choice of a spatial arm's model: terms are added as long as the recording supports them.
 
-Torque scales are not chosen in this way: they belong to the model wherever the torque constants are uncertain.
+Torque scales are not chosen in this way: they belong to the model if the torque constants are uncertain.
 """
 
 import time

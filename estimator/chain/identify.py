@@ -23,11 +23,13 @@ from hil.estimator.fit.fitted_parameters import FittedParameters
 from hil.estimator.models.conflicts import Conflict
 
 EXPLAINED_RESIDUAL = 1.06
-"""RMS residual of the worst joint, relative to the noise of its angle, below which a motion counts as explained."""
+"""A motion counts as explained if the RMS residual of the worst joint, relative to the noise of its angle, is below
+this.
+"""
 
 SYSTEMATIC = 1.1
-"""Largest ratio of a base parameter's standard error to that under white noise, above which the residual contains a
-model error rather than noise.
+"""The residual contains a model error rather than noise if a base parameter's standard error is more than this multiple
+of that under white noise.
 
 It is 0.6 to 0.9 for encoder rounding and noise. Torque ripple of 0.2 %, or load-dependent friction of 0.3 % of the
 torque, raises it to 2 or 3, while the residual still exceeds the noise by less than a tenth. With a noisy encoder,

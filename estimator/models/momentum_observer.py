@@ -50,7 +50,7 @@ HOLD_S = 0.05
 
 TIMES = 4.0
 FLOOR_SHARE = 0.25
-"""Fraction of the largest planned torque below which a residual torque never raises an alarm."""
+"""A residual torque below this fraction of the largest planned torque never raises an alarm."""
 
 _COUNT = len(NAMES)
 _STANDING = 0.05  # rad/s below which dry friction may hold a joint

@@ -115,7 +115,8 @@ def linearised(
 ) -> Linearised:
     """Expand the sum of squares of `period` about `estimate`, which was fitted to it.
 
-    `names`: additional parameters; they are expanded about their value in `known`, or else where they have no effect.
+    `names`: additional parameters; they are expanded about their value in `known` or, without one, about the value at
+    which they have no effect.
     """
     used = without_spikes(period)
     added = [name for name in names if name not in estimate.names]

@@ -114,7 +114,7 @@ class TorqueChange:
     left: float
     """Sum of squares of what the torque does not explain, in units of the noise."""
     noticed: Array
-    """Torque of each joint above which it matters (joints,) [N m]."""
+    """Smallest torque of each joint that matters (joints,) [N m]."""
 
     @property
     def is_seen(self) -> Mask:

@@ -77,7 +77,7 @@ class Choice:
     def cost(self) -> float:
         """Increase of the base parameters' standard errors due to the added terms (geometric mean of ratios).
 
-        The reference is the standard errors that would result if the terms that the simplest model lacks were known.
+        They are compared with the standard errors that would result if the added terms were known exactly.
         """
         estimate = self.estimate
         std = estimate.std

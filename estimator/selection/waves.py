@@ -27,7 +27,8 @@ def wave_peaks(
     waves: Sequence[Wave] = WAVES,
     only: Sequence[int] = (),
 ) -> dict[str, tuple[float, ...]]:
-    """Return the numbers of `cycles` per turn at which a wave explains more than at neighbouring ones, best first.
+    """Return the numbers of `cycles` per turn with which a wave explains more than with neighbouring numbers, best
+    first.
 
     The part that the fitted parameters explain is removed first. The result is by parameter name. If the estimate's
     model includes a wave that is sought, that wave is disabled first. If other terms have absorbed part of a wave, the

@@ -24,15 +24,15 @@ class AmplitudeOptions:
     search_arms: int = 32
     """Number of arms simulated during the search; the result is checked on all arms."""
     prior_share: float = 0.9
-    """Fraction of the limits used before any identification: a wide prior has longer tails than the simulated arms
-    show.
+    """Fraction of the limits that may be used before any identification. A wide prior has longer tails than the
+    simulated arms show.
     """
     max_rounds: int = 12
     """Maximum number of iterations of the search, and of reductions after it."""
     max_polishing_rounds: int = 4
     """Maximum number of final torque increases, one joint at a time."""
     close: float = 0.94
-    """Fraction of the limits from which on they count as reached, evaluated at the required probability."""
+    """The limits count as reached once this fraction of them is used at the required probability."""
     over: float = 0.97
     """Fraction of the limits that the next iteration aims at if the last torque exceeded them."""
     under: float = 0.99
@@ -43,7 +43,9 @@ class AmplitudeOptions:
     """Factor by which the exponent of the corrections decreases from one iteration to the next."""
     min_exponent: float = 0.4
     least_change: float = 0.005
-    """Relative change of the torque below which another iteration is not worth its simulations."""
+    """The search stops if the torque would change by less than this fraction: another iteration is not worth its
+    simulations.
+    """
     polishing_ratio: float = 1.06
     """Factor by which each of the final increases raises a joint's torque."""
     back_off: float = 0.93

@@ -74,15 +74,19 @@ STEPS, STEPS_S = 4, 0.5
 """Number of jumps that counts as a fault, and the longest time between them [s]."""
 
 BLOCK_S = 0.0099
-"""Shortest time after which the distance covered under an unchanged velocity is noted [s]: the latest three such notes
+"""Shortest interval between two notes of the distance covered under an unchanged velocity [s]. The latest three notes
 reach back by `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
-"""Velocity below which readings may stay the same while a joint sticks and slips, and their resolution [rad/s]."""
+"""Below the first velocity, readings may stay the same while a joint sticks and slips. Second value: resolution of the
+readings [rad/s].
+"""
 
 LONGEST_GAP_S = 0.06
-"""Time between two exchanges beyond which the velocity in between is unknown [s]; longer than an interval at 20 Hz."""
+"""If two exchanges are farther apart than this [s], the velocity in between is unknown. An interval at 20 Hz is
+shorter.
+"""
 
 SCALE, MORE_SCALE = 0.06, 0.02
 CURVED = 0.35

@@ -39,7 +39,9 @@ EARLY_MOTION_RAD = 0.05
 """Largest motion allowed while resting before the start [rad]."""
 
 BELOW_VOLTAGE = 0.9
-"""Speed that is proposed as a limit, relative to one at which the supply could not drive the commanded current."""
+"""If the supply cannot drive the commanded current at some speed, this fraction of that speed is proposed as a
+limit.
+"""
 
 _ERRORS_IN_A_ROW = 3
 """Number of consecutive replies with values and an error number after which the arm is stopped: that servo may not

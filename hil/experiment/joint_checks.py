@@ -34,7 +34,9 @@ one that has fallen is farther away.
 """
 
 LONG_GAP = 3.0
-"""Gap between two samples, in sample intervals, beyond which the motion in between is too uncertain to integrate."""
+"""If the gap between two samples is longer than this [sample intervals], the motion in between is too uncertain to
+integrate.
+"""
 
 JOINT = np.dtype(
     [

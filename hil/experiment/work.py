@@ -15,8 +15,8 @@ import numpy as np
 __all__ = ["MEMORY", "TOLERANCE_RAD", "begin", "look"]
 
 TOLERANCE_RAD = 0.04
-"""Work taken out of the arm, divided by the joint's largest planned torque, above which the joint's sign is considered
-wrong [rad].
+"""A joint's sign is considered wrong if the motor has taken more than this out of the arm [rad]: work divided by the
+joint's largest planned torque.
 
 Because of delays, even a healthy motor takes some out: up to 0.02 rad from a heavy arm at 20 Hz.
 """

@@ -45,7 +45,7 @@ SIMULATED = 100
 
 @dataclass(frozen=True)
 class ChainBelief:
-    """An ensemble of arms, of which only the first ones are simulated.
+    """An ensemble of arms; only the first ones are simulated.
 
     lightest: smallest inertia of each joint with the others free, of all arms of the prior (joints,) [kg m^2].
     """

@@ -32,7 +32,7 @@ SEARCH_ARMS, ARMS = 24, 72
 PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
 SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4, 0.28, 0.18)
 SMALL = 0.5
-"""Fraction of the wanted share below which other paths, with more reserve, are designed."""
+"""If the safe share is below this fraction of the wanted one, other paths with more reserve are designed."""
 
 REDESIGNS = 2
 
@@ -57,7 +57,7 @@ ROOM = 1.2
 
 SATURATED = 0.98
 LEAST_SPREAD_SHARE = 0.1
-"""Advised spread of the masses, relative to the present one, below which no spread is advised."""
+"""A smaller spread of the masses is advised only if it is at least this fraction of the present one."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class SafeShares:
     def safe(self, config: Config, shares: tuple[float, ...], most: float = np.inf) -> Found:
         """Find the first of the `shares` of the designed path that is safe for all simulated arms.
 
-        most: largest share; on other paths, the share with the same amplitude counts. `shares` are scaled to it.
+        most: largest share, to which `shares` are scaled; on other paths, it is the share with the same amplitude.
 
         If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
         kept. If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.

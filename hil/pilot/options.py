@@ -34,9 +34,9 @@ class PilotOptions:
     breakaway_raise: float = 1.6
     """Ratio of successive peak torques of a joint that has not moved yet."""
     breakaway_room: float = 0.25
-    """Fraction of the distance to its position limits after which a joint that has just broken away is stopped."""
+    """A joint that has just broken away is stopped after this fraction of the distance to its position limits."""
     min_breakaway_steps: int = 60
-    """Minimum distance after which a joint that has just broken away is stopped [encoder steps]."""
+    """A joint that has just broken away moves at least this far before it is stopped [encoder steps]."""
 
     at_limit: float = 0.99
     """Fraction of a torque limit above which the limit counts as reached."""

@@ -31,7 +31,7 @@ DELAY_S = 0.002
 """Time until a goal takes effect [s]; a braking goal thus acts for the interval between exchanges plus this time."""
 
 GETS_FASTER = 0.2
-"""Increase in speed, relative to the velocity limit, at which braking is abandoned.
+"""Braking is abandoned if the speed increases by this fraction of the velocity limit.
 
 Some increase is normal: gravity and the other joint's brake act on the joint.
 """

@@ -31,8 +31,8 @@ _MORE = 1.25
 """Tolerance for a velocity that increases within the span, as a factor on the mean velocity."""
 
 CONTRADICTS = 2.0
-"""Factor on the range that the position allows, beyond which a velocity contradicts it: at constant acceleration from
-standstill, the last velocity is twice the mean one.
+"""A velocity contradicts the position if it is beyond this multiple of the range that the position allows: at constant
+acceleration from standstill, the last velocity is twice the mean one.
 """
 
 UNREACHABLE = 3.0

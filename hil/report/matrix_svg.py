@@ -7,7 +7,7 @@ import numpy as np
 from hil.report.chart import Matrix
 
 LARGE = 30
-"""Number of labels above which a matrix is drawn without its faint cells, which would make up most of the page."""
+"""A matrix with more labels than this is drawn without its faint cells, which would make up most of the page."""
 FAINT = 0.1
 
 

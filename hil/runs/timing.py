@@ -11,7 +11,7 @@ SERVO_CLOCK_WRAP_S = 32.768
 """The servos' Realtime Tick counts milliseconds from 0 to 32767."""
 
 LOST_SHARE = 0.005
-"""Share of a joint's samples lost above which the summary of a run names the joint."""
+"""The summary of a run names a joint if more than this fraction of its samples was lost."""
 
 _FEWEST_READINGS = 5
 _EDGES_US = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5, 1e6)

@@ -65,7 +65,7 @@ class Left:
 
 
 def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
-    """Compare the settings before a killed program with the present ones. Raises as `Servo.read`.
+    """Compare the settings before a killed program with the present ones. Raises the same errors as `Servo.read`.
 
     If another program changed the Operating Mode, goals and gains belong to the new mode and are kept.
     """
@@ -89,7 +89,7 @@ class Restored:
 
 
 def recover(servo: Servo, port: str) -> Restored:
-    """Restore settings that a terminated program left changed; raises as `Servo.write`.
+    """Restore settings that a terminated program left changed. Raises the same errors as `Servo.write`.
 
     The file with the earlier settings is kept as long as another program's value prevents the restoration of a
     register.

@@ -288,8 +288,8 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
     A TorqueNotOff that leaves the block reports the final state: servos that answer again are read back. If torque is
     off on all servos, the error that ended the block before is raised instead.
 
-    folder: run folder that receives a copy of the settings. say: receives messages for the user. Same
-    errors as `ServoBus.open`, and RunFolderError.
+    folder: run folder that receives a copy of the settings. say: receives messages for the user. Raises the same errors
+    as `ServoBus.open`, and RunFolderError.
     """
     outer = _outermost.get()
     if outer is not None and outer.bus.port.is_open and outer.bus.config.is_same_arm(config.bus):
@@ -331,8 +331,8 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
 
 def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
     """The exception to raise in place of `error` if torque is off on all servos by now; None if it is not. This is the
-    exception because of which torque was cut, or an ExperimentError if only the silence of servos was the reason. It
-    has a note about torque.
+    exception that caused torque to be cut, or an ExperimentError if only the silence of servos did. It has a note about
+    torque.
     """
     report = bus.torque_off_report
     error.args = (str(report),)

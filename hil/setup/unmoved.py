@@ -24,7 +24,7 @@ Lies = Mapping[Joint, int]
 
 
 def where_it_lies(bus: ServoBus) -> Lies:
-    """Read where each servo is; raises as `Servo.read`."""
+    """Read each servo's Present Position. Raises the same errors as `Servo.read`."""
     return {drive: servo.read("Present Position") for drive, servo in bus.drives.items()}
 
 

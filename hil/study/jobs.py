@@ -48,7 +48,7 @@ def run_jobs(
 
     Args:
         client: a client from `hil.study.engine.workers`.
-        function: importable by a worker, or else picklable with everything it refers to.
+        function: must be importable by a worker, or picklable with everything it refers to.
         items: items, each with a number that identifies its job; consumed as workers become free.
 
     Raises:

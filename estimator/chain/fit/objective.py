@@ -130,8 +130,8 @@ class ChainProblem:
         return self._with_prior(x, self._of_data(x))
 
     def tempered(self, x: Array) -> tuple["ChainProblem", Quadratic]:
-        """Return the problem with the prior's weight raised by as much as the residual at `x` exceeds the assumed
-        noise, and its sum of squares there.
+        """Return the problem with the prior's weight raised in proportion to the excess of the residual at `x` over the
+        assumed noise, and the sum of squares at `x`.
 
         Repeated readings count as one, as they do in the sum of squares.
         """

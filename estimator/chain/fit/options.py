@@ -15,7 +15,7 @@ class ChainOptions:
     A softer observer extracts more information; one that is too soft no longer follows the motion.
     """
     lost: float = 1.5
-    """Cost increase, beyond what the softness explains, above which the previous observer is kept (a ratio)."""
+    """The previous observer is kept if the cost increases by more than this ratio beyond what the softness explains."""
     first_step: float = 5.2e-3
     """Integration step while the observer is stiff [s]; samples within it are skipped."""
     coarse_step: float = 2.6e-3
@@ -51,8 +51,8 @@ class ChainOptions:
     towards_prior: tuple[float, ...] = (1.0, 0.7, 0.4, 0.2, 0.0)
     """Initial guesses as fractions of the way from the prior to stage 1; the first that can be simulated is used."""
     unfinished: float = 1.0
-    """Expected decrease of the sum of squares in one more step, above which the minimum counts as not reached and the
-    fit continues with shorter integration steps. 1 is a distance of one standard error.
+    """If one more step is expected to decrease the sum of squares by more than this, the minimum has not been reached,
+    and the fit continues with shorter integration steps. 1 is a distance of one standard error.
     """
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""

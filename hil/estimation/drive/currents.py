@@ -20,10 +20,10 @@ LARGE = 0.5
 """Goals above this fraction of the largest one count as large; smaller ones say little about clipping."""
 
 SHORT = 0.85
-"""Ratio of measured to commanded current below which the current was clipped."""
+"""A current counts as clipped if it is below this fraction of the commanded one."""
 
 OFTEN = 0.05
-"""Fraction of the samples with large goals from which on clipping is reported."""
+"""Clipping is reported if it affects more than this fraction of the samples with large goals."""
 
 _RECENT = 4
 """Number of latest goals, any of which a lagging current may still follow."""

@@ -26,7 +26,7 @@ STEP_V = 0.1  # of the register
 SIGNIFICANT = 6.0
 """Number of standard errors by which the drop at full load must differ from zero."""
 LEAST = {Mode.PWM: 0.005, Mode.CURRENT: 0.05}
-"""Drop, relative to the voltage without load, up to which nothing is reported, by drive mode."""
+"""Smallest drop that is reported, relative to the voltage without load, by drive mode."""
 _FULL_LOAD = 0.99  # quantile of the drop
 
 
