@@ -80,8 +80,8 @@ class Joint:
         """Return this joint with its zero shifted by whole turns, so that its angle is closest to `near`.
 
         Without `near` the joint is returned unchanged. A servo measures its position within one turn when it is
-        switched on and counts turns from there, so a joint that rests just beyond the end of that turn starts a whole
-        turn away.
+        switched on, and counts turns from there. A joint that rests just beyond the end of that turn therefore starts a
+        whole turn away.
         """
         if self.near is None:
             return self

@@ -9,8 +9,8 @@ PATIENCE_S = 0.018
 class SdkPort:
     """Adapts our open port to `dynamixel-sdk`, removing the echo of an adapter that receives its own transmissions.
 
-    Unlike the SDK's own port, reads block instead of polling, time is the port's clock, and a failure cannot leave the
-    port marked as in use, which would make it impossible to cut torque. The method names are the SDK's.
+    Unlike with the SDK's own port, reads block instead of polling, and time is the port's clock. A failure cannot leave
+    the port marked as in use, which would make it impossible to cut torque. The method names are the SDK's.
     """
 
     def __init__(self, port: Port) -> None:

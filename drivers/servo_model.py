@@ -45,8 +45,9 @@ FULL_PWM_TICKS = 885
 """Goal PWM that applies the whole supply voltage to the motor [ticks]."""
 
 LEAST_SUPPLY = 0.6
-"""Lowest voltage across a motor that counts as the full supply voltage, relative to the lowest one published: supplies
-sag, and resistance and no-load speed differ by tens of percent from servo to servo."""
+"""A voltage across a motor counts as the full supply voltage if it is at least this fraction of the lowest one
+published: supplies sag, and resistance and no-load speed differ by tens of percent from servo to servo.
+"""
 
 LEAST_OF_MEASURED = 0.75
 """`LEAST_SUPPLY` if the supply was measured: it may sag between two readings, and motors differ."""
@@ -112,7 +113,7 @@ class ServoModel:
     watchdog_firmware: first firmware with a Bus Watchdog.
     fast_sync_read_firmware: first firmware that supports Fast Sync Read; None if none does.
     senses_supply: whether Present Current is the supply current, that is, the motor current times the bridge's duty
-    cycle: far less than the commanded current while the joint is slow.
+    cycle, which is far less than the commanded current while the joint is slow.
     """
 
     name: str

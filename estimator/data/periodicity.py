@@ -45,9 +45,9 @@ def period_difference(position: Array) -> Settling:
 def settling_difference(former: Array, latest: Array) -> float:
     """Return the RMS difference of a period (joints, samples) [rad] from the previous one, relative to the motion.
 
-    The worst joint counts. Only the second halves are compared: if they agree, the motion had settled before the end of
-    the previous period, so the whole latest one is settled even if the previous one began with the transient of the
-    ramp. This saves a whole period of the experiment.
+    The worst joint counts. Only the second halves are compared. If they agree, the motion had settled before the end of
+    the previous period. The latest one is then settled as a whole, even if the previous one began with the transient of
+    the ramp. This saves a whole period of the experiment.
     """
     half = former.shape[1] // 2
     return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())

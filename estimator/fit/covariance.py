@@ -1,7 +1,7 @@
 """Standard errors that remain valid if the residual is not white: the sandwich N^-1 S N^-1.
 
 N = J'WJ is the information, S the scatter of the score J'Wr. For independent errors S = N. Rounding errors of a slow
-joint, and model errors, are correlated between samples, which S takes into account if the products of the score are
+joint, and model errors, are correlated between samples. S takes this into account if the products of the score are
 summed over lags (Newey and West, Econometrica 55 (1987) 703). Bartlett's kernel with L lags equals the sum, over all
 windows of L samples, of the window's score times itself, divided by L: one pass for any L.
 

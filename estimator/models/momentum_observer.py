@@ -7,17 +7,17 @@ torques:
 
 After a first-order low-pass filter both sides become sums over the past (generalised momentum: A. De Luca and R.
 Mattone, "Sensorless robot collision detection and hybrid force/motion control", ICRA 2005; J.-J. Slotine and W. Li, "On
-the adaptive control of robot manipulators", 1987). The parameters are given as a mean and a covariance, those of an
-ensemble of arms, and are updated with each sample (recursive least squares, that is, a Kalman filter on constants that
-drift slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as it moves.
+the adaptive control of robot manipulators", 1987). The parameters are given as the mean and covariance of an ensemble
+of arms, and are updated with each sample (recursive least squares, that is, a Kalman filter on constants that drift
+slowly). The range of admissible motion is therefore wide for a poorly known arm and narrows as it moves.
 
-An alarm is raised if a joint's residual torque, which the motion does not account for, exceeds three thresholds for
-`HOLD_S` (a shorter time if it exceeds them by far): `TIMES` standard deviations of the uncertainty due to parameters
-and noise, what friction can hold while the joint stands still, and a fraction of the largest planned torque. The noise
-is estimated as well: effects that the model lacks (Stribeck friction, backlash, flexibility) widen the admissible
-range. A deviation that may become an alarm enters that estimate only once it has ended without one; otherwise a joint
-that is held for long would widen the range until nothing exceeds it. While a joint stands still its noise is lower,
-since most of it needs motion.
+A joint's residual torque is the part that the motion does not account for. An alarm is raised if it exceeds three
+thresholds for `HOLD_S` (a shorter time if it exceeds them by far): `TIMES` standard deviations of the uncertainty due
+to parameters and noise, the torque that friction can hold while the joint stands still, and a fraction of the largest
+planned torque. The noise is estimated as well: effects that the model lacks (Stribeck friction, backlash, flexibility)
+widen the admissible range. A deviation that may become an alarm enters that estimate only once it has ended without
+one; otherwise a joint that is held for long would widen the range until nothing exceeds it. While a joint stands still
+its noise is lower, since most of it needs motion.
 
 What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which the
 gear's presliding softens every reversal, dry friction looks viscous. It nevertheless holds the joint once it stands
@@ -92,8 +92,8 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: lower bound on this torque scale, as a multiple of dry friction, as far as that is known: near
-    standstill, friction behaves differently from the model.
+    frictions: `largest` is raised to at least this multiple of dry friction, as far as that is known: near standstill,
+    friction behaves differently from the model.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """Friction model selection: models are fitted from simple to rich and judged on a held-out motion.
 
 A richer model always has a smaller residual on the motion to which it was fitted. Its free prediction of another
-motion, from rest, only improves if its terms are real, or by chance, so it must also reduce the residual more than
-meaningless terms would. Without another motion, the Bayesian information criterion is used (Schwarz, Annals of
+motion, from rest, improves only if its terms are real, or by chance. Therefore it must also reduce the residual more
+than meaningless terms would. Without another motion, the Bayesian information criterion is used (Schwarz, Annals of
 Statistics 6 (1978) 461), with the number of samples reduced according to the residual's correlation.
 """
 

@@ -6,8 +6,8 @@ torque is replaced by the mean torque between its deadline and the next: the pre
 afterwards. The remaining error is of second order: half the acceleration times lateness squared, a hundredth of an
 encoder step at 0.5 ms and 50 rad/s^2.
 
-Delays that the host cannot see are not corrected: between the write call and the wire (the adapter's buffer), and
-between the arrival of the request and the servo's own sampling.
+Delays that the host cannot see are not corrected: those between the write call and the wire (the adapter's buffer), and
+those between the arrival of the request and the servo's own sampling.
 """
 
 import numpy as np

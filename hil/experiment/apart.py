@@ -1,9 +1,10 @@
 """Check that the servos of one joint turn together.
 
 Two servos on one joint are coupled by their horns. A horn that slips, a loose screw or a broken gear lets one of them
-turn without the other, which the joint's angle, taken from the first servo, does not show. The difference between their
-angles is compared with what it was at the first sample, because horns are mounted at any angle. If the direction of one
-of them is wrong, they work against each other and the joint does not turn at all, which looks like an obstacle.
+turn without the other. The joint's angle is taken from the first servo and does not show this. The difference between
+their angles is compared with what it was at the first sample, because horns are mounted at any angle. If the configured
+direction of one servo is wrong, the servos work against each other. The joint then does not turn at all, as if an
+obstacle held it.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """Check that a motor carries the commanded current, by the current (or voltage) reported in each reply.
 
-A servo may lose its torque in the middle of a run: it rebooted, was stopped by its watchdog, or was switched off by
-another program. Its current is then zero, whatever is commanded. How much current is missing depends on the plan,
-not on what the servo could carry, so all thresholds are relative to the planned peak.
+A servo may lose its torque in the middle of a run because it rebooted, its watchdog stopped it, or another program
+switched it off. Its current is then zero, whatever is commanded. How much current is missing depends on the plan, not
+on what the servo could carry, so all thresholds are relative to the planned peak.
 
 Two hypotheses are compared on every sample, sequentially (E. S. Page, "Continuous inspection schemes", Biometrika 41
 (1954) 100): the current is the one commanded, or it is zero. Their log likelihood ratio, for errors of standard

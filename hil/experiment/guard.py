@@ -1,6 +1,6 @@
 """Checks every sample and stops the arm when a limit is exceeded or a reply is inconsistent.
 
-The checks take a few us per sample: those of every joint are one compiled loop (`joint_checks`), which also applies
+The checks take a few us per sample. Those of every joint are one compiled loop (`joint_checks`), which also applies
 `following` (does the motor carry the commanded current), `consistency` (do position and velocity agree) and `work`
 (does the motor turn as commanded). Other modules check the status registers (`status_check`) and the time without
 commands or replies (`deadlines` and `silence`); `command_limits` clamps what is sent.

@@ -4,10 +4,10 @@ The difference is that of `hil.estimator.data.periodicity.settling_difference`, 
 only a few divisions remain at its end. The previous period is kept in one buffer, which the latest one overwrites.
 
 The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same
-sample of the previous period. If they differ by more than `TIMES` the RMS difference between the two previous periods,
-plus `FLOOR_RAD`, for `LASTING_S`, the joint does not repeat its motion (`unlike`). In the second half of the second
-period, the RMS difference in its first half is used instead, since transients only decay. The last `UNJUDGED_S` of a
-period do not affect the tolerance in the next one: a disturbance that begins there would enlarge it.
+sample of the previous period. If they differ by more than `TIMES` times the RMS difference between the two previous
+periods, plus `FLOOR_RAD`, for `LASTING_S`, the joint does not repeat its motion (`unlike`). In the second half of the
+second period, the RMS difference in its first half is used instead, since transients only decay. The last `UNJUDGED_S`
+of a period do not affect the tolerance in the next one: a disturbance that begins there would enlarge it.
 """
 
 from collections.abc import Callable, Sequence

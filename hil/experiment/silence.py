@@ -4,10 +4,10 @@ A stalled computer neither receives nor sends anything, which reveals nothing ab
 missed deadlines are (`hil.experiment.deadlines`); only the time in which this program waited for a reply that did not
 come counts as silence.
 
-A busy computer also delays what it has received: the kernel passes on the bytes of a serial port in a separate thread,
-which has to wait for a core like any other program, for 4 to 10 ms at a time. So while this program itself wakes up
-late, silence of all servos may be due to the computer, and is also limited in the same way as missed deadlines. If some
-servos are heard and one is not, that servo is silent.
+A busy computer also delays what it has received: the kernel passes on the bytes of a serial port in a separate thread.
+Like any other program, this thread has to wait for a core, for 4 to 10 ms at a time. So while this program itself wakes
+up late, silence of all servos may be due to the computer, and is also limited in the same way as missed deadlines. If
+some servos are heard and one is not, that servo is silent.
 """
 
 from hil.config.schema import Config

@@ -15,8 +15,8 @@ import numpy as np
 __all__ = ["MEMORY", "TOLERANCE_RAD", "begin", "look"]
 
 TOLERANCE_RAD = 0.04
-"""A joint's sign is considered wrong if the motor has taken more than this out of the arm [rad]: work divided by the
-joint's largest planned torque.
+"""A joint's sign is considered wrong if its motor has taken more work than this out of the arm, divided by the joint's
+largest planned torque [rad].
 
 Because of delays, even a healthy motor takes some out: up to 0.02 rad from a heavy arm at 20 Hz.
 """

@@ -1,7 +1,7 @@
 """The current belief about the arm: an ensemble drawn from the prior and updated by measured motion.
 
 Each recorded motion is assimilated by an ensemble smoother with multiple data assimilation (Emerick and Reynolds,
-Computers and Geosciences 55 (2013) 3): every arm of the ensemble is given the real one's commands, and is updated
+Computers and Geosciences 55 (2013) 3). Every arm of the ensemble is given the real arm's commands, and is then updated
 towards the measured motion by regressing parameters on motion over the ensemble. This needs no derivatives, no initial
 guess and no motion that separates all parameters: what a motion does not determine keeps the prior's spread. A joint
 that did not move is informative too: arms that would have moved are shifted towards more friction.

@@ -152,8 +152,8 @@ class Search:
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
         """The largest safe amplitude for all plausible arms.
 
-        If there is none, the amplitude of the last run is used if the real arm has shown it to be safe, otherwise a
-        smaller one. Raises NoSafeTorque if there was no run yet.
+        If there is none, the amplitude of the last run is used, provided that the real arm has shown it to be safe, and
+        otherwise a smaller one. Raises NoSafeTorque if there was no run yet.
         """
         ensemble, options = self.belief.ensemble(self._farther), self.options
         cap = self.cap

@@ -158,8 +158,8 @@ def tells_of_the_arm(error: ExperimentError) -> bool:
     """Whether the error is informative about the arm, so that another run may follow: limit, no motion, no steady
     motion, a period that differs from the one before.
 
-    Errors caused by another program or by goals changed on the way are not: a further run with less torque or speed
-    would only hide it.
+    Errors caused by another program or by goals changed on the way are not informative: a further run with less torque
+    or speed would only hide their cause.
     """
     if isinstance(error, SafetyStop):
         return not error.overruled and (error.cause in _AT_A_LIMIT or error.cause is Cause.UNLIKE_BEFORE)

@@ -56,7 +56,7 @@ def settings_now(bus: ServoBus) -> Settings:
     """Read the settings that determine how servos move and what they report.
 
     Servos that do not answer are left out. Each register is read twice, in opposite orders, because a reply may belong
-    to an earlier request: where the two differ, the value is unknown and left out.
+    to an earlier request. If the two readings differ, the value is unknown and left out.
     """
     found: dict[tuple[Joint, str], int] = {}
     for joint, servo in bus.drives.items():

@@ -81,8 +81,8 @@ def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float])
 def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
     """The configuration with the measured pose (joints,) [rad] as rest pose, as far as position_limit contains it.
 
-    It is returned unchanged if that makes no difference, or if the arm is too far from its rest pose, so that the run
-    is refused.
+    It is returned unchanged if the poses hardly differ, or if the arm is so far from its rest pose that the run is
+    refused.
     """
     limits = [joint.position_limit for joint in config.joints]
     low, high = np.array(limits).T

@@ -1,7 +1,7 @@
 """The servos' settings before a program changed them, in files that outlive the program.
 
 There is one file per servo in the user's state folder, named after port, ID and model: however a program ends, the next
-one on that port finds the file and restores the settings.
+program on that port finds the file and restores the settings.
 """
 
 import json

@@ -72,8 +72,9 @@ class ChainProblem:
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; less near the minimum."""
     prior_weight: float = 1.0
-    """Factor on the prior's precision: above 1 while model errors exceed the noise that the weights assume, so that the
-    prior still decides what the data do not determine."""
+    """Factor on the prior's precision. It is above 1 while model errors exceed the noise that the weights assume: the
+    prior then still decides what the data do not determine.
+    """
     added: tuple[Array | None, ...] = ()
     """Known base parameters of what was added to the arm in each period (base parameters,) [SI]; None for nothing."""
     latest: _Latest = field(repr=False, compare=False, default_factory=_Latest)

@@ -82,8 +82,8 @@ class ChainFit:
 
     @property
     def total_covariance(self) -> Array:
-        """Covariance of `value` about the truth: that at the minimum, widened by the distance to the minimum and by
-        what the model is known to neglect.
+        """Covariance of `value` about the truth: the covariance at the minimum, widened by the distance to the minimum
+        and by what the model is known to neglect.
         """
         return np.asarray(self.covariance + np.outer(self.missing, self.missing) + self.neglected)
 

@@ -47,8 +47,9 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
 def neglected_covariance(problem: ChainProblem, x: Array) -> Array:
     """Return the covariance (parameters, parameters) [SI] due to what the description of late back-EMF neglects.
 
-    Friction affects the motor's current later by the difference of both lags, which makes a joint's inertia wrong by
-    the square of what it loses, relative to the inertia (`hil.estimator.simulation.back_emf.neglected`).
+    The effect of friction on the motor's current is delayed by the difference of both lags. This makes a joint's
+    inertia wrong by the square of the lost inertia, divided by the inertia
+    (`hil.estimator.simulation.back_emf.neglected`).
     """
     base, parameters = problem.model.base, problem.parameters(x)
     total = np.zeros((problem.count, problem.count))

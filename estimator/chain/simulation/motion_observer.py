@@ -8,10 +8,10 @@ Kalman filter for slowly drifting constants), so the tolerance narrows over time
 subtracted from the residual. There is an alarm if the rest exceeds `TIMES` standard deviations and a fraction of the
 largest planned torque for `HOLD_S`; large residuals raise it sooner.
 
-The noise estimate describes motion, so it only learns from motion: the residual of a joint at rest is due to friction,
-or to something that blocks it, and would otherwise widen the tolerance until nothing exceeded it. A joint at rest is
-also judged by the range of torques on it (`hil.estimator.models.standstill`). A residual that may become an alarm
-enters the noise estimate only once it has ended without one.
+The noise estimate describes motion, so it only learns from motion. The residual of a joint at rest is due to friction,
+or to something that blocks it, and would widen the tolerance until nothing exceeded it. A joint at rest is also judged
+by the range of torques on it (`hil.estimator.models.standstill`). A residual that may become an alarm enters the noise
+estimate only once it has ended without one.
 """
 
 import math
