@@ -177,7 +177,7 @@ class FakeArm(Described):
 
 
 def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the [fake] table with the path of its chain's URDF made absolute, relative to the TOML file's folder.
+    """Return the [fake] table with the path of its chain's URDF resolved against the TOML file's folder.
 
     If that file does not exist, a file of the same name in the TOML file's own folder is used, as in a run folder.
     """

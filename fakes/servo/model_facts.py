@@ -253,7 +253,7 @@ FACTS: Mapping[str, ModelFacts] = {
         Motor(12.0, 1.4, 70), {**_volts(60, 60, 160), "Velocity Limit": _Facts(306, (0, 1023)), **_gains(p=700)}
     ),
 }
-"""Every model of the X series for 5 to 12 V that the SDK has a number for, and one motor."""
+"""Every X-series model with one motor for 5 to 12 V that has a model number in the SDK."""
 
 _STRENGTH = (0, 1023)
 

@@ -59,7 +59,7 @@ class EmulatedModel:
     current_unit_a: float
     """Current per tick of Goal Current and Present Current [A]; 0 if the model has no current sensor."""
     operating_modes: frozenset[int]
-    """Supported operating modes; empty if the motor is unknown, which then never moves."""
+    """Supported operating modes; empty if the motor is unknown: it then never moves."""
     fast_read_firmware: int
     """First firmware that supports Fast Sync Read, Fast Bulk Read and Control Table Backup."""
     nominal_voltage_v: float

@@ -183,7 +183,7 @@ def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None)
 
 
 def unused_path(path: Path) -> Path:
-    """`path`, or `path` with a number appended: a program may start two runs within a second."""
+    """`path`, with a number appended if it exists: a program may start two runs within a second."""
     number = 2
     tried = path
     while tried.exists():

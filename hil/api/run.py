@@ -142,7 +142,7 @@ class Run:
         return self.result.model
 
     def plot(self) -> Any:
-        """Plot position and goal of every joint over the whole recording with matplotlib. Raises MissingExtra."""
+        """Plot the position and goal of every joint over the whole recording with matplotlib. Raises MissingExtra."""
         from hil.report.chart import BLUE, ORANGE, Chart, Series, thin
         from hil.report.png import draw_figures
 

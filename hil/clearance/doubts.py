@@ -11,7 +11,7 @@ from hil.next_step import command
 
 
 def doubts(config: Config) -> Iterator[str]:
-    """Yield one sentence per doubt. Raises ArmFileError."""
+    """Yield one sentence per warning. Raises ArmFileError."""
     for joint in config.joints:
         if said := _weak(joint):
             yield said

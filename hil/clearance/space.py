@@ -56,7 +56,7 @@ class Nearest:
 
     @property
     def room(self) -> float:
-        """Distance in excess of what is required [m]; negative if too close."""
+        """Excess over the required distance [m]; negative if too close."""
         return self.distance - self.needed
 
     def __str__(self) -> str:

@@ -7,7 +7,8 @@ FAKE_URL = "fake://"
 
 
 def url_from(url: str, file: Path) -> str:
-    """The URL with a fake arm's path made absolute, relative to the configuration `file`; other URLs are unchanged.
+    """The URL with a fake arm's path resolved against the folder of the configuration `file`; other URLs are
+    unchanged.
 
     An empty path means the file itself. The name of a bundled arm stays a name.
     """

@@ -332,7 +332,7 @@ def _own(link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: se
 
 
 def check_units(arm: Sequence[ArmJoint], path: Path) -> None:
-    """Raise ArmFileError where lengths, masses or inertias look like millimetres or grams."""
+    """Raise ArmFileError if lengths, masses or inertias look like millimetres or grams."""
     for joint in arm:
         length = float(np.linalg.norm(joint.translation))
         if length > MOST_LENGTH:

@@ -115,7 +115,7 @@ def predict_chain(
 
 
 def simulated_seconds(plan: Plan) -> float:
-    """Motion of one arm that `predict_chain` simulates [s]."""
+    """Duration of the motion that `predict_chain` simulates for one arm [s]."""
     samples = sum(2 * each.ramp_samples + PERIODS * len(each.period_current) for each in plan.segments)
     return samples / plan.rate
 

@@ -2,7 +2,7 @@
 
 The stop itself is simulated on the arms of an ensemble, with gravity, friction and coupling between the joints:
 
-planned the run is stopped at any moment of the planned motion, because of a signal, lost replies, an alert, a lost
+planned   the run is stopped at any moment of the planned motion, because of a signal, lost replies, an alert, a lost
           port, or a killed program
 passed    the motion differs from the plan (a blocked, reversed or unpowered joint, or an arm other than the one
           described), so the guard stops it at a limit: one joint at its position limit moves outwards at its velocity

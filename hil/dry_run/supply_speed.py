@@ -22,7 +22,7 @@ def within_supply(config: Config) -> Config:
 
 
 def slower(config: Config, speed: list[float]) -> Config:
-    """The configuration with each velocity_limit lowered to `speed` (joints,) [rad/s] where that is less."""
+    """The configuration with each velocity_limit lowered to `speed` (joints,) [rad/s] if that is less."""
     joints = [
         joint if each >= joint.velocity_limit else joint.model_copy(update={"velocity_limit": float(f"{each:.2g}")})
         for joint, each in zip(config.joints, speed, strict=True)

@@ -14,8 +14,8 @@ def wanted_model(
 ) -> Model:
     """The model requested by the file for an arm with `joints` joints; "auto" gives Stribeck friction.
 
-    by_voltage: joints, from 1, that are driven by voltage (`voltage_driven`). lever: length of link 1 over gravity
-    (`lever_of`).
+    by_voltage: joints, from 1, that are driven by voltage (`voltage_driven`). lever: length of link 1 divided by
+    gravity (`lever_of`).
     """
     return Model(
         joints,
@@ -33,6 +33,6 @@ def voltage_driven(config: Config) -> tuple[int, ...]:
 
 
 def lever_of(config: Config) -> float | None:
-    """Length of link 1 over gravity [s^2], where both are given and the arm does not lie flat."""
+    """Length of link 1 divided by gravity [s^2]; None unless both are given and the arm does not lie flat."""
     lengths = config.arm.link_lengths
     return None if lengths is None or len(lengths) != 2 or not config.arm.gravity else lengths[0] / config.arm.gravity

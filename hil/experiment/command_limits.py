@@ -10,7 +10,7 @@ from hil.errors import Cause, SafetyStop
 
 
 class CommandLimits:
-    """Clamps goals, whatever computed them."""
+    """Clamps goals, regardless of what computed them."""
 
     def __init__(self, config: Config) -> None:
         self._names = [joint.joint.title for joint in config.joints]

@@ -198,7 +198,7 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
 
 
 def lost(memory: Any) -> None:
-    """Restart with the next reply: too many are missing."""
+    """Restart with the next reply, because too many replies are missing."""
     memory.position = np.nan
 
 

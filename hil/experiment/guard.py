@@ -108,7 +108,7 @@ class Guard:
         self._status = StatusCheck(config)
         self._missing = self._silence.counts
         self._errors = [0] * len(config.joints)
-        """Errors reported in a row together with values, by joint."""
+        """Number of consecutive replies with values and an error, by joint."""
         self._any_errors = False
         self._resting: Sequence[float] | None = None
         self._shortest = float("inf")

@@ -30,7 +30,7 @@ MOST_OUTSIDE_RAD = 0.5
 """How far beyond its limit a joint may start if an earlier run left it there [rad].
 
 A light arm that was stopped at a limit coasts on by a few tenths of a radian, and friction holds it there; an upright
-one that has fallen is farther away.
+arm that has fallen comes to rest farther away.
 """
 
 LONG_GAP = 3.0
@@ -81,8 +81,8 @@ class JointChecks:
         self._check = only_version(_look)
 
     def look(self, state: State, unsure: float) -> int:
-        """Check all joints, if all have sent this reply and the one before. Returns FINE, or CHECKS * joint + check of
-        a fault.
+        """Check all joints; none may have missed this reply or the one before. Returns FINE, or CHECKS * joint + check
+        of a fault.
 
         unsure: excess duration of the exchange [s]. Joints after the first faulty one are not checked.
         """
@@ -91,7 +91,7 @@ class JointChecks:
         return int(self._check(self.joints, self._sample, 0, self._count, before, after, self.interval, unsure, 0))
 
     def look_at(self, joint: int, state: State, unsure: float, missed: int) -> int:
-        """Check one joint whose last `missed` replies were missing; return as `look` does."""
+        """Check one joint whose last `missed` replies were missing. The result is as for `look`."""
         self._pack(self._bytes, 0, *state.position, *state.velocity, *state.goal_current, *state.current)
         before, after = state.time_before_write, state.time_after_read
         only = joint, joint + 1

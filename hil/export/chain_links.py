@@ -74,8 +74,8 @@ def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
     """Separate a link from what its held joints move, such as a gripper's fingers, so that these keep their inertia.
 
     If their described masses leave no physically possible body for the link itself, all of them keep the same fraction
-    of their masses. It is halved until a body is possible; if none ever is, it is 0. Returns the link's body and that
-    fraction.
+    of their masses. This fraction is halved until a body is possible; if none is, it is 0. Returns the link's body and
+    that fraction.
     """
     share = 1.0
     for _ in range(HALVINGS):

@@ -22,8 +22,8 @@ FREQUENCY, DAMPING_RATIO = 3.0, 0.7
 """Natural frequency [Hz] and damping ratio of each joint on the stabiliser's spring, unless the rate is too low."""
 
 MOST_DAMPING = 0.3
-"""Largest fraction of a joint's velocity that the damper may remove per sample, with the other joints free; from 1 on,
-a single joint would oscillate.
+"""Largest fraction of a joint's velocity that the damper may remove per sample, with the other joints free. At 1 or
+more, a single joint would oscillate.
 """
 
 MOST_DRIVING = 0.3
@@ -32,7 +32,7 @@ MOST_DRIVING = 0.3
 
 @dataclass(frozen=True)
 class ChainGains:
-    """Limits of the gains, of each joint (joints,).
+    """Limits of the gains for each joint (joints,).
 
     stiffness, damping: gains at a high rate [N m/rad, N m s/rad]. friction: least viscous friction [N m s/rad].
     lightest: smallest inertia with the other joints free [kg m^2].

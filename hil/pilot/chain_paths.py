@@ -111,7 +111,7 @@ class Paths:
         return cls(config, designer, best, other, reserve)
 
     def amplitude_over(self, other: "Paths") -> float:
-        """Return the largest ratio of a joint's peak excursion or speed in these paths to that in others."""
+        """Return the largest ratio of a joint's peak excursion or speed in these paths to that in `other` paths."""
         pairs = (self.identify, other.identify), (self.held_out, other.held_out)
         return max(float((_peaks(mine.path) / _peaks(its.path)).max()) for mine, its in pairs)
 

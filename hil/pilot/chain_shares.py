@@ -42,7 +42,7 @@ OTHER_SEEDS = 2
 _NEXT_SEED = 100
 
 MOST_SIMULATED_S = 60_000.0
-"""Motion that a search may simulate before it tries no further paths [s], all arms together: about a minute of
+"""A search tries no further paths after it has simulated this much motion [s], over all arms: about a minute of
 processor time with six joints.
 """
 

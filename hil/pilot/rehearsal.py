@@ -1,6 +1,6 @@
 """`hil dry-run` for a planar arm with `pilot = true`: what `hil identify` would do.
 
-Its first run and the largest safe torque are simulated, both with the stabiliser that it would propose.
+The first run and the largest safe torque are simulated, both with the stabiliser that `hil identify` would propose.
 """
 
 from concurrent.futures import Executor

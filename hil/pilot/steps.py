@@ -78,9 +78,9 @@ class Step:
 class Played:
     """The outcome of a run.
 
-    step: comparison with the prediction. seen: commands and motion; None if there are too few. torque: sentence about
-    the final torque state. error: what ended the run early, or None; only errors that are informative about the arm,
-    not those of servos, bus or user.
+    step: comparison with the prediction. seen: commands and motion; None if too few samples were recorded. torque:
+    sentence about the final torque state. error: what ended the run early, or None; only errors that are informative
+    about the arm, not those of servos, bus or user.
     """
 
     step: Step

@@ -1,8 +1,8 @@
 """The first part of a stop, if possible: braking, with a current opposing each joint's velocity.
 
-Braking lasts a bounded time, within the current limits. It ends at once when a reply is missing, a servo raises an
-alert, a deadline is missed, a second signal arrives, or a joint accelerates according to its velocity or its positions,
-as it does if its motor turns the wrong way. Torque is cut afterwards in any case.
+Braking lasts for a bounded time and stays within the current limits. It stops at once when a reply is missing, a servo
+raises an alert, a deadline is missed, a second signal arrives, or a joint accelerates according to its velocity or its
+positions, as it does if its motor turns the wrong way. Torque is cut afterwards in any case.
 
 A joint is braked against its reported velocity only as far as the change of its position confirms it
 (`hil.plan.recent_motion`), so that no current acts in the direction in which its position moves.
@@ -24,7 +24,7 @@ A stronger brake hardly stops sooner, and throws the arm back much farther if th
 LIGHTEST = 0.5
 """Smallest inertia that a joint is assumed to have, relative to the typical rotor inertia of its servo.
 
-A light joint that is braked too hard is thrown back faster than it came before its velocity is read again.
+If a light joint is braked too hard, it is thrown back, faster than it came, before its velocity is read again.
 """
 
 DELAY_S = 0.002

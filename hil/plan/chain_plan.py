@@ -147,7 +147,9 @@ def check_rest_pose(config: Config) -> None:
 
 
 def check_clearance(config: Config, plan: Plan) -> None:
-    """Raise ConfigError if the desired motion itself has too little clearance; real arms need a dry run."""
+    """Raise ConfigError if the desired motion itself has too little clearance; only a dry run predicts the actual
+    motion.
+    """
     check_rest_pose(config)
     space = Space.of(config)
     for segment in plan.segments:

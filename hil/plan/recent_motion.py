@@ -59,12 +59,13 @@ class RecentMotion:
         self._fastest = [_fastest(joint.joint.servo) for joint in config.joints]
 
     def add(self, state: State) -> None:
-        """Keep an exchange; one that is already the latest is not kept twice."""
+        """Store an exchange, unless it is already the latest one."""
         if not self._states or self._states[-1] is not state:
             self._states.append(state)
 
     def believed(self, state: State) -> list[float]:
-        """The reported velocities, confined to what the positions allow [rad/s]; 0 where no change of them is known.
+        """The reported velocities, confined to what the positions allow [rad/s]; 0 if no change of position is
+        known.
 
         state: the latest exchange.
         """

@@ -5,8 +5,8 @@ The residual torque, `torque - Y(q, v, a) theta`, is compared with its uncertain
 rounding of the velocities, and noise that is estimated while the arm moves. The parameters are updated as well (a
 Kalman filter for slowly drifting constants), so the tolerance narrows over time. As in
 `hil.estimator.models.momentum_observer`, which planar arms use, the friction that can hold a joint at rest is
-subtracted from the residual. There is an alarm if the rest exceeds `TIMES` standard deviations and a fraction of the
-largest planned torque for `HOLD_S`; large residuals raise it sooner.
+subtracted from the residual. There is an alarm if the remainder exceeds `TIMES` standard deviations and a fraction of
+the largest planned torque for `HOLD_S`; large residuals raise it sooner.
 
 The noise estimate describes motion, so it only learns from motion. The residual of a joint at rest is due to friction,
 or to something that blocks it, and would widen the tolerance until nothing exceeded it. A joint at rest is also judged

@@ -77,7 +77,9 @@ class Difference:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Sentences on joints that differ, and on each of the two models that should not be trusted as it is."""
+        """Warnings: sentences on joints that differ, and on each of the two models that should not be trusted as it
+        is.
+        """
         untrusted = tuple(
             f"{name}: trust this model: {trust}. Its values may be biased by more than their standard errors, so a "
             "change may come from the model instead of the arm; the report says why."

@@ -1,4 +1,4 @@
-"""Spatial arms estimated from other tools' recordings, and checked on the last part of each, as a result."""
+"""Estimates of spatial arms from other tools' recordings; the last part of each recording serves as a check."""
 
 import time
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Detection of values that no servo arm has in estimates from imported recordings; the usual cause is a wrong unit."""
+"""Detection of values that are impossible for a servo arm, for imported recordings; the usual cause is a wrong unit."""
 
 from collections.abc import Sequence
 
