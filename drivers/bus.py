@@ -47,7 +47,7 @@ class BusConfig:
     """Location of the servos and how to communicate with them.
 
     url: device or pyserial URL.
-    one_write: send Sync Write and group read in one write; False where `hil check` finds that an arm needs two.
+    one_write: send Sync Write and group read in one write; False if `hil check` finds that an arm needs two.
     fast_sync_read: use Fast Sync Read if the firmware of every servo supports it.
     slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
     voltage with temperature.

@@ -33,7 +33,9 @@ class Heard:
         self._expected: frozenset[tuple[int, int]] = frozenset()
         self.expect(reads)
         self.damaged_at = self.late_at = -math.inf
-        """When incomplete or damaged replies last arrived, and when an unexpected one did [s on the port's clock]."""
+        """Times of the latest incomplete or damaged replies and of the latest unexpected one [s on the port's
+        clock].
+        """
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.strangers = 0

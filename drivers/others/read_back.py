@@ -108,7 +108,7 @@ class ReadBack:
         """A servo that has missed `LOST_GOALS` of `LOST_OF` goals, and the older goal that it holds."""
         self._looks = 0  # read-backs of goals so far
         self._missed: list[deque[int]] = [deque(maxlen=LOST_GOALS) for _ in ids]
-        """Numbers of the latest read-backs that found an older goal of this program, by servo."""
+        """Indices of the latest read-backs that found an older goal of this program, by servo."""
         self.doubts_until = -math.inf
         self.sighted: Overruled | None = None
         """The latest value read back that this program did not write; it is recent until `doubts_until`."""

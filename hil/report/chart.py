@@ -18,8 +18,8 @@ Kind = Literal["line", "broad", "dashed", "points", "dots", "area", "steps"]
 class Series:
     """One curve.
 
-    x, y: coordinates (n,), with a gap at each NaN. kind: `area` fills between y and `low`; `steps` has n + 1 edges as
-    x.
+    x, y: coordinates (n,), with a gap at each NaN. kind: `area` fills between y and `low`; for `steps`, x holds the n +
+    1 edges.
     """
 
     name: str

@@ -91,7 +91,7 @@ class SettledFit(Fit):
 @dataclass(frozen=True, kw_only=True)
 class ShootingFit(Fit):
     """Fit of an arbitrary motion, cut into segments. residual_rms_rad: the residual in rad RMS, per joint;
-    residual_rms_ticks is empty where the encoders' resolution is not known.
+    residual_rms_ticks is empty if the encoders' resolution is not known.
     """
 
     residual_rms_rad: PerJoint
@@ -147,12 +147,12 @@ class LineLevels:
 
 @dataclass(frozen=True)
 class Validation:
-    """How well the model predicts, per joint; None where it was not checked.
+    """How well the model predicts, per joint; None if that was not checked.
 
     held_out_rms: open-loop prediction error of a held-out multisine, encoder noise included, relative to the motion's
     RMS (the verdict excludes the noise); if friction has changed since the fitted multisine, it is scaled by one factor
     per joint, which is estimated from the held-out motion itself. held_out_as_fitted_rms: the same with friction as it
-    was in the fitted multisine; None where it has not changed. free_run_rms: the same for the fitted multisine.
+    was in the fitted multisine; None if it has not changed. free_run_rms: the same for the fitted multisine.
     residual_over_floor: residual relative to the measured noise, which is at least that of rounding. correlated_lags:
     fraction of the residual's autocorrelations that exceed those of white noise. condition: condition number of the
     scaled information matrix.

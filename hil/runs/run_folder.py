@@ -261,7 +261,9 @@ class RunFolder:
             write_json(self.rest_pose_path, {"rest_pose": list(played.arm.rest_pose)})
 
     def set_aside(self, name: str, played: Config) -> None:
-        """Move the recording of a run of `played` to a subfolder, so that another run can use this folder."""
+        """Move the recording of a run to a subfolder, so that another run can use this folder. played: its
+        configuration.
+        """
         folder = self.below(name, played)
         try:
             for path in (self.samples_path, self.run_path, self.path / "lateness.json"):

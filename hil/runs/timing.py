@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hil.results.parts import Quantiles, StreamTiming
 
 SERVO_CLOCK_WRAP_S = 32.768
-"""The servos' Realtime Tick counts milliseconds from 0 to 32767."""
+"""Period after which the servos' Realtime Tick wraps [s]: it counts milliseconds from 0 to 32767."""
 
 LOST_SHARE = 0.005
 """The summary of a run names a joint if more than this fraction of its samples was lost."""

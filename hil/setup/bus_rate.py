@@ -18,7 +18,7 @@ from hil.setup.realtime import on_time
 CYCLES = 200
 SLOW_EVERY = 10
 USUAL = 0.9
-"""Fraction of the exchanges that determines the rate; an experiment needs four fifths on time."""
+"""The rate is one that this fraction of the exchanges sustains; an experiment needs four fifths of them on time."""
 PATIENCE_S = 0.05
 """Time after which a reply counts as lost [s]; on a busy computer the kernel may deliver one 10 to 20 ms late."""
 AGAIN_AFTER_S = 0.5
@@ -26,7 +26,7 @@ AGAIN_AFTER_S = 0.5
 SHARE = 0.9
 """Fraction of a period that the exchange may take; the rest is for the computer."""
 RATE_MARGIN = 1.2
-"""How much faster than a newly chosen rate a bus must be, so that the next measurement confirms it."""
+"""Factor by which a bus must be faster than a newly chosen rate, so that the next measurement confirms that rate."""
 
 
 @dataclass(frozen=True)

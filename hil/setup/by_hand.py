@@ -56,7 +56,7 @@ class Moved:
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
     """The pose at these angles [rad].
 
-    Whole turns, which a servo does not count while it is off, are removed where a joint's position limits reveal them.
+    Whole turns, which a servo does not count while it is off, are removed if a joint's position limits reveal them.
     """
     limits = [joint.position_limit for joint in config.joints]
     angles = tuple(within_limits(*each) for each in zip(angles, limits, strict=True))
@@ -81,7 +81,7 @@ def guided(
 
 
 def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Array) -> Moved:
-    """Compare a motion `change` (joints,) [rad] with the one that was asked for.
+    """Compare a motion `change` (joints,) [rad] with the requested one.
 
     drives: motion of that joint according to each of its servos [rad], the first servo's first.
     """

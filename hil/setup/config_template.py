@@ -60,7 +60,7 @@ class ArmAnswers:
     """Answers about one arm.
 
     gravity: gravity in the plane of the arm [m/s^2]. head: comment at the top of the file. measured: None if the bus
-    was not measured; the rate then follows from its baud rate.
+    was not measured; the sample rate then follows from the baud rate.
     """
 
     url: str

@@ -19,7 +19,7 @@ _MODE, _CURRENT_LIMIT = "Operating Mode", "Current Limit"
 
 
 def left_behind(port: str, joint: Joint) -> Kept | None:
-    """Settings of this joint's servo that a terminated program left unrestored; None if there are none."""
+    """Settings of this joint's servo that a terminated program did not restore; None if there are none."""
     kept = settings_file.load(port, joint.id, joint.servo.name)
     return kept if kept is not None and kept.may_restore else None
 
@@ -28,8 +28,8 @@ def left_behind(port: str, joint: Joint) -> Kept | None:
 class Left:
     """What a killed program left on one servo.
 
-    kept: the settings before that program. wanted: those to restore, with what another program changed since left as
-    it is. changed: these registers, each with its present value.
+    kept: the settings before that program. wanted: the settings to restore, except that those changed by another
+    program since then keep their present values. changed: the latter registers, each with its present value.
     """
 
     kept: Kept

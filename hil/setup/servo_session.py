@@ -1,8 +1,9 @@
 """A session with the arm's servos: their settings are saved before the first write and restored after the last.
 
 A session holds the port. A session inside another one for the same arm shares it, so that the steps of a pilot write
-each EEPROM register only once. It is also restored only once, when the outermost block is left for whatever reason. If
-a killed program left saved settings behind, these count as the servos' own and are restored at the end (`killed_run`).
+each EEPROM register only once. Each register is also restored only once, when the outermost block is left for whatever
+reason. If a killed program left saved settings behind, these count as the servos' own and are restored at the end
+(`killed_run`).
 """
 
 import sys
@@ -51,7 +52,7 @@ SETTINGS_NAME = "servo_settings.json"
 
 
 REBOOT_S = 0.6
-"""Time before a servo that does not answer at the end, and may be booting, is tried again [s]."""
+"""A servo that does not answer at the end may be booting; it is tried again after this time [s]."""
 
 
 _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
@@ -97,7 +98,7 @@ class ServoSession:
     """Whether the last inner block ended with an exception: the arm went limp earlier than planned."""
 
     def begin(self, config: Config, folder: Path | None) -> None:
-        """Check that the servos answer and that nobody holds the arm, then save their settings.
+        """Check that the servos answer and that no other program holds the arm, then save their settings.
 
         Nothing is written to a servo before its settings are on disk. Raises the same errors as `ServoBus.open`.
         """

@@ -39,7 +39,7 @@ class Spec:
 
     toml: the arm's file with this run's values in it, or "". versions: package versions that the worker must have.
     seconds: processor time after which the run has failed. recording: the run folder to estimate, or None. keep_in:
-    where the run folder stays, None for nowhere.
+    where the run folder is kept; None if it is deleted.
     """
 
     run: int
