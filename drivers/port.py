@@ -65,8 +65,8 @@ def open_port(url: str, baud: int) -> "Port":
 class Port:
     """An open serial port. Every method but `close` raises PortLost when the device fails.
 
-    After PortLost the same object may be used again; it fails again as long as the device is gone. After the cable was
-    replugged, open a new port. `latency` is the longest time the adapter may hold back a reply [s].
+    After PortLost the same object may be used again; it fails again as long as the device is gone. After replugging the
+    cable, open a new port. `latency` is the longest time the adapter may hold back a reply [s].
     """
 
     overheard: bytes = b""

@@ -26,7 +26,7 @@ class ServoPrior:
     viscous: viscous friction without back-EMF [N m s/rad].
     armature: reflected rotor inertia [kg m^2].
     mass: mass of the servo [kg].
-    stribeck_rise: breakaway friction above Coulomb friction, as a fraction of the latter [1].
+    stribeck_rise: excess of breakaway friction over Coulomb friction, as a fraction of Coulomb friction [1].
     stribeck_velocity: Stribeck velocity [rad/s].
     lag: time constant of the current loop [s].
     """

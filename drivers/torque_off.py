@@ -182,7 +182,7 @@ def cut_again(servo: Servo, *, armed: bool) -> bool:
 def was_rebooted(servo: Servo) -> bool:
     """Whether a servo's watchdog, once armed, is no longer armed; False if it does not answer.
 
-    A late reply to an earlier question would be taken for the answer, so another register is read before and after.
+    A late reply to an earlier request would be taken for the answer, so another register is read before and after.
     """
     with suppress(DriverError):
         return servo.read("ID") == servo.id and servo.read("Bus Watchdog") == 0 and servo.read("ID") == servo.id

@@ -1,7 +1,7 @@
 """Other methods on the same settled period, each tuned and timed, for comparison.
 
-All methods receive the same positions and commands. Their torque is the command delayed by the delay found in this
-project's first stage, so that none has to estimate it. The settings of each method (cut-off, width of the smoothed
+All methods receive the same positions and commands. Their torque is the command, delayed by the delay that hil's stage
+1 has found, so that none of them has to estimate it. The settings of each method (cut-off, width of the smoothed
 Coulomb step, process noise) are searched, and those whose simulation is closest to the recording are kept; only the run
 time with these settings counts.
 """

@@ -25,7 +25,8 @@ MOST_SAMPLES = 30_000  # more would take too long
 
 @dataclass(frozen=True)
 class Clipped:
-    """A joint whose torque seems limited to `level` [N m], which the column exceeds in the fraction `beyond`.
+    """A joint whose torque seems limited to `level` [N m], although the column exceeds it in the fraction `beyond` of
+    samples.
 
     residual, residual_given: relative RMS of its torque's residual with the limit and as given.
     """

@@ -35,7 +35,7 @@ VELOCITY_SAMPLES = 9  # at the beginning, from which the initial velocity is tak
 class MotionPiece(SettledPeriod):
     """A recording sampled at equal intervals, for the likelihood of settled periods. Its motion need not be periodic.
 
-    The torque before the first sample is assumed to equal the last one; the initial state absorbs the error.
+    The torque before the first sample is assumed to be that of the last sample; the initial state absorbs the error.
     """
 
     def __post_init__(self) -> None:
@@ -162,7 +162,9 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
 
 
 def torque_error(recordings: Sequence[Recording], found: RecordedChain) -> Array:
-    """Return the RMS error of the torque that the parameters require for recordings, relative to its RMS (joints,)."""
+    """Return the RMS error of the torque computed with the parameters for recordings, relative to the torque's RMS
+    (joints,).
+    """
     value = np.array([found.parameters[name] for name in found.model.linear_names])
     return _torque_residual(recordings, found.model, value, found.cutoff)
 

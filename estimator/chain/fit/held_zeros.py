@@ -20,9 +20,9 @@ class HeldZeros:
     """Encoder zeros of all joints but the first, as far as the recording reveals them."""
 
     shift: Array
-    """Estimated true minus measured angle (joints - 1,) [rad]; close to 0 where gravity does not reveal it."""
+    """Estimated true minus measured angle (joints - 1,) [rad]; close to 0 if gravity does not reveal it."""
     gain: float
-    """Expected decrease of the sum of squares if they were fitted, in units of white noise."""
+    """Expected decrease of the sum of squares if the zeros were fitted, in units of white noise."""
 
 
 def held_zeros(problem: ChainProblem, x: Array, unfinished: float) -> HeldZeros:

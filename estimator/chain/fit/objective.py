@@ -64,7 +64,7 @@ class ChainProblem:
     softness: float
     """Natural frequency of the observer [Hz]."""
     finer: int = 1
-    """Number of smaller integration steps that replace one where a joint may be near standstill."""
+    """Number of smaller integration steps that replace one step in which a joint may be near standstill."""
     every: int = 1
     """Only every `every`-th sample is compared, with integration steps longer by that factor; it may exceed 1 only if
     `steps` is 1.
@@ -76,7 +76,9 @@ class ChainProblem:
     prior then still decides what the data do not determine.
     """
     added: tuple[Array | None, ...] = ()
-    """Known base parameters of what was added to the arm in each period (base parameters,) [SI]; None for nothing."""
+    """Known base parameters of the mass added to the arm in each period (base parameters,) [SI]; None if none was
+    added.
+    """
     latest: _Latest = field(repr=False, compare=False, default_factory=_Latest)
 
     @property

@@ -14,7 +14,7 @@ MINIMISER = MinimiserOptions()
 def remaining(minimum: Minimum, coordinates: ChainCoordinates) -> tuple[Array, float]:
     """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations predict.
 
-    Where the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
+    If the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
     A friction width at its lower bound stays there, and no positive parameter becomes negative.
     """
     at, least = minimum.at, np.full(minimum.x.size, -np.inf)

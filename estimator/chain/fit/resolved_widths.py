@@ -19,13 +19,12 @@ POSES = 40  # of a recording, in which the joints' inertias are computed
 def resolved_widths(problem: ChainProblem, x: Array, shortest_step: float, widths_per_substep: float) -> Array:
     """Return the narrowest Coulomb step that is resolved for each joint (joints,) [rad/s].
 
-    widths_per_substep: see `hil.estimator.options.CoordinateOptions`.
-
     Args:
         problem: the recordings.
         x: coordinates at which the arm can be simulated.
         shortest_step: shortest integration step, near standstill [s].
-        widths_per_substep: number of widths through which a reversal of friction may take a joint in `shortest_step`.
+        widths_per_substep: number of widths through which a reversal of friction may take a joint in `shortest_step`;
+            see `hil.estimator.options.CoordinateOptions`.
     """
     model = problem.model
     parameters = as_moving(model.base, problem.parameters(x))

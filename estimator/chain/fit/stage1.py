@@ -41,7 +41,8 @@ def fit_lines(
 ) -> ChainLinear:
     """Estimate the parameters in which the torque is linear from settled periods.
 
-    added: known base parameters of what was added to the arm in each period (base parameters,) [SI]; None for nothing.
+    added: known base parameters of the mass added to the arm in each period (base parameters,) [SI]; None if none was
+    added.
     """
     lines = [lines_of(period.filled()) for period in periods]
     highest = list(map(cut_off, lines))

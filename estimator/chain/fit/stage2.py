@@ -40,7 +40,7 @@ MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 NEARER, LAST = MinimiserOptions(max_damping=0.1), MinimiserOptions(max_damping=1.0)
 """Options of the last iterations with coarse steps, and of those with fine steps that follow.
 
-Where a joint is on the verge of sticking, the sum of squares is slightly discontinuous. A decrease that is only
+If a joint is on the verge of sticking, the sum of squares is slightly discontinuous. A decrease that is only
 achieved with heavy damping is such a discontinuity and is not pursued.
 """
 

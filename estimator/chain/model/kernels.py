@@ -256,7 +256,7 @@ def _flow(b: Any, trace: float, w: Any, out: Any) -> None:
 
 
 def regress(column: Any, a: Any, room: Any, Y: Any) -> None:
-    """Compute the regressor Y (joints, columns) at the accelerations a last given to `accelerate`.
+    """Compute the regressor Y (joints, columns) at the accelerations that were last passed to `accelerate`.
 
     column (joints, 11): column of Y for each of a link's parameters and the armature; unwanted columns are written but
     never read. Entries that are always zero are not written.

@@ -49,7 +49,7 @@ def as_moving(base: BaseParameters, parameters: Mapping[str, float]) -> dict[str
 
 
 def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[int, float]:
-    """Return by how much lighter each voltage-driven joint (from 0) moves than it is [kg m^2]."""
+    """Return the apparent loss of inertia of each voltage-driven joint (from 0) [kg m^2]."""
     generating = _generating(base.chain.joints, parameters)
     possible = _possible(base, parameters, generating)
     return {joint: possible * share * viscous * late for joint, share, viscous, late in generating}
@@ -85,7 +85,7 @@ of the parameters on which its lagging back-EMF depends, by their index.
 
 
 def losses(base: BaseParameters, parameters: Mapping[str, float], names: tuple[str, ...]) -> Losses:
-    """Return how the inertias of the arm of `as_moving` depend on the parameters that make it lighter, for
+    """Return the derivatives of the lost inertias with respect to the parameters that cause the loss, for
     `complete`.
 
     names: the parameters with respect to which to differentiate; the base parameters come first.

@@ -32,7 +32,7 @@ class ChainRun:
     step: float
     """Length of an integration step [s]."""
     finer: int = 1
-    """Number of smaller integration steps that replace one where a joint may be near standstill."""
+    """Number of smaller integration steps that replace one step in which a joint may be near standstill."""
 
 
 PIECE = 256  # samples whose derivatives fit into the processor's cache
