@@ -106,7 +106,7 @@ class LikelihoodOptions:
     ftol_start: float = 3e-3
     """Tolerance of the fit from one initial guess."""
     ftol_coarse: float = 2e-2
-    """Tolerance where only the neighbourhood of a minimum is needed: in a coarse fit and in the tracking fit."""
+    """Tolerance if only the neighbourhood of a minimum is needed: in a coarse fit and in the tracking fit."""
     ftol_state: float = 0.1
     """Tolerance of the fit of the initial state alone."""
 
@@ -188,7 +188,9 @@ class ShootingOptions:
     max_step: float = 1e-3
     """Longest integration step of the last fit [s]."""
     coarse_step: float = 2.6e-3
-    """Longest integration step of the earlier fits [s]: three times as fast, off by hundredths of a standard error."""
+    """Longest integration step of the earlier fits [s], which are three times as fast and off by hundredths of a
+    standard error.
+    """
     start_segments: int = 80
     """Maximum number of segments, evenly spread, in the fits that only need to come close to a minimum."""
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-3)
@@ -218,7 +220,7 @@ class CalibrationOptions:
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)
     minimiser: MinimiserOptions = MinimiserOptions()
     initial_width: float = 0.005
-    """Initial width of the smoothed Coulomb step [rad/s]; that of an estimate with wrong torque constants is
+    """Initial width of the smoothed Coulomb step [rad/s]; a width estimated with wrong torque constants would be
     misleading.
     """
     angle_scale: float = 0.1
@@ -269,7 +271,7 @@ class SelectionOptions:
     wave_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))
     """Numbers of ripple and cogging cycles per turn that are tried."""
     max_wave_peaks: int = 3
-    """Maximum number of cycles per turn from which a fit with ripple or cogging is started."""
+    """Maximum number of different cycles per turn from which fits with ripple or cogging are started."""
     wave_evidence: float = 0.05
     """Ripple or cogging is tried if the evidence in the score test is at least this.
 

@@ -68,7 +68,9 @@ class Recording:
 
     @cached_property
     def noise(self) -> Array:
-        """Standard deviation of one position (joints,) [rad]: the measured white noise, at least that of rounding."""
+        """Standard deviation of one position (joints,) [rad]: the measured white noise, but at least that of
+        rounding.
+        """
         rounding = self.position_step / np.sqrt(12.0)
         white = np.array([_white_noise(self.time, row) for row in self.position])
         return np.asarray(np.maximum(rounding, white))

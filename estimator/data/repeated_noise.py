@@ -13,8 +13,9 @@ Widrow and I. Kollar, Quantization Noise, 2008). The drift is the slow part of t
 changing friction. Solving for s gives the error variance of one reading, s^2 + 1/12. It is an upper bound, since other
 differences between the passes increase it.
 
-That is the noise if it is white before rounding. Noise that a servo has filtered is stronger at low frequencies; its
-excess there over the fast part is measured by the same difference, except where drift may be (`coloured_noise`).
+This applies to noise that is white before rounding. Noise that a servo has filtered is stronger at low frequencies. Its
+excess there over the fast part is measured from the same difference, except at frequencies at which there may be drift
+(`coloured_noise`).
 """
 
 from collections.abc import Sequence
@@ -53,8 +54,7 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
         step: encoder step of each joint (joints,) [rad].
         averaged: number of passes whose mean is the sample.
 
-    Returns:
-        None for fewer than two passes, or short ones.
+    Returns: The standard deviations; None for fewer than two passes, or short ones.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None
@@ -74,7 +74,8 @@ def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
 
     It is 0 unless significant. On the lines on which the motion may have changed from pass to pass, the noise is
     extrapolated: it is assumed to rise from the octave above by as much as it rises from the next octave to that one.
-    Noise with a long correlation is underestimated. Arguments and None: as for `repeated_noise`.
+    Noise with a long correlation is underestimated. Takes the arguments of `repeated_noise`, and returns None in the
+    same cases.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None

@@ -35,7 +35,7 @@ class RecordingSegment:
     position: Array
     """Measured positions (joints, samples) [rad]."""
     state: Array
-    """Angles and velocities at its start by a local fit (2, joints) [rad, rad/s]."""
+    """Angles and velocities at its start, from a local fit (2, joints) [rad, rad/s]."""
     samples: slice
     """The recording's samples that belong to it."""
 

@@ -64,14 +64,14 @@ class SettledPeriod:
     before: Array | None = None
     """Angles and velocities one period before the first sample (2, joints) [rad, rad/s], as read by the encoders.
 
-    A motion counts as settled if it differs little from that of the period before; what is left of the transient can be
-    predicted from there.
+    A motion counts as settled if it differs little from that of the period before; the rest of the transient can be
+    predicted from this state.
     """
     valid: Mask = field(init=False)
     """Whether each sample was received (joints, samples)."""
     noise: Array = field(init=False)
-    """Standard deviation of one sample's error (joints,) [rad]: the measured white noise, at least that of rounding,
-    and coloured noise.
+    """Standard deviation of one sample's error (joints,) [rad]: the measured white noise, but at least that of
+    rounding, and coloured noise.
 
     If a motion is sampled slowly, its fastest lines are not only noise: what repeats from period to period is left out.
     """

@@ -34,9 +34,9 @@ class Minimum:
     at: Quadratic
     """The sum of squares at the minimum."""
     iterations: int
-    """Number of points at which it was evaluated."""
+    """Number of points at which the sum was evaluated."""
     stalled: bool = False
-    """Whether it was accepted because no damping gave the decrease that the normal equations predict."""
+    """Whether the minimum was accepted because no damping gave the decrease that the normal equations predict."""
 
 
 Evaluate = Callable[[Array], Quadratic]

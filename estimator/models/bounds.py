@@ -1,7 +1,7 @@
 """Parameters at a bound of their range, although the data favour values beyond it.
 
 A fit cannot leave the physical range: an inertia stays positive, a coupling below the geometric mean of its inertias.
-Where the model is wrong or the recording carries little information, the best value may lie outside. The fit then stops
+If the model is wrong or the recording carries little information, the best value may lie outside. The fit then stops
 at the bound, which the standard errors do not reflect, and the other parameters absorb the difference. A parameter
 whose true value is zero, such as the Stribeck term of a joint without Stribeck friction, also ends there but does no
 harm: the undamped step of the normal equations, in the parameters themselves, distinguishes the two cases.
@@ -55,7 +55,8 @@ def finite_std(std: Array, white: Array) -> Array:
     """Return the standard errors `std` (parameters,), with finite values in place of infinite ones, such as those at a
     bound.
 
-    white: standard errors for independent errors. They are used there, widened as those of the other parameters are.
+    white: standard errors for independent errors. They replace infinite ones, widened by as much as those of the other
+    parameters.
     """
     known = np.isfinite(std) & (white > 0.0)
     wider = float(np.median(std[known] / white[known])) if known.any() else 1.0

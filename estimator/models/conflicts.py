@@ -59,7 +59,7 @@ class Conflict:
 
     @property
     def is_large(self) -> bool:
-        """Whether the deviation is larger than tolerances of the servos and of the assembly."""
+        """Whether the deviation is larger than the tolerances of the servos and of the assembly."""
         if self.relative:
             return bool(abs(np.log(self.value / self.expected)) > np.log1p(LARGE_RATIO))
         return abs(self.value - self.expected) > LARGE_ANGLE

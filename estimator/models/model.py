@@ -17,7 +17,9 @@ from hil.estimator.models.terms import (
 )
 
 LEVER_STD = 0.05
-"""Relative standard deviation of a measured link length over gravity, which depends on the configured tilt."""
+"""Relative standard deviation of a measured link length divided by gravity; the latter depends on the configured
+tilt.
+"""
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class Model:
     Always a frozenset after construction.
     """
     lever: float | None = None
-    """Measured length of link 1 over gravity [s^2], if known.
+    """Measured length of link 1 divided by gravity [s^2], if known.
 
     Coupling is expected to be this times gravity_2, within `LEVER_STD`. This prior only matters if the motion does not
     determine the two.

@@ -17,7 +17,7 @@ to parameters and noise, the torque that friction can hold while the joint stand
 planned torque. The noise is estimated as well: effects that the model lacks (Stribeck friction, backlash, flexibility)
 widen the admissible range. A deviation that may become an alarm enters that estimate only once it has ended without
 one; otherwise a joint that is held for long would widen the range until nothing exceeds it. While a joint stands still
-its noise is lower, since most of it needs motion.
+its noise is lower, since most of the noise only arises in motion.
 
 What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which the
 gear's presliding softens every reversal, dry friction looks viscous. It nevertheless holds the joint once it stands
