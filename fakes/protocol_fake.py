@@ -43,8 +43,9 @@ class _Unplugged(serial.SerialException):
 class FakeSerial(SerialBase):
     """A pyserial port onto a fake bus.
 
-    The arm is created when the port is first opened and lives as long as the port object: after closing and reopening
-    it is as it was left, except that time has passed, as with real servos. Two port objects never share an arm.
+    The arm is created when the port is first opened and lives as long as the port object: after closing and reopening,
+    it is as it was left, except that time has passed. Real servos behave in the same way. Two port objects never share
+    an arm.
 
     It has the attributes `clock` and `bus` in addition to pyserial's interface.
     """

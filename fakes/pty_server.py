@@ -37,7 +37,7 @@ LONGEST_SLEEP_S = 0.05
 """Longest wait before the server checks faults, watchdogs and whether to stop [s]."""
 
 PRIORITY = 10
-"""Priority for SCHED_FIFO, where it is permitted: below that of a control loop on the same computer."""
+"""Priority for SCHED_FIFO, if it is permitted: below that of a control loop on the same computer."""
 
 _TCGETS2 = 0x802C542A
 _PR_SET_TIMERSLACK = 29

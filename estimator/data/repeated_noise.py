@@ -54,7 +54,8 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
         step: encoder step of each joint (joints,) [rad].
         averaged: number of passes whose mean is the sample.
 
-    Returns: The standard deviations; None for fewer than two passes, or short ones.
+    Returns:
+        The standard deviations; None for fewer than two passes, or short ones.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None

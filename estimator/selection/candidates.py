@@ -47,7 +47,7 @@ class Candidate:
     evidence: float
     """Decrease of the sum of squares relative to that expected by chance: above 1 it is significant."""
     explained: float
-    """Fraction of the sum of squares that it explains."""
+    """Fraction of the sum of squares that the term explains."""
     values: Mapping[str, float]
     """Initial guesses of the added parameters."""
 
@@ -151,8 +151,8 @@ def linearised(
 def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, float]) -> list[Candidate]:
     """Return the terms that could be added to the estimate's model, most significant first.
 
-    `known`: the periods of ripple and cogging (`hil.estimator.selection.waves`), by parameter name; without them, these
-    are not considered.
+    `known`: the periods of ripple and cogging (`hil.estimator.selection.waves`), by parameter name; a wave whose period
+    is not given is not considered.
     """
     model = estimate.model
     richer = richer_models(model)

@@ -5,7 +5,7 @@ responds on these and, because it is nonlinear, also on others. Effects that cha
 gravity about a hanging pose) produce odd lines; others (an offset, direction-dependent friction, any other pose)
 produce even lines. Some odd lines, the detection lines, are left unexcited to observe the effects of the first kind. If
 even lines are excited too, odd distortion appears on all lines, so the unexcited lines cannot be separated into odd and
-even and form a single group. The residual of a fit on each group, beyond the noise, is its model error there.
+even and form a single group. The residual of a fit on each group, beyond the noise, is the model error of that group.
 """
 
 from dataclasses import dataclass

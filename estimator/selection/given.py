@@ -1,8 +1,9 @@
 """Fit of a model whose terms are given, with the periods of its ripple and cogging searched twice.
 
-The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period provided that it explains the rest of
-the motion. Encoder errors, cables and narrow Stribeck friction are not linear in its lines, and if they matter, the
-search may end at a wrong period, from which no fit recovers. The second search starts from a fit of all other terms.
+The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period if the regression explains the rest
+of the motion. Encoder errors, cables and narrow Stribeck friction are not linear in its lines. If they matter, the
+search may end at a wrong period, and no fit started there finds the right one. The second search starts from a fit of
+all other terms.
 """
 
 from collections.abc import Mapping, Sequence

@@ -52,7 +52,7 @@ def prediction_errors(
 
     Args:
         recordings: recordings of one arm.
-        parameters: parameters by the names of `Model.names` [SI].
+        parameters: parameters by name, as in `Model.names` [SI].
         length: length of a segment [s].
         joints: number of joints.
         zeros: true minus measured angle of each recording (recordings, joints) [rad], overriding `parameters`.

@@ -84,7 +84,7 @@ def held_out_errors(
     """Return the RMS error of predicted segments relative to the motion's RMS: per joint (joints,), and the median.
 
     The initial state of a segment is estimated from its first third; the rest is predicted from the torque alone. The
-    median is that over segments, since the error of a segment in which the arm tumbles can be arbitrarily large. A
+    median is taken over segments, since the error of a segment in which the arm tumbles can be arbitrarily large. A
     prediction that diverges is wrong by half a turn.
     """
     problem = _posed(recordings, estimate, of)

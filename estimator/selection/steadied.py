@@ -1,9 +1,9 @@
 """Periods corrected for friction that changes while they are recorded, as it does while grease warms up.
 
-A fit assumes constant friction. If friction changes by a fraction c per second, it lacks the torque c (t - t_middle)
-F(t), where F is the friction torque. F is known well from the measured motion and a first fit, and c from a later
-recording (`hil.estimator.selection.drift`), so that the product, a small part of the friction, can be subtracted from
-the commanded torque. The fit then holds for the middle of the period.
+A fit assumes constant friction. If friction changes by a fraction c per second, the fit lacks the torque c (t -
+t_middle) F(t), where F is the friction torque. F is known well from the measured motion and a first fit, and c from a
+later recording (`hil.estimator.selection.drift`), so that the product, a small part of the friction, can be subtracted
+from the commanded torque. The fit then holds for the middle of the period.
 """
 
 from dataclasses import replace
@@ -34,8 +34,8 @@ def friction_torque(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def steadied(period: SettledPeriod, estimate: Estimate, drift: Drift) -> SettledPeriod:
-    """Return `period` with the torque that its motion would have needed if friction had always been that in
-    mid-period.
+    """Return `period` with the torque that its motion would have needed if friction had stayed at its mid-period
+    value.
 
     estimate: fitted to this period, or to one under the same friction. drift: change of friction over `drift.seconds`.
     """

@@ -24,7 +24,7 @@ QUICK = LikelihoodOptions(
     integration=IntegrationOptions(max_substeps=16),
     coarse_integration=IntegrationOptions(max_step=2.6e-3, max_substeps=8),
 )
-"""With these limits, no substeps are wasted on bristles that become extremely stiff."""
+"""Limits with which no substeps are wasted on bristles that become extremely stiff."""
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ class Validation:
     """Relative standard error of each base parameter except offsets."""
     torque_std: dict[str, float]
     """Standard error of the torque that each base parameter except offsets contributes, relative to the joint's torque
-    (RMS, worst joint).
+    (RMS), for the worst joint.
     """
     levels: Levels
 

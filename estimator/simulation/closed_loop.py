@@ -65,7 +65,7 @@ class Stabilised:
     """A period in which `feedback` applied part of the torque.
 
     In the simulation the feedback acts on the simulated arm, as it did on the real one, so an arm that is unstable on
-    its own can be simulated; where model and arm agree, the torque is the one that was actually commanded.
+    its own can be simulated. If model and arm agree, the torque is the one that was actually commanded.
     """
 
     feedback: Feedback

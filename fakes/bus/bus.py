@@ -108,7 +108,7 @@ class FakeBus:
 
     @property
     def hand(self) -> Hand:
-        """Moves joints whose torque is off; in its state at the clock's current time."""
+        """The hand that moves joints whose torque is off, in its state at the clock's current time."""
         self.advance(self.clock.now())
         return self._hand
 

@@ -5,8 +5,8 @@
 Faults can also be given in TOML, as `[[fake.faults]]` with the same keys, and on the command line, as `--fault
 lost_reply:servo=2,at=3`. `FAULTS` describes each kind. Times are seconds since the bus was created (`bus.time`).
 
-Faults of packets (replies, instructions, noise) affect each packet while they last, with their probability. The others
-happen at most once, at their time, with their probability. The same seed gives the same faults.
+Faults of packets (replies, instructions, noise) affect each packet with the given probability while they last. Any
+other fault happens at most once, at its time, with the given probability. The same seed gives the same faults.
 """
 
 import difflib

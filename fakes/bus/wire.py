@@ -49,7 +49,7 @@ class Wire:
     def __init__(self, baud: int, latency_s: float) -> None:
         self._set_baud(baud)
         self.collisions = 0
-        """Number of times that two transmitted at once."""
+        """Number of times that two devices transmitted at once."""
         self.reply_by = float("-inf")
         """Time at which the last servo will have finished transmitting [s]."""
         self._latency_s = latency_s

@@ -20,7 +20,7 @@ JAM = 1e6  # N m of dry friction: more than any drive here can overcome
 
 
 class Motor:
-    """The physics of one drive. Its only state is its current and the deflection of its friction's bristles."""
+    """The physics of one drive. Its state consists of its current and the deflection of its friction's bristles."""
 
     __slots__ = (
         "_bent",

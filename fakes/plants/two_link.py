@@ -30,7 +30,9 @@ from hil.fakes.plants.arm import Arm, Link, armature
 from hil.fakes.plants.motor import SHORTEST_STEP, Motor
 
 State = tuple[float, float, float, float, float, float, float, float]
-"""Angles, velocities, accelerations of the last step (to extrapolate velocities to the next one's middle), currents."""
+"""Angles, velocities, accelerations of the last step, currents. The accelerations are used to extrapolate velocities to
+the middle of the next step.
+"""
 
 
 class TwoLink:

@@ -38,7 +38,7 @@ class Encoder(Described):
         return not (self.once_ticks or self.twice_ticks)
 
     def error(self, ticks: float) -> float:
-        """Return the periodic error where a perfect encoder would read `ticks` [ticks]."""
+        """Return the periodic error at the angle at which a perfect encoder would read `ticks` [ticks]."""
         angle = ticks * _TURN_PER_TICK
         return self.once_ticks * math.sin(angle + self.once_phase) + self.twice_ticks * math.sin(
             2.0 * angle + self.twice_phase
@@ -58,10 +58,10 @@ class Reading:
         """Whether its only error is rounding."""
 
     def steady(self, ticks: float) -> float:
-        """Return the reading without noise, before rounding, where a perfect encoder would read `ticks`."""
+        """Return the reading without noise, before rounding, if a perfect encoder would read `ticks`."""
         return ticks if self._encoder.is_linear else ticks + self._encoder.error(ticks)
 
     def sample(self, ticks: float) -> float:
-        """Return one reading with noise, before rounding, where a perfect encoder would read `ticks`."""
+        """Return one reading with noise, before rounding, if a perfect encoder would read `ticks`."""
         read = self.steady(ticks)
         return read if self._noise is None else read + self._noise.gauss(0.0, self._encoder.noise_ticks)

@@ -69,7 +69,7 @@ class ModelFacts:
     """Blocks of indirect addressing: address of the first address register and first data register, and their number.
     """
     older_indirect: tuple[tuple[int, int, int], ...] | None = None
-    """The blocks in firmware before `INDIRECT_MOVED_FIRMWARE`, where they differ."""
+    """The blocks in firmware before `INDIRECT_MOVED_FIRMWARE`, if they differ."""
 
 
 _Facts = RegisterFacts
