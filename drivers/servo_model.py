@@ -53,8 +53,8 @@ LEAST_OF_MEASURED = 0.75
 """`LEAST_SUPPLY` if the supply was measured: it may sag between two readings, and motors differ."""
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
-"""A current below the first fraction of its goal may also be that of a servo without torque; the second value then
-replaces `LEAST_OF_MEASURED`.
+"""If a current is below the first fraction of its goal, the servo may also have its torque off. The second value then
+replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
 """
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
@@ -176,7 +176,9 @@ class ServoModel:
 
     @property
     def torque_per_ampere(self) -> Published:
-        """Torque constant at the output shaft [N m/A]: stall torque over stall current, and other published values."""
+        """Torque constant at the output shaft [N m/A]: stall torque divided by stall current, and other published
+        values.
+        """
         return _spread([stall.torque / stall.current for stall in self.stalls] + list(self.other_constants))
 
     @property

@@ -32,7 +32,8 @@ def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) 
     """Fit the lines of a period about the hanging pose by least squares.
 
     length: length of link 1 [m]. The linear response of two joints determines three combinations of the four inertias;
-    coupling = length gravity_2 / gravity is the fourth equation. Raises ModelError without gravity or length.
+    coupling = length gravity_2 / gravity is the fourth equation. Raises ModelError if the gravity term or the length is
+    missing.
     """
     if gravity <= 0.0:
         raise ModelError("the paper's method linearises about the hanging pose, which requires gravity")

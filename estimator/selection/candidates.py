@@ -68,7 +68,9 @@ class Linearised:
     gradient: Array
     """J'Wr with r simulated minus measured (causes,)."""
     samples: int
-    """Number of valid samples over all joints; it equals the sum of squares, which is weighted by the residual."""
+    """Number of valid samples over all joints. Each joint's residual is divided by its RMS, so the sum of squares
+    equals this number.
+    """
     colour: float
     """Factor by which the residual's correlation raises the decrease expected by chance; 1 for white residuals."""
     precision: Array

@@ -41,7 +41,7 @@ class Drift:
     seconds: float
     """Time between the middles of the periods that are compared [s]."""
     left: float = np.inf
-    """Sum of squares of what the change does not explain, in units of the noise."""
+    """Sum of squares of the residual that the change does not explain, in units of the noise."""
 
     @property
     def is_seen(self) -> bool:
@@ -112,7 +112,7 @@ class TorqueChange:
     std: Array
     """Standard error of the torque (joints,) [N m]."""
     left: float
-    """Sum of squares of what the torque does not explain, in units of the noise."""
+    """Sum of squares of the residual that the torque does not explain, in units of the noise."""
     noticed: Array
     """Smallest torque of each joint that matters (joints,) [N m]."""
 

@@ -105,7 +105,8 @@ class Fitting:
     """Change of friction from the fitted periods to `held_out`; both are corrected for it."""
 
     def trial(self, model: Model, near: Trial | None, values: Mapping[str, float], coarse: bool) -> Trial:
-        """Fit `model` from the result of `near`, using `values` for what it lacks, or from scratch.
+        """Fit `model` from the result of `near`, using `values` for the parameters that this result lacks, or from
+        scratch.
 
         Raises ConvergenceError.
         """

@@ -70,7 +70,7 @@ class Present:
         self._imperfect = noise is not None or senses_supply
         self._booted_at = 0.0
         self._turn_ticks = 0
-        """What the servo adds to its encoder's count [ticks], before reverse mode mirrors the sum."""
+        """Offset that the servo adds to its encoder's count [ticks]; reverse mode mirrors the sum."""
         self._shift = 0
         self._reversed = False
         self._moving_threshold = 0

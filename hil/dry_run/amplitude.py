@@ -53,7 +53,7 @@ class AmplitudeOptions:
     torque_share: float = 0.97
     """Fraction of the current limit that may be used, since clamping would distort the designed wave."""
     initial_share: float = 0.125
-    """Initial torque, relative to what the current limits allow."""
+    """Initial torque, relative to the torque that the current limits allow."""
     initial_safe_share: float = 0.25
     """Torque, relative to the initial one, that is assumed to be safe until the search finds a larger safe torque."""
 

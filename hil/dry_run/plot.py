@@ -12,7 +12,9 @@ from hil.errors import RunFolderError
 
 
 def draw(config: Config, prediction: Prediction, path: Path) -> None:
-    """Save the plot to `path`. Raises MissingExtra without matplotlib, RunFolderError if `path` cannot be written."""
+    """Save the plot to `path`. Raises MissingExtra if matplotlib is not installed, RunFolderError if `path` cannot be
+    written.
+    """
     figure = plot(config, prediction)
     try:
         figure.savefig(path, dpi=130)

@@ -398,7 +398,7 @@ def _within_limits(config: Config, pose: Array, inside: float) -> Array:
 
 
 def only_first(found: Amplitude, options: PilotOptions = DEFAULTS) -> Amplitude:
-    """The amplitude `found` with only the first multisine."""
+    """The amplitude `found`, with its plan reduced to one period of the first multisine."""
     plan = replace(
         found.plan.first_segment(), max_settling_periods=options.max_pilot_settling, periods=1, warm_up_periods=0
     )

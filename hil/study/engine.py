@@ -47,8 +47,8 @@ that needs too much memory never ends."""
 def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> Iterator["Client"]:
     """Connect to a Dask cluster; scheduler: None for this machine, "tcp://HOST:PORT", or "slurm".
 
-    Raises MissingExtra without Dask, and ConfigError if no scheduler answers, there is no worker, or a worker has
-    other versions of hil or of Python packages.
+    Raises MissingExtra if Dask is not installed, and ConfigError if no scheduler answers, there is no worker, or a
+    worker has other versions of hil or of Python packages.
     """
     try:
         import dask

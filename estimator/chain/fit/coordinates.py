@@ -97,7 +97,7 @@ class ChainCoordinates:
         return y
 
     def room_below(self, x: Array) -> Array:
-        """Return the largest possible decrease of each parameter's coordinate, as a number not above 0
+        """Return the largest possible decrease of each parameter's coordinate, as a negative number or 0
         (parameters,).
 
         Only widths have a floor; `x` may be followed by other coordinates.

@@ -15,7 +15,9 @@ class ChainOptions:
     A softer observer extracts more information; one that is too soft no longer follows the motion.
     """
     lost: float = 1.5
-    """The previous observer is kept if the cost increases by more than this ratio beyond what the softness explains."""
+    """The previous observer is kept if the cost increases by more than this ratio in addition to the increase that the
+    softness explains.
+    """
     first_step: float = 5.2e-3
     """Integration step while the observer is stiff [s]; samples within it are skipped."""
     coarse_step: float = 2.6e-3

@@ -72,7 +72,7 @@ class ChainFit:
     remaining: float
     """Decrease of the sum of squares that is expected from one more step, the one that would reach the minimum."""
     neglected: Array
-    """Covariance due to what the model of voltage-driven joints neglects (parameters, parameters) [SI]."""
+    """Covariance due to the effects that the model of voltage-driven joints neglects (parameters, parameters) [SI]."""
     at_bound: tuple[str, ...] = ()
     """Parameters at a bound although the data favour values beyond it, if base parameters depend on them."""
     held_zeros: HeldZeros | None = None
@@ -83,7 +83,7 @@ class ChainFit:
     @property
     def total_covariance(self) -> Array:
         """Covariance of `value` about the truth: the covariance at the minimum, widened by the distance to the minimum
-        and by what the model is known to neglect.
+        and by the effects that the model is known to neglect.
         """
         return np.asarray(self.covariance + np.outer(self.missing, self.missing) + self.neglected)
 

@@ -45,7 +45,8 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
 
 
 def neglected_covariance(problem: ChainProblem, x: Array) -> Array:
-    """Return the covariance (parameters, parameters) [SI] due to what the description of late back-EMF neglects.
+    """Return the covariance (parameters, parameters) [SI] due to the effects that the description of late back-EMF
+    neglects.
 
     The effect of friction on the motor's current is delayed by the difference of both lags. This makes a joint's
     inertia wrong by the square of the lost inertia, divided by the inertia

@@ -43,8 +43,8 @@ def import_mujoco() -> tuple[Any, Any]:
 def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: float, gravity: float, seed: int) -> Peer:
     """Fit with mujoco.sysid, starting from values drawn within 50 % of `centre` (base parameters by name [SI]).
 
-    `length`: length of link 1 [m]. `gravity`: acceleration of gravity [m/s^2]. Raises MissingExtra without
-    mujoco[sysid].
+    `length`: length of link 1 [m]. `gravity`: acceleration of gravity [m/s^2]. Raises MissingExtra if mujoco[sysid] is
+    not installed.
     """
     mujoco, sysid = import_mujoco()
     linear = fit_lines(period)
