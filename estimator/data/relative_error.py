@@ -6,7 +6,7 @@ from hil.estimator.arrays import Array
 
 
 def relative_error(measured: Array, predicted: Array, noise: Array | None = None) -> Array:
-    """Return the RMS of `measured` minus `predicted`, divided by that of the motion about its mean (joints,).
+    """Return the RMS of `measured` minus `predicted`, divided by the RMS of the motion about its mean (joints,).
 
     Both are positions (joints, samples) [rad]; samples that are NaN in `measured` are ignored. noise: standard
     deviation of one measured sample (joints,) [rad]; no model predicts it, so its power is subtracted.

@@ -119,7 +119,7 @@ def conflicts(
 
 
 def worst_first(found: Sequence[Conflict | None]) -> tuple[Conflict, ...]:
-    """Return those of `found` that are contradictions, the largest first."""
+    """Return the deviations in `found` that are contradictions, the largest first."""
     return tuple(sorted((each for each in found if each is not None), key=lambda each: -each.deviations))
 
 

@@ -17,9 +17,7 @@ from hil.estimator.models.terms import (
 )
 
 LEVER_STD = 0.05
-"""Relative standard deviation of a measured link length divided by gravity; the latter depends on the configured
-tilt.
-"""
+"""Relative standard deviation of a measured link length divided by gravity; gravity depends on the configured tilt."""
 
 
 @dataclass(frozen=True)

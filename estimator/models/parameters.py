@@ -27,7 +27,7 @@ LEAST_INERTIA = 0.2
 def place_of(term: str) -> int:
     """Return the index of a term's constant in `Physics.vector`.
 
-    For a term that each joint has, it is the index for joint 1; that for joint 2 follows.
+    For a term that each joint has, it is the index for joint 1; the index for joint 2 follows.
     """
     return CONSTANTS.index(term if TERMS[term].scope == "arm" else f"{term}_1")
 

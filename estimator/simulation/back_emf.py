@@ -11,8 +11,8 @@ the lag lag'. It is simulated in this way: `Physics.of` subtracts back_emf visco
 inertia, 5 to 10 % of it on an XL430. The estimated lag is lag', slightly larger than that of the winding. The effect of
 friction on the motor's current is delayed by lag' - lag (see `neglected`).
 
-Ripple, saturation and load-dependent friction act on the motor's torque, which is that of the voltage minus that of the
-back-EMF (`hil.estimator.simulation.arm`).
+Ripple, saturation and load-dependent friction act on the motor's torque, which is the torque of the voltage minus the
+torque of the back-EMF (`hil.estimator.simulation.arm`).
 """
 
 from collections.abc import Mapping

@@ -38,8 +38,8 @@ def torque_and_slopes(
 ) -> tuple[Array, Array]:
     """Return `motor_torque` and its derivatives (2, joints, samples, steps) [N m/s] with respect to delay and lag.
 
-    If a command changes exactly at the edge of a step and there is no lag, the derivative is
-    the one-sided one, towards smaller delays.
+    If a command changes exactly at the edge of a step and there is no lag, the derivative with respect to delay is
+    one-sided, towards smaller delays.
     """
     torque, late, change = _torque(command, rate, command_to_sample, steps, delay, lag)
     return torque, np.stack((late, change))

@@ -4,12 +4,12 @@ Where the manual is silent, the fake behaves as follows:
 
 - A Sync Read samples the registers of all servos when the last byte of its instruction arrives.
 - In a group read each servo waits for the one listed before it. After one that does not reply, all others stay silent,
-and the reply to a fast read ends in the middle (source: ROBOTIS in DynamixelSDK issue 364).
+  and the reply to a fast read ends in the middle (source: ROBOTIS in DynamixelSDK issue 364).
 - Servos reply to a broadcast Ping one directly after the other, in ascending order of ID.
 - If two servos have the same ID and reply at once, the host receives nothing; both execute the instruction.
-- The status of a write to ID or Baud Rate, and of a Factory Reset, is still sent with the old ID at the old baud rate;
-that of a Reboot no longer carries the Alert bit, which the reboot clears: ROBOTIS' easy SDK and hardware interface
-reboot servos because of alerts, yet treat any error in this status as a failed reboot.
+- The status of a write to ID or Baud Rate, and of a Factory Reset, is still sent with the old ID at the old baud rate.
+- The status of a Reboot no longer carries the Alert bit, which the reboot clears: ROBOTIS' easy SDK and hardware
+  interface reboot servos because of alerts, yet treat any error in this status as a failed reboot.
 - A servo executes what is addressed to its Secondary ID but does not reply to it; its EEPROM is not written.
 - In a fast read, a servo that refuses sends its error and zeros.
 """

@@ -44,8 +44,8 @@ SHORT_S, LONG_S = 0.3, 1.2
 """Time constants of the memories [s]."""
 
 LONG_EVERY_S = 0.0099
-"""Shortest interval after which the long fading memory is updated [s]: that of 100 Hz, less a margin for rounding
-errors.
+"""Shortest interval after which the long fading memory is updated [s]: the sample interval at 100 Hz, minus a margin
+for rounding errors.
 """
 
 UNSURE_RAD, LONG_UNSURE_RAD = 0.02, 0.045

@@ -1,8 +1,8 @@
 """Check during the experiment that the motion is consistent with some arm of the dry run's ensemble.
 
-The prior knowledge is that of the dry run: an ensemble of arms from `[arm.prior]` or from an earlier result. Its mean
-and inflated covariance initialise `hil.estimator.models.momentum_observer`. Without link lengths, which a dry run needs
-too, only the planned torque is known: the first motion then trains the model, and only later motion is judged.
+The prior knowledge is the same as in the dry run: an ensemble of arms from `[arm.prior]` or from an earlier result. Its
+mean and inflated covariance initialise `hil.estimator.models.momentum_observer`. Without link lengths, which a dry run
+needs too, only the planned torque is known: the first motion then trains the model, and only later motion is judged.
 """
 
 import math

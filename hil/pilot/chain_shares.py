@@ -47,7 +47,7 @@ processor time with six joints.
 """
 
 STOPPED_SHARE = 0.5
-"""Effort of simulating a stop, relative to that of simulating one arm on a path and its transitions."""
+"""Effort of simulating a stop, relative to the effort of simulating one arm on a path and its transitions."""
 
 RAISED_RATE = 1.6
 """Ratio of the first higher rate that is tried, for advice, to the configured one."""

@@ -64,8 +64,8 @@ class RecentMotion:
             self._states.append(state)
 
     def believed(self, state: State) -> list[float]:
-        """The reported velocities, confined to what the positions allow [rad/s]; 0 if no change of position is
-        known.
+        """The reported velocities, confined to the range that the positions allow [rad/s]; 0 if no change of position
+        is known.
 
         state: the latest exchange.
         """

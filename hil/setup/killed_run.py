@@ -28,8 +28,8 @@ def left_behind(port: str, joint: Joint) -> Kept | None:
 class Left:
     """What a killed program left on one servo.
 
-    kept: the settings before that program. wanted: the settings to restore, except that those changed by another
-    program since then keep their present values. changed: the latter registers, each with its present value.
+    kept: the settings before that program. changed: the registers that another program has changed since then, each
+    with its present value. wanted: the settings to restore; the changed registers keep their present values.
     """
 
     kept: Kept

@@ -134,8 +134,8 @@ class Goal:
     """Number of samples of the recording."""
 
     def error(self, lines: NDArray[np.complex128]) -> float:
-        """Return the expected RMS error of the rigid-body torque of other motions relative to its RMS, for the worst
-        joint.
+        """Return the RMS error expected of the rigid-body torque in other motions, relative to that torque's RMS, for
+        the worst joint.
         """
         rows = self._seen(self._columns(self.box.path(lines, self._samples))) * self._lengths
         information = rows.T @ rows

@@ -1,8 +1,8 @@
 """The compiled motion of a chain under given motor torques, and its derivatives (parameters, initial state).
 
-Friction and drive are those of `hil.estimator.simulation.arm`. Each step uses that module's Rosenbrock method ROS2,
-with the second stage written so that both stages need the regressor at one acceleration only. With f the torques minus
-friction, S the slopes of friction, ID inverse dynamics, M the mass matrix, and primes for quantities at the end
+Friction and drive are modelled as in `hil.estimator.simulation.arm`. Each step uses that module's Rosenbrock method
+ROS2, with the second stage written so that both stages need the regressor at one acceleration only. With f the torques
+minus friction, S the slopes of friction, ID inverse dynamics, M the mass matrix, and primes for quantities at the end
 predicted by stage 1,
 
     ID(q, v, k) + gamma h S k = f        ID(q', v', l + 2 k) + gamma h S' l = f'

@@ -85,7 +85,7 @@ def by_voltage(config: Config) -> NDArray[np.bool_]:
 
 
 def torque_factor(config: Config, sag: Sag | None, samples: NDArray[np.void]) -> Array:
-    """Torque relative to that with a constant supply voltage (samples, joints)."""
+    """Torque relative to the torque with a constant supply voltage (samples, joints)."""
     if sag is None:
         return np.ones(samples["goal_current"].shape)
     return np.where(by_voltage(config), sag.remaining(samples), 1.0)
