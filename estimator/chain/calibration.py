@@ -66,7 +66,7 @@ class ChainCalibration:
 
     @property
     def misfit(self) -> float:
-        """Mean square of the residual, each run's scaled by its own noise; 1 for noise alone."""
+        """Mean square of both runs' residuals, each divided by the noise of its run; 1 for noise alone."""
         return float(np.mean((self.residual_steps / self.noise_steps) ** 2))
 
 

@@ -92,7 +92,7 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: `largest` is raised to at least this multiple of dry friction, as far as that is known: near standstill,
+    frictions: `largest` is raised to at least this multiple of the known dry friction, because near standstill
     friction behaves differently from the model.
     """
 

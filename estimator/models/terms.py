@@ -97,7 +97,9 @@ class Term:
     sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of the two terms that this one is a share of; for a term of each joint, terms of the same joint."""
+    """Names of the two terms of which this one is a share; if each joint has such a term, the terms of the same
+    joint.
+    """
     scale: Scale | float = 1.0
     """Typical change in the fit: the name of a scale of the arm and its motion, or a number [unit]."""
     initial: float = 0.0

@@ -138,9 +138,9 @@ class EmulatedServo(Powered):
         """Power up at time `now` [s]; the servo does not respond for `boot_s` [s].
 
         angle: returns the joint's current position [rad]; called later as well.
-        RAM registers take their initial values (or the backup's, depending on Startup Configuration; the XL320's Torque
-        Limit takes Max Torque), torque is off, errors are cleared, and the turn count is lost: Present Position starts
-        within one turn (before Homing Offset).
+        RAM registers take their initial values, or those of the backup if Startup Configuration says so; the XL320's
+        Torque Limit takes Max Torque. Torque is off, and errors are cleared. The turn count is lost: Present Position
+        starts within one turn (before Homing Offset).
         """
         memory = self.memory
         for register in memory.registers.values():

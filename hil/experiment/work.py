@@ -18,7 +18,7 @@ TOLERANCE_RAD = 0.04
 """A joint's sign is considered wrong if its motor has taken more work than this out of the arm, divided by the joint's
 largest planned torque [rad].
 
-Because of delays, even a healthy motor takes some out: up to 0.02 rad from a heavy arm at 20 Hz.
+Because of delays, even a healthy motor takes some work out of the arm: up to 0.02 rad with a heavy arm at 20 Hz.
 """
 
 _OF_OTHERS = 0.5
