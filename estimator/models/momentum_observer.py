@@ -19,9 +19,8 @@ widen the admissible range. A deviation that may become an alarm enters that est
 one; otherwise a joint that is held for long would widen the range until nothing exceeds it. While a joint stands still
 its noise is lower, since most of the noise only arises in motion.
 
-What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which the
-gear's presliding softens every reversal, dry friction looks viscous. It nevertheless holds the joint once it stands
-still.
+What friction can hold includes the viscous friction at the speeds of the usual motion: over a small motion, in which
+the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once it stands.
 
 Errors of the model last longer than the interval between two updates, and so does the rounding of a velocity that stays
 below one tick: they are not new information each time. Therefore each update counts only as a fraction of one.
@@ -92,8 +91,8 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: `largest` is raised to at least this multiple of the known dry friction, because near standstill
-    friction behaves differently from the model.
+    frictions: multiple of dry friction, as far as it is known, to which `largest` is raised if it is smaller: near
+    standstill, friction behaves differently from the model.
     """
 
     def __init__(
