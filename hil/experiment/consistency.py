@@ -142,8 +142,8 @@ MEMORY = np.dtype(
 position, velocity: latest ones [rad, rad/s]; the position is NaN before the first one and after a long gap. seconds,
 moved, difference, unknown, most_curved: sums (for the last one, the maximum) since the long memory was last updated.
 learnt_for: duration of the motion that lag and scale error were estimated from [s]. lag_squared, scale_squared,
-crossed, lag_product, scale_product: elements of the normal equations for the two. lag, scale: largest accepted values
-[s, 1].
+crossed, lag_product, scale_product: elements of the normal equations for lag and scale error. lag, scale: largest
+accepted values [s, 1].
 """
 
 
