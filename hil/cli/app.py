@@ -36,7 +36,7 @@ def _root(
     allow_code: Annotated[
         bool,
         typer.Option(
-            "--allow-code", help='Let a file\'s [fake] plant = "module:factory" run arbitrary code. Read it first.'
+            "--allow-code", help='Run the code that [fake] plant = "module:factory" names. Read that code first.'
         ),
     ] = False,
 ) -> None:

@@ -64,7 +64,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
             continue
         if max(-lower, upper) > _MOST_TURNED_RAD:
             in_rad = f"[{math.radians(lower):.3g}, {math.radians(upper):.3g}]"
-            yield f"{where}: are these degrees? They must be in radians, then {in_rad}."
+            yield f"{where}: are these degrees? Limits must be in radians, here {in_rad}."
             continue
         low, high = joint.position_limit
         free = POSITION_RESERVE * (high - low)
@@ -88,8 +88,8 @@ def doubted_gravity(config: "Config") -> Iterator[str]:
         return
     used = [round(each, 4) + 0.0 for each in base_gravity(config).tolist()]
     yield (
-        f"{arm.path.name}: its gravity is {list(arm.gravity)} m/s^2, which is not used: [arm] base and gravity "
-        f"give {used} in the frame of the base. {_mounted(np.array(arm.gravity))}"
+        f"{arm.path.name}: its gravity, {list(arm.gravity)} m/s^2, is not used. [arm] base and gravity give {used} "
+        f"in the frame of the base. {_mounted(np.array(arm.gravity))}"
     )
 
 
@@ -189,20 +189,21 @@ def _planar_slips(config: "Config") -> Iterator[str]:
     if config.arm.urdf is None and config.joint_path is not None:
         yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
     if config.model.base_tilt:
-        yield "model.base_tilt: the tilt of a planar arm equals a zero error of its first joint: use model.zeros"
+        yield "model.base_tilt: tilting a planar arm acts like a zero error of its first joint: use model.zeros"
 
 
 def _path_slips(config: "Config") -> Iterator[str]:
     if config.experiment.band is None:
         yield (
-            "experiment.lines: a spatial arm follows a path, whose highest frequency is the upper end of "
-            "experiment.band"
+            "experiment.lines: only for planar arms; a spatial arm follows a path, and the upper end of "
+            "experiment.band is its highest frequency"
         )
     high = (config.experiment.band or DEFAULT_BAND)[1]
     if config.experiment.period * high < _HARMONICS - 1e-9:
         yield (
             f"experiment.period = {config.experiment.period:g} s: a path needs at least {_HARMONICS} harmonics below "
-            f"the upper end of its band, {high:g} Hz: make it at least {_HARMONICS / high:.3g} s; 8 to 10 s are usual"
+            f"the upper end of its band, {high:g} Hz: set period to at least {_HARMONICS / high:.3g} s; 8 to 10 s are "
+            "usual"
         )
     if config.joint_path is None:
         return
@@ -218,8 +219,8 @@ def _path_slips(config: "Config") -> Iterator[str]:
         if speed > joint.velocity_limit:
             hint = in_other_units(speed, "rad/s", lambda limited: limited <= least)
             yield (
-                f"joint_path.speed: {speed:g} rad/s of {joint.name!r}: its velocity_limit is {joint.velocity_limit:g}"
-                + (f". {hint}" if hint else "")
+                f"joint_path.speed: {speed:g} rad/s for {joint.name!r}, above its velocity_limit of "
+                f"{joint.velocity_limit:g} rad/s" + (f". {hint}" if hint else "")
             )
 
 

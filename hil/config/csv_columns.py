@@ -90,7 +90,9 @@ class Columns(_Table):
     torque_per_volt: list[Gain] | None = Field(
         None, description="N m/V per joint at standstill: stall torque over voltage, or torque_constant / resistance"
     )
-    between: Literal["held", "linear"] = Field("linear", description="held for a command, linear for a measurement")
+    between: Literal["held", "linear"] = Field(
+        "linear", description="torque between samples: held for a command, linear for a measurement"
+    )
     segment: PositiveFloat = Field(
         1.0, le=60, description="s, duration of a shooting segment, each with an unknown initial state"
     )

@@ -108,7 +108,9 @@ class JointConfig(Table):
                 raise ValueError(f"{name} is missing; {mode} mode needs it")
         for name, value in zip(names[not pwm], values[not pwm], strict=True):
             if value is not None:
-                raise ValueError(f"{name} = {value:g}: it has no meaning in {mode} mode; {' and '.join(names[pwm])} do")
+                raise ValueError(
+                    f"{name} = {value:g}: it has no meaning in {mode} mode; use {' and '.join(names[pwm])}"
+                )
         return self
 
     @property

@@ -66,7 +66,7 @@ class PortConfig(Table):
 
     url: str = Field(min_length=1, description='device or pyserial URL; "fake://" is the [fake] arm of the same file')
     baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
-    one_write: bool = Field(True, description="send goals and read request in one write; false if hil check says so")
+    one_write: bool = Field(True, description="send goals and read request in one write; set as hil check advises")
     fast_sync_read: bool = Field(True, description="use Fast Sync Read where every servo's firmware supports it")
 
 
@@ -118,24 +118,24 @@ class SafetyConfig(Table):
         0.08, ge=0.02, le=2.54, description="s, time without packets after which a servo stops by itself"
     )
     allow_no_watchdog: bool = Field(
-        False, description="accept firmware without a Bus Watchdog: nothing then stops the servo when packets cease"
+        False, description="accept firmware without a Bus Watchdog: if packets cease, nothing then stops the servo"
     )
     write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
     missing_time: PositiveFloat = Field(0.015, le=2, description="s, time for which a servo may fail to reply")
     late_time: PositiveFloat = Field(0.05, le=2, description="s, time for which deadlines may be missed")
     max_missing: int | None = Field(
-        None, ge=1, le=1000, description="consecutive lost replies, instead of missing_time"
+        None, ge=1, le=1000, description="allowed consecutive lost replies, instead of missing_time"
     )
     max_late: int | None = Field(None, ge=1, le=1000, description="consecutive missed deadlines, instead of late_time")
     rest_time: float = Field(3.0, gt=0, le=60, description="s, time allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, le=2, description="rad/s, speed below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, le=1e4, description="A/s (V/s in PWM mode): maximum rate of change of goals")
-    max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C inside a servo")
+    max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C, highest inside a servo")
     min_voltage: float = Field(0.0, ge=0, le=60, description="V; default: the models' factory shutdown thresholds")
     max_voltage: PositiveFloat = Field(30.0, le=60, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s, time for which a current may deviate from its goal")
     follow_share: PositiveFloat = Field(
-        0.3, le=1, description="fraction of the planned peak by which a current may deviate for longer"
+        0.3, le=1, description="deviation of a current allowed for longer, as a fraction of the planned peak"
     )
     take_over: bool = Field(
         False, description="take over an arm whose torque is on, and lower it slowly; by default such an arm is refused"
@@ -258,7 +258,7 @@ class Config(Table):
             found = "no multiple" if lines == 0 else "only 1 multiple" if lines == 1 else f"only {lines} multiples"
             raise ValueError(
                 f"experiment.band = [{low:g}, {high:g}] Hz contains {found} of 1 / period = {1 / experiment.period:g} "
-                f"Hz; each of [[joints]] needs one of its own: lengthen period, or widen band"
+                f"Hz, but each of [[joints]] needs its own: lengthen period, or widen band"
             )
 
     def _check_pilot(self) -> None:

@@ -40,7 +40,7 @@ def test_doubts_are_told_before_anything_moves(
         raise ExperimentError(told[0].message)
 
     monkeypatch.setattr(experiment, "run_experiment", move)
-    with pytest.raises(ExperimentError, match=r"Warning: current_limit of joint .* it probably would not move"):
+    with pytest.raises(ExperimentError, match=r"Warning: current_limit of joint .* The joint probably would not move"):
         start(tmp_path / "arm.toml", out=tmp_path / "run", on_progress=told.append)
     assert not (tmp_path / "run").exists()
 
