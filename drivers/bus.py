@@ -315,7 +315,7 @@ class ServoBus:
         self._last_answers = reply.servos
         state = self._converter.state(ticks, reply)
         if (strangers := exchange.heard.strangers) > MOST_STRANGERS:
-            raise shared(f"has sent {strangers} packets, or made servos send them,")
+            raise shared(f"has sent {strangers} packets, or requested them from servos,")
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def check_not_overruled(self, due: float) -> None:

@@ -63,7 +63,9 @@ class FakeServo(Described):
         bool, Field(description="whether supply voltage and back-EMF also limit the current in current mode")
     ] = False
     thermal: Annotated[Thermal | None, Field(description="heating by the motor current; none by default")] = None
-    overload: Annotated[Overload | None, Field(description="when it shuts down on overload; never by default")] = None
+    overload: Annotated[
+        Overload | None, Field(description="conditions of its overload shutdown; by default it never shuts down")
+    ] = None
     registers: Annotated[
         dict[str, int], Field(description="other EEPROM registers with values different from the factory defaults")
     ] = {}  # noqa: RUF012  # pydantic copies it

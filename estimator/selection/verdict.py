@@ -187,12 +187,12 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
     listed = ", ".join(f"{name} ({100.0 * worst[name]:.2g} %)" for name in named[:4])
     more = f" and {len(named) - 4} others" if len(named) > 4 else ""
     if trust == "no":
-        return f"It may bias everything, most of all {listed}{more}."
+        return f"It may bias all parameters, most of all {listed}{more}."
     if trust == "yes":
-        return f"The standard errors include it: {listed}{more}; the others are known to 2 % or better."
+        return f"The standard errors include it: {listed}{more}; the other parameters are known to 2 % or better."
     return (
-        f"It may bias all of them: the standard errors include it ({listed}{more}; the others at most 2 %), but while "
-        "its cause is unknown, errors of several standard errors are possible."
+        f"It may bias all parameters. The standard errors include it ({listed}{more}; the others at most 2 %), but "
+        "while its cause is unknown, errors of several standard errors are possible."
     )
 
 
@@ -208,10 +208,10 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
         return f"{100.0 * float(level[joint] / driven[joint]):.2g} %"
 
     found = (
-        f"On lines that were not excited, joint {joint + 1} responds with {share(levels.odd.motion)} of an excited "
-        f"line's motion on odd ones (friction, gravity) and {share(levels.even.motion)} on even ones (offsets, "
-        f"direction-dependent effects); noise is {share(levels.noise)}. The model does not explain "
-        f"{share(levels.odd.left)} and {share(levels.even.left)}."
+        f"Joint {joint + 1} also responds on lines that were not excited. Relative to an excited line's motion: "
+        f"{share(levels.odd.motion)} on odd lines (friction, gravity), {share(levels.even.motion)} on even lines "
+        f"(offsets, direction-dependent effects), and {share(levels.noise)} noise. The model leaves "
+        f"{share(levels.odd.left)} (odd) and {share(levels.even.left)} (even) unexplained."
     )
     beyond = [
         hint
@@ -241,9 +241,9 @@ def _pushed(torque: TorqueChange | None) -> tuple[str, ...]:
         if seen
     )
     return (
-        f"Relative to the fitted motion, a constant torque of {found} acts in the held-out one, which explains the "
-        "difference better than a change of friction: in one of them something pushed or pulled the arm, a cable "
-        "tightened, it carried something, or its base tilted. Remove the cause and record again.",
+        f"Relative to the fitted motion, a constant torque of {found} acts in the held-out one. It explains the "
+        "difference better than a change of friction. In one of the two motions, something pushed or pulled the arm, a "
+        "cable tightened, the arm carried something, or its base tilted. Remove the cause and record again.",
     )
 
 
@@ -251,7 +251,7 @@ def _reason(change: float, seconds: float) -> str:
     """Return the possible cause of a change of friction, as the end of a sentence. While a servo warms up, its friction
     falls; a rise always indicates a fault.
     """
-    holds = "the values hold for the fitted periods"
+    holds = "the identified values hold for the fitted periods"
     if change < 0.0:
         warm = f"To obtain those of the warm arm, set experiment.warm_up = {_warm_up(seconds)}."
         return f", as is typical while grease warms up: {holds}. {warm}"
@@ -274,8 +274,8 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
     if as_fitted is None or _percent(as_fitted) == worst:
         return (f"{said}.",)
     return (
-        f"{said} with friction as it was at that time, one factor per joint taken from that motion itself; with "
-        f"friction as it was in the fitted motion, to within {_percent(as_fitted)}.",
+        f"{said}, if friction is rescaled to its level at that time (one factor per joint, taken from that motion). "
+        f"With friction as in the fitted motion, it predicts it to within {_percent(as_fitted)}.",
     )
 
 
@@ -296,12 +296,12 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
     name = validation.weakest
     part = validation.relative_std[name]
     if part <= WELL_KNOWN:
-        return (f"The least well known parameter is {name}, to {100 * part:.2g} %.",)
+        return (f"The least certain parameter is {name}, known to {100 * part:.2g} %.",)
     improvement = improvement_of(name, torque_limit)
     if part > WEAK and not _is_weak(validation, name):
         share = 100 * validation.torque_std[name]
         return (
-            f"The least well known parameter is {name}, to {100 * part:.2g} %, which hardly affects this arm: its "
+            f"The least certain parameter is {name}, known to {100 * part:.2g} %. It hardly affects this arm: its "
             f"standard error is {share:.2g} % of the torque of the fitted motion. To improve it: {improvement}.",
         )
     if not np.isfinite(part):

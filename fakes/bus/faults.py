@@ -113,7 +113,7 @@ _LEAST_REPEAT_S = 1e-3
 class Fault(Described):
     """One injected fault, immutable. `servo` is a bus ID at the time the fault begins; None means all servos."""
 
-    kind: Annotated[FaultKind, Field(strict=False, description="what goes wrong; see FAULTS")]
+    kind: Annotated[FaultKind, Field(strict=False, description="kind of fault; see FAULTS")]
     at: Annotated[
         float, Field(ge=0, allow_inf_nan=False, description="when it begins [s since the bus was created]")
     ] = 0.0

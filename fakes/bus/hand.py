@@ -102,7 +102,9 @@ class Hand:
         now = self._time()
         free = {self._joint_of(move) for move in moves} - self._grips.keys()
         if moves and not isinstance(self._plant, CanBeHeld):
-            raise PlantError(f"{type(self._plant).__name__} has no hold(joint, velocity): the hand needs it")
+            raise PlantError(
+                f"{type(self._plant).__name__} has no hold(joint, velocity): moving a joint by hand needs it"
+            )
         for joint in free:
             self._hold(joint, None)  # a custom plant that cannot be held is refused now, not in the middle of a run
         self._to_come += [move.model_copy(update={"at": now + move.at}) for move in moves]

@@ -175,7 +175,7 @@ class CheckedPlant:
     def hold(self, joint: int, velocity: float | None) -> None:
         """Grip, move or release a joint; raises PlantError if the plant does not support this."""
         if not isinstance(self._plant, CanBeHeld):
-            raise PlantError(f'plant "{self._name}" has no hold(joint, velocity): the hand needs it')
+            raise PlantError(f'plant "{self._name}" has no hold(joint, velocity): moving a joint by hand needs it')
         self._plant.hold(joint, velocity)
 
     def check(self) -> None:

@@ -248,8 +248,8 @@ def _verdict(
     sentences += conflict_sentences(estimate.conflicts, explained)
     if estimate.unseen:
         sentences.append(
-            f"In this motion gravity does not reveal {', '.join(estimate.unseen)}: not identifiable, and assumed to be "
-            "zero within the standard error."
+            f"In this motion gravity does not reveal {', '.join(estimate.unseen)}: not identifiable, so the value is "
+            "assumed to be zero within the standard error."
         )
     return Verdict(trust, weakest, tuple(sentences))
 
@@ -287,8 +287,8 @@ def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_p
     if not found:
         return ""
     return (
-        f"The standard errors of {', '.join(found)} are larger than the uncertainty that the URDF's values are assumed "
-        "to have: errors of the model, or a fit that stopped short, outweigh what the recording says about them."
+        f"The standard errors of {', '.join(found)} exceed the assumed uncertainty of the URDF's values. Model errors, "
+        "or a fit that stopped short, outweigh the information in the recording."
     )
 
 
@@ -321,7 +321,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     if over > EXPLAINED:
         return f"{said} the model is incomplete.{tried} Possible causes: {causes}."
     return (
-        f"{said} but part of it repeats with the motion, which increases standard errors by a factor of "
-        f"up to {estimate.systematic:.1f}, and some values may be wrong by more than these indicate. A small effect is "
-        f"missing from the model: {causes}.{tried}"
+        f"{said} but part of it repeats with the motion. This increases standard errors by a factor of up to "
+        f"{estimate.systematic:.1f}, and some values may be wrong by more than their standard errors. A small effect "
+        f"is missing from the model: {causes}.{tried}"
     )

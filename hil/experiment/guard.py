@@ -191,9 +191,9 @@ class Guard:
                 index,
                 Cause.ERRORS,
                 f"reports an error ({describe_status_error(error)}) with its values, {_ERRORS_IN_A_ROW} times in a "
-                "row, although nothing that it was sent should cause one: whether it accepts its goals is unknown. "
-                "Power-cycle it and check its firmware; a device between adapter and servo may also be changing "
-                "replies.",
+                "row, although no packet sent to it should cause one. Whether it accepts its goals is unknown. "
+                "Power-cycle it and check its firmware. A device between adapter and servo may also be changing "
+                "its replies.",
             )
 
     def goals_are_lost(self, index: int, held: str) -> NoReturn:
@@ -235,7 +235,7 @@ class Guard:
                     Cause.EARLY_MOTION,
                     f"moves before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
                     f"is allowed. {self._still_swings()} Otherwise check whether a hand or a cable pushes or holds it, "
-                    "or its horn slips.",
+                    "or whether its horn slips.",
                 )
 
     def _still_swings(self) -> str:
@@ -252,7 +252,7 @@ class Guard:
             Cause.UNLIKE_BEFORE,
             f"does not repeat its motion: under the same torque it is at {position:.3f} rad, far from where it was one "
             "period ago. Something pushes or holds it, its load has changed, it slips, or its encoder has failed. If "
-            f"none is so, it swings so far that its motion never repeats.{self._lower_torque}",
+            f"none applies, it swings so far that its motion never repeats.{self._lower_torque}",
         )
 
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
@@ -390,8 +390,8 @@ class Guard:
             index,
             Cause.APART,
             f"has servos that no longer turn together: ID {ids[servo]} has turned {turned:+.3f} rad relative to the "
-            "first one since the start. Its horn slips, a screw is loose, one of their encoders is wrong, or its "
-            "direction is.",
+            "first one since the start. Its horn slips, a screw is loose, one of the encoders is wrong, or its "
+            "direction setting is.",
         )
 
     def _disagree(self, index: int, state: State) -> NoReturn:

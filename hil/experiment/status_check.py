@@ -159,12 +159,12 @@ class StatusCheck:
                 return None
             if self._is_anothers(joint, offset, now):
                 return Cause.STALE, (
-                    "returns another servo's data: its reply carries the clock of another joint. Replies are mixed up: "
-                    "check the adapter, and that every servo has its own ID."
+                    "returns another servo's data: its reply carries the clock of another joint. Replies are mixed up. "
+                    "Check the adapter, and that every servo has its own ID."
                 )
             return Cause.STALE, (
                 f"returns stale data: by its own clock its reply is {1e3 * abs(ahead):.0f} ms off. Replies "
-                "are delayed in transit, or it was rebooted. Check the adapter, its latency and its cable."
+                "are delayed in transit, or the servo was rebooted. Check the adapter, its latency and its cable."
             )
         least = offset if ahead < drifted else behind + drifted
         self._clock[joint] = least, now, readings + 1, 0

@@ -240,7 +240,7 @@ class Stream:
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"drifts: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. "
+            f"{self._plan.settle_within:.1%} ({self._plan.drift_within:.1%} if it drifts slowly). "
             + self._advice(differences, samples)
         )
 

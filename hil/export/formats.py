@@ -82,7 +82,7 @@ def _not_its_own(run: Path, out: Path | None, default: str) -> Path:
     if path.parent.resolve() != run.resolve() or path.name not in RunFolder(run).own_files():
         return path
     if out is not None:
-        raise ExportError(f"{path} is one of the run's own files, which would be lost: choose another file name.")
+        raise ExportError(f"{path} is one of the run's own files and would be overwritten: choose another file name.")
     return run / f"identified_{default}"
 
 

@@ -79,7 +79,7 @@ def _share_of_rod(p: Mapping[str, float]) -> float:
     needed = p["coupling"] ** 2 / (p["inertia_1"] * p["inertia_2"])
     if needed >= 1:
         raise ExportError(
-            f"inertia_1 * inertia_2 = {p['inertia_1'] * p['inertia_2']:.4g} is not above coupling^2 = "
+            f"inertia_1 * inertia_2 = {p['inertia_1'] * p['inertia_2']:.4g} must be greater than coupling^2 = "
             f"{p['coupling'] ** 2:.4g} kg^2 m^4: no links of positive mass have such inertias. Check the residual in "
             "the report; excite more, or choose a richer [model] friction."
         )

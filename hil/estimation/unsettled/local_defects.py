@@ -181,8 +181,8 @@ def _stop(joint: _Joint) -> list[str]:
             continue
         found.append(
             f"{joint.name[0].upper()}{joint.name[1:]} rebounds at {place:.4g} rad {at.size} times, {_at(time[at])}, "
-            "and never gets beyond: it hits a stop or an object there, which no model includes. Use the part before, "
-            "or record motion that stays away from it."
+            "and never moves past it: it hits a stop or an object there, which no model includes. Use the part before "
+            "the first impact, or record motion that stays clear of it."
         )
     return found
 
@@ -197,8 +197,8 @@ def _windows(joint: _Joint, window: float) -> list[str]:
     more = f" and {len(groups) - SHOWN} more" if len(groups) > SHOWN else ""
     times = float(levels[bad].max()) / max(joint.usual, 1e-12)
     return [
-        f"The residual of {joint.name} is up to {times:.0f} times the usual one in {parts}{more}: something else acted "
-        "on the arm there, or the recording is wrong. Look at that part, or leave it out."
+        f"The residual of {joint.name} is up to {times:.0f} times its usual value in {parts}{more}: something else "
+        "acted on the arm there, or the recording is wrong. Look at that part, or leave it out."
     ]
 
 

@@ -80,7 +80,7 @@ def _weight(estimate: ShootingEstimate, gravity: float) -> list[str]:
     for name, value, std in zip(estimate.names, estimate.value, estimate.std, strict=True):
         if kind_of(name) == "gravity" and gravity > 0.0 and value < -SURE * std:
             found.append(
-                f"{name} is {value:.3g} N m, negative: the angle is measured from the other side (columns.zero), or a "
+                f"{name} is {value:.3g} N m, negative: the angle's zero is half a turn off (columns.zero), or a "
                 "sign is reversed."
             )
     return found

@@ -198,6 +198,6 @@ def test_a_prediction_that_takes_friction_from_the_held_out_motion_says_so(ideal
     evidence = Evidence(held_out=np.array([0.001, 0.002]), held_out_as_fitted=np.array([0.03, 0.001]))
     verdict = judge(estimate, validation, evidence)
     (said,) = [each for each in verdict.sentences if "held-out" in each]
-    assert "0.2 %" in said and "from that motion itself" in said
-    assert "as it was in the fitted motion, to within 3 %" in said
+    assert "0.2 %" in said and "taken from that motion" in said
+    assert "With friction as in the fitted motion, it predicts it to within 3 %" in said
     assert verdict.trust == "yes"

@@ -106,7 +106,7 @@ def test_a_csv_that_is_wrong_is_named(
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda columns: columns | {"tau1": np.clip(columns["tau1"], -0.1, 0.1)}, "if the current was clipped"),
+        (lambda columns: columns | {"tau1": np.clip(columns["tau1"], -0.1, 0.1)}, "If the current was clipped"),
         (lambda columns: columns | {"q1": np.where(np.arange(2000) % 10 < 2, np.nan, columns["q1"])}, "20.0 % of its"),
         (lambda columns: columns | {"q1": -np.pi / 2 + (columns["q1"] + np.pi / 2) / 80.0}, "moved by only"),
     ],
