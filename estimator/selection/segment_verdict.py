@@ -130,8 +130,8 @@ def _predicted(held_out: Array | None, length: float) -> str:
 
 def _weakest(name: str, part: float, spoiled: bool) -> str:
     if part <= WELL_KNOWN or spoiled:
-        return f"The least certain parameter is {name}, known to {100 * part:.2g} %."
+        return f"The least certain parameter is {name}, known to within {100 * part:.2g} %."
     if not np.isfinite(part):
         return f"This motion provides no information on {name}. To identify it: {IMPROVEMENT[kind_of(name)]}."
     improvement = IMPROVEMENT[kind_of(name)]
-    return f"The least certain parameter is {name}, known to {100 * part:.2g} %. To improve it: {improvement}."
+    return f"The least certain parameter is {name}, known to within {100 * part:.2g} %. To improve it: {improvement}."

@@ -296,17 +296,17 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
     name = validation.weakest
     part = validation.relative_std[name]
     if part <= WELL_KNOWN:
-        return (f"The least certain parameter is {name}, known to {100 * part:.2g} %.",)
+        return (f"The least certain parameter is {name}, known to within {100 * part:.2g} %.",)
     improvement = improvement_of(name, torque_limit)
     if part > WEAK and not _is_weak(validation, name):
         share = 100 * validation.torque_std[name]
         return (
-            f"The least certain parameter is {name}, known to {100 * part:.2g} %. It hardly affects this arm: its "
-            f"standard error is {share:.2g} % of the torque of the fitted motion. To improve it: {improvement}.",
+            f"The least certain parameter is {name}, known to within {100 * part:.2g} %. It hardly affects this arm: "
+            f"its standard error is {share:.2g} % of the torque of the fitted motion. To improve it: {improvement}.",
         )
     if not np.isfinite(part):
         return (f"This motion provides no information on {name}. To identify it: {improvement}.",)
-    return (f"The least well known parameter is {name}, to {100 * part:.2g} %. To improve it: {improvement}.",)
+    return (f"The least certain parameter is {name}, known to within {100 * part:.2g} %. To improve it: {improvement}.",)
 
 
 def _alike(validation: Validation) -> tuple[str, ...]:
