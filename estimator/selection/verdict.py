@@ -306,7 +306,9 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
         )
     if not np.isfinite(part):
         return (f"This motion provides no information on {name}. To identify it: {improvement}.",)
-    return (f"The least certain parameter is {name}, known to within {100 * part:.2g} %. To improve it: {improvement}.",)
+    return (
+        f"The least certain parameter is {name}, known to within {100 * part:.2g} %. To improve it: {improvement}.",
+    )
 
 
 def _alike(validation: Validation) -> tuple[str, ...]:
