@@ -76,7 +76,7 @@ class TorqueOff:
             if joint in self.rebooted:
                 yield (
                     f"{joint.title} was rebooted: its Bus Watchdog is no longer armed. Check its supply and its "
-                    "connector; a brief voltage dip is enough."
+                    "connector; a brief voltage dip is enough to reboot it."
                 )
 
     def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:

@@ -143,7 +143,8 @@ def fit_as_printed(coefficient: Complex, excitation: Excitation, known: PaperArm
         rows = np.concatenate((A.real, A.imag))
         if linalg.matrix_rank(rows / np.linalg.norm(rows, axis=0)) < rows.shape[1]:
             raise ModelError(
-                "both joints have the same torque on the same lines: eq. (33) is singular; give each its own"
+                "both joints have the same torque on the same lines: eq. (33) is singular; give each joint its own "
+                "lines"
             )
         found = linalg.lstsq(rows, np.concatenate((goal.real, goal.imag)), rcond=None)[0]
         masses.append(_nearest_masses(found, joint, known)[joint])

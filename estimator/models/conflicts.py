@@ -38,7 +38,7 @@ _CHECKS = {
     "stribeck_velocity": "use slower motion to separate friction near standstill",
 }
 _DRIVE = "check the joint's servo model and mode"
-_LINK = "correct the mass, centre of mass and inertia of that link there, or check what the arm carries"
+_LINK = "correct that link's mass, centre of mass and inertia in the description, or check what the arm carries"
 
 
 @dataclass(frozen=True)

@@ -275,7 +275,7 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
         return (f"{said}.",)
     return (
         f"{said}, if friction is rescaled to its level at that time (one factor per joint, taken from that motion). "
-        f"With friction as in the fitted motion, it predicts it to within {_percent(as_fitted)}.",
+        f"With friction as in the fitted motion, it predicts that motion to within {_percent(as_fitted)}.",
     )
 
 

@@ -187,8 +187,8 @@ class RecordingConfig(BaseModel):
         count = len(self.columns.position or ())
         if count > PLANAR and self.arm.urdf is None:
             raise ValueError(
-                f"columns.position: {count} joints need arm.urdf, which gives the geometry, and [[joints]] with name = "
-                "for each of them; without a URDF, an arm has one or two joints"
+                f"columns.position: {count} joints need arm.urdf, which gives the geometry, and one [[joints]] table "
+                "each, with its name; without a URDF, an arm has one or two joints"
             )
         return self
 

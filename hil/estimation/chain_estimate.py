@@ -236,7 +236,7 @@ def _verdict(
         trust = lowered(trust, "with care")
         sentences.append(
             "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
-            "the remaining distance. Use faster motion ([joint_path]), so that fewer joints stick."
+            "the remaining distance to it. Use faster motion ([joint_path]), so that fewer joints stick."
         )
     if estimate.at_bound:
         trust = lowered(trust, "with care")

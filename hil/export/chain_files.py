@@ -49,8 +49,8 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
             comment(link, f"without {', '.join(apart)}, moved by held joints: values described, not identified")
         if share < 1.0:
             reduced.append(
-                f"{100 * share:.2g} % of the inertia that the description gives {', '.join(joint.movable)}: "
-                f"the full inertia would leave no possible body for {joint.link}"
+                f"the full inertia that the description gives {', '.join(joint.movable)}; the file has "
+                f"{100 * share:.2g} % of it, because more would leave no possible body for {joint.link}"
             )
             for name in apart:
                 _scale_inertial(links[name], share)

@@ -329,7 +329,7 @@ def _pwm_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: 
     needed = share * joint.servo.resistance if joint.mode is Mode.CURRENT else share
     found = f"{pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply"
     fix = (
-        f"It limits the voltage in every mode. The limit of {joint_config.goal_limit:g} needs {needed:.1f} V at "
+        f"It limits the voltage in every mode. current_limit = {joint_config.goal_limit:g} needs {needed:.1f} V at "
         "rest and more at speed: raise PWM Limit with DYNAMIXEL Wizard 2.0, or lower current_limit."
     )
     if volts < needed:

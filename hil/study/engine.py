@@ -112,7 +112,7 @@ def _local(count: int, memory: str) -> Any:
     except RuntimeError as error:
         raise ConfigError(
             f"The workers did not start ({error}). A script must start them under `if __name__ == "
-            '"__main__":`, since each worker imports it; if memory is short, ask for fewer (--workers).'
+            '"__main__":`, since each worker imports it; if memory is short, request fewer workers (--workers).'
         ) from error
 
 

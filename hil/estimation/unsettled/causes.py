@@ -24,8 +24,8 @@ def causes(
 
 def _clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return tuple(
-        f"The torque of joint {each.joint} seems to have been limited to about {each.level:.3g} N m, which its column "
-        f"exceeds in {100 * each.beyond:.2g} % of the samples: with this limit, inverse dynamics leaves "
+        f"The torque of joint {each.joint} seems to have been limited to about {each.level:.3g} N m; its column "
+        f"exceeds that in {100 * each.beyond:.2g} % of the samples. With this limit, inverse dynamics leaves "
         f"{100 * each.residual:.2g} % of the torque unexplained instead of {100 * each.residual_given:.2g} %. A "
         "current limit or the supply voltage clips it (saturation): use the measured current, or smaller commands."
         for each in suspect_clipped(recordings)

@@ -219,7 +219,7 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         trust = lowered(trust, "with care")
         sentences.append(
             "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
-            "the remaining distance. Record faster motion, so that fewer joints stick."
+            "the remaining distance to it. Record faster motion, so that fewer joints stick."
         )
     return Verdict(trust, weakest, tuple(sentences))
 

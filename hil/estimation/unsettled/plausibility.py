@@ -70,8 +70,8 @@ def _pendulum(estimate: ShootingEstimate, gravity: float) -> list[str]:
     if PENDULUM[0] < length < PENDULUM[1]:
         return []
     return [
-        f"Inertia and weight of joint 1 are those of a pendulum of {length:.2g} m: check the units of time and angle, "
-        "and arm.gravity."
+        f"Inertia and weight of joint 1 are those of a pendulum {length:.2g} m long: check the units of time and "
+        "angle, and arm.gravity."
     ]
 
 

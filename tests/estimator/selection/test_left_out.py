@@ -199,5 +199,5 @@ def test_a_prediction_that_takes_friction_from_the_held_out_motion_says_so(ideal
     verdict = judge(estimate, validation, evidence)
     (said,) = [each for each in verdict.sentences if "held-out" in each]
     assert "0.2 %" in said and "taken from that motion" in said
-    assert "With friction as in the fitted motion, it predicts it to within 3 %" in said
+    assert "With friction as in the fitted motion, it predicts that motion to within 3 %" in said
     assert verdict.trust == "yes"
