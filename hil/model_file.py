@@ -155,7 +155,7 @@ def _file(path: Path) -> Path:
 def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
     """Check that every term is present and known: a model without one of its terms would be silently wrong."""
     if joints not in RIGID_BODY:
-        raise ResultError(f"{path}: an arm of {joints} joints; this version of hil supports one or two.")
+        raise ResultError(f"{path} describes an arm of {joints} joints; this version of hil supports one or two.")
     needed = set(base_names(joints))
     possible = {*needed, *extra_names(joints)}
     missing, unknown = sorted(needed - values.keys()), sorted(values.keys() - possible)

@@ -35,7 +35,7 @@ def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) 
     coupling = length gravity_2 / gravity is the fourth equation. Raises ModelError without gravity or length.
     """
     if gravity <= 0.0:
-        raise ModelError("the paper's method linearises about the hanging pose, which requires gravity")
+        raise ModelError("the method of Zhu et al. linearises about the hanging pose, which requires gravity")
     lines = lines_of(period.filled())
     count = cut_off(lines) + 1
     Q = lines[:, 1:count]
@@ -49,7 +49,7 @@ def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) 
         single = ("inertia_1", "viscous_1", "gravity_1")
         return LinearisedEstimate(_named(single, x), _named(single, np.sqrt(np.diag(covariance))), remark)
     if length is None:
-        raise ModelError("the paper's method needs the length of link 1: give known.length_1")
+        raise ModelError("the method of Zhu et al. needs the length of link 1: give known.length_1")
     none = np.zeros_like(s)
     # Unknowns: D11, D12, D22, viscous_1, viscous_2, gravity_1, gravity_2.
     first = np.stack((s * s * Q[0], s * s * Q[1], none, s * Q[0], none, Q[0], Q[0] + Q[1]), axis=1)

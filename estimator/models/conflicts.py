@@ -75,7 +75,7 @@ class Conflict:
         advice = next((check for kind, check in _CHECKS.items() if self.name.startswith(kind)), usual)
         return (
             f"{self.name} is {self.value:.3g} +- {self.std:.1g}, {self.deviations:.0f} standard deviations from "
-            f"{self.expected:.3g} {spread}, {_SOURCES[self.source]}: {advice}."
+            f"{self.expected:.3g} ({spread}), {_SOURCES[self.source]}: {advice}."
         )
 
 

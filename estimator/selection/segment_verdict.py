@@ -121,9 +121,9 @@ def _left(estimate: ShootingEstimate, evidence: SegmentEvidence, trust: Trust) -
 
 def _predicted(held_out: Array | None, length: float) -> str:
     if held_out is None:
-        return "It was not validated on a held-out motion: the recording is too short to hold out a part of it."
+        return "The model was not validated on a held-out motion: the recording is too short to hold out a part of it."
     return (
-        f"Fitted to every other segment of {length:g} s, it predicts the remaining ones to within "
+        f"Fitted to every other segment of {length:g} s, the model predicts the remaining ones to within "
         f"{100.0 * float(held_out.max()):.2g} % of the motion's RMS."
     )
 

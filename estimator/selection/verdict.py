@@ -162,12 +162,14 @@ def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
     if seen:
         what = _in_words(seen[0].part)
         advice = "" if evidence.tried_all else ' [model] friction = "auto" tries that.'
-        return f"It looks most like {what}, which would explain {100.0 * seen[0].explained:.0f} % of it.{advice}"
+        return (
+            f"The residual looks most like {what}, which would explain {100.0 * seen[0].explained:.0f} % of it.{advice}"
+        )
     if not evidence.tried_all and estimate.model.friction != "stribeck_load":
-        return 'No single term explains it; [model] friction = "auto" tries them together.'
+        return 'No single term explains the residual; [model] friction = "auto" tries them together.'
     return (
-        "No available term explains it. Possible causes: cogging or torque ripple, backlash, a loose screw, a sagging "
-        "supply or a dragging cable."
+        "No available term explains the residual. Possible causes: cogging or torque ripple, backlash, a loose screw, "
+        "a sagging supply or a dragging cable."
     )
 
 
@@ -180,19 +182,19 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
     """Return which parameters the model error may have biased, judged by their inflated standard errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst and trust == "no":
-        return "It may bias all parameters, whatever their standard errors say."
+        return "This error may bias all parameters, whatever their standard errors say."
     if not worst:
-        return "It does not affect the parameters significantly: including it, each is known to 2 % or better."
+        return "This error does not affect the parameters significantly: including it, each is known to 2 % or better."
     named = sorted(worst, key=lambda name: -worst[name])
     listed = ", ".join(f"{name} ({100.0 * worst[name]:.2g} %)" for name in named[:4])
     more = f" and {len(named) - 4} others" if len(named) > 4 else ""
     if trust == "no":
-        return f"It may bias all parameters, most of all {listed}{more}."
+        return f"This error may bias all parameters, most of all {listed}{more}."
     if trust == "yes":
-        return f"The standard errors include it: {listed}{more}; the other parameters are known to 2 % or better."
+        return f"The standard errors include this: {listed}{more}; the other parameters are known to 2 % or better."
     return (
-        f"It may bias all parameters. The standard errors include it ({listed}{more}; the others at most 2 %), but "
-        "while its cause is unknown, errors of several standard errors are possible."
+        f"This error may bias all parameters. The standard errors include it ({listed}{more}; the others at most 2 %), "
+        "but while its cause is unknown, errors of several standard errors are possible."
     )
 
 
@@ -268,7 +270,7 @@ def _warm_up(seconds: float) -> int:
 
 def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ...]:
     if held_out is None:
-        return ("It was not validated on a held-out motion: set experiment.held_out = true.",)
+        return ("The model was not validated on a held-out motion: set experiment.held_out = true.",)
     worst = _percent(held_out)
     said = f"It predicts a held-out motion to within {worst} of that motion's RMS, excluding encoder noise"
     if as_fitted is None or _percent(as_fitted) == worst:
@@ -329,5 +331,6 @@ def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
     one = estimate.outliers == 1
     counted = "1 sample is an outlier and was" if one else f"{estimate.outliers} samples are outliers and were"
     return (
-        f"{counted} downweighted: a jolt, backlash, or late or damaged readings; the report's residuals show where.",
+        f"{counted} downweighted. Possible causes: a jolt, backlash, or late or damaged readings. The residuals in the "
+        "report show where.",
     )

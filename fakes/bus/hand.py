@@ -32,7 +32,7 @@ _PULL_S = 0.01
 class Move(Described):
     """One movement of the hand, after which it holds the joint for `hold` seconds, indefinitely by default."""
 
-    servo: Annotated[int, Field(ge=0, le=252, description="bus ID of a servo of the joint")]
+    servo: Annotated[int, Field(ge=0, le=252, description="bus ID of one of the joint's servos")]
     to: Annotated[
         float | None,
         Field(ge=-4 * math.pi, le=4 * math.pi, allow_inf_nan=False, description="joint angle at the end [rad]"),

@@ -97,7 +97,7 @@ def _mounted(gravity: NDArray[np.float64]) -> str:
     """Say which settings give this gravity in the frame of the base (3,) [m/s^2]."""
     strength = float(np.linalg.norm(gravity))
     if strength <= _SAME_GRAVITY:
-        return "In the file, the arm is weightless: correct it."
+        return "The file sets gravity to zero: correct it."
     x, y, z = (-gravity / strength + 0.0).tolist()
     base = [round(angle, 4) for angle in (math.atan2(y, z), -math.asin(max(-1.0, min(1.0, x))), 0.0)]
     return f"If the arm is mounted as the file says, set base = {base} and gravity = {strength:.4g} under [arm]."

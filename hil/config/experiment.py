@@ -37,7 +37,7 @@ class ExperimentConfig(Table):
         description="s, how long to repeat the motion before the first recorded period, to warm up the joints",
     )
     settle_within: PositiveFloat = Field(
-        0.01, lt=1, description="RMS difference between periods, relative to the motion's RMS"
+        0.01, lt=1, description="largest RMS difference between settled periods, relative to the motion's RMS"
     )
     max_settling_periods: int = Field(5, ge=1, le=100)
     periods: int = Field(1, ge=1, le=1000, description="number of settled periods recorded")

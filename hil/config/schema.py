@@ -268,7 +268,9 @@ class Config(Table):
         if experiment.pilot and self.arm.link_lengths is None:
             raise ValueError("experiment.pilot = true needs arm.link_lengths [m], one for each of [[joints]]")
         if experiment.peak_torque is None and self.arm.link_lengths is None:
-            raise ValueError("experiment.peak_torque is missing: give it in N m, or arm.link_lengths and pilot = true")
+            raise ValueError(
+                "experiment.peak_torque is missing: set it in N m, or set arm.link_lengths and pilot = true"
+            )
         if experiment.design == "optimal" and not experiment.pilot:
             raise ValueError('experiment.design = "optimal" needs pilot = true: the design uses the pilot\'s model')
 

@@ -215,8 +215,9 @@ def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
     if NONE_HEARD not in str(stop) or not silent or not heard:
         return ""
     return (
-        f"No servo was heard then, but {' and '.join(heard)} answered afterwards and {' and '.join(map(str, silent))} "
-        "did not: a silent servo hides the replies of those after it. Check its cable and its supply."
+        f"No servo was heard at the stop, but {' and '.join(heard)} answered afterwards and "
+        f"{' and '.join(map(str, silent))} did not: a silent servo hides the replies of those after it. Check its "
+        "cable and its supply."
     )
 
 
@@ -309,7 +310,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if file is not None:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which allows "
-            f"at most {1 / slowest:.0f} Hz, and this user may not change it. Type: {command_to_set(file)}"
+            f"at most {1 / slowest:.0f} Hz. This user may not change it. Type: {command_to_set(file)}"
         )
     if bus.port.latency_measured:
         raise WrongSetting(

@@ -229,7 +229,9 @@ class Stream:
             difference = repetition.difference
             differences.append(difference)
             if difference <= self._plan.settle_within:
-                self._note(f"{segment.role}: period {period} is settled, {difference:.2%} from the one before")
+                self._note(
+                    f"{segment.role}: period {period} is settled, {difference:.2%} different from the one before"
+                )
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
                     self._check_motion(repetition.moved)
@@ -299,7 +301,7 @@ class Stream:
                 self._note("balanced")
                 return
             state = self._play(self._silence(window), Phase.COMING_TO_REST)
-        self._note("not balanced: without torque, friction may not hold the arm upright")
+        self._note("the arm is not balanced: without torque, friction may not hold it upright")
 
     def _play(self, goals: NDArray[np.float64], phase: Phase, period: int = -1) -> State:
         """Send goal currents (samples, joints) [A], one row per tick; return the last state."""

@@ -68,7 +68,7 @@ def export(run: Path, name: str, out: Path | None = None, link_length: float | N
         return Written(name, path, recording.write(Recorded.open(run), path))
     if name not in FORMATS:
         raise ExportError(
-            f"{name!r} is not a format of hil export. Possible: {', '.join((*FORMATS, *RECORDING_FORMATS))}."
+            f"{name!r} is not a format of hil export. Available: {', '.join((*FORMATS, *RECORDING_FORMATS))}."
             + _each_its_own(name)
         )
     arm = FORMATS[name]

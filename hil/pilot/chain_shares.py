@@ -123,7 +123,7 @@ class SafeShares:
             if times is None:
                 break
             self.say(
-                f"No share of the designed path is safe for all arms: {why}. Trying another path, {number + 1} of "
+                f"No amplitude of the designed path is safe for all arms: {why}. Trying another path, {number + 1} of "
                 f"{OTHER_SEEDS}."
             )
             most = most / times
@@ -219,7 +219,7 @@ class SafeShares:
         found, why, shortage = self._found(config, shares[0], f"amplitude 1 of at most {len(shares)}")
         if found is not None or len(shares) == 1:
             return found, why, shortage
-        last_why, last_shortage = self._unsafe(config, shares[-1], SEARCH_ARMS, "the least amplitude")[1:]
+        last_why, last_shortage = self._unsafe(config, shares[-1], SEARCH_ARMS, "the smallest amplitude")[1:]
         if last_why:
             return None, last_why, max(shortage, last_shortage)
         for number, share in enumerate(shares[1:], 2):

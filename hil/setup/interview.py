@@ -101,7 +101,7 @@ def _one_baud(heard: Sequence[Heard]) -> tuple[int, list[Found]]:
     if len(usable) > 1:
         found = "; ".join(f"{baud}: ID {', '.join(str(one.id) for one in servos)}" for baud, servos in usable.items())
         raise ExperimentError(
-            f"Servos answer at more than one baud ({found}). Set them all to the same rate with hil setup."
+            f"Servos answer at more than one baud rate ({found}). Set them all to the same rate with hil setup."
         )
     return next(iter(usable.items()))
 

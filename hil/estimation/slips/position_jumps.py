@@ -51,7 +51,7 @@ def jump_disturbances(config: Config, facts: RunFacts, samples: NDArray[np.void]
         return ()
     return (
         f"The position of {' and '.join(names)} jumped during the recording (see the warning), so angles before and "
-        "after the jump do not belong together: the values may be wrong by more than their standard errors.",
+        "after the jump are inconsistent: the values may be wrong by more than their standard errors.",
     )
 
 

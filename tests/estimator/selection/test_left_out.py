@@ -53,7 +53,7 @@ def test_what_is_missing_is_named_with_its_evidence(
     assert seen[part].evidence > 1.0
     verdict = judge(estimate, validate(period, estimate), Evidence(candidates=found))
     assert verdict.trust != "yes"
-    assert "It looks most like" in verdict.sentences[0] and 'friction = "auto"' in verdict.sentences[0]
+    assert "The residual looks most like" in verdict.sentences[0] and 'friction = "auto"' in verdict.sentences[0]
     tried = judge(estimate, validate(period, estimate), Evidence(candidates=found, tried_all=True))
     assert '"auto"' not in " ".join(tried.sentences)
 

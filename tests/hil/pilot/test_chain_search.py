@@ -314,7 +314,7 @@ def test_a_reserve_always_leaves_some_range() -> None:
         reserve = reserve.larger(0.01)
     assert reserve.position < 0.35
     config = chain_config(load_config(LEG))
-    with pytest.raises(NoSafeTorque, match="no range of position is left"):
+    with pytest.raises(NoSafeTorque, match="no position range is left"):
         Paths.of(config, ChainBelief.prior(config).torque, replace(RESERVE, position=0.5))
 
 
