@@ -61,7 +61,7 @@ def _no_result(folder: Path) -> str:
         return f"{folder} is not a run folder but contains some: did you mean {below[-1]}? List them: {listed}"
     return (
         f"{folder} is not a run folder: it has neither a result nor a recording. {command('identify', 'ARM.toml')} "
-        f"creates one; list those that you have: {command('runs')}"
+        f"creates one; to list existing runs: {command('runs')}"
     )
 
 

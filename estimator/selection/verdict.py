@@ -202,7 +202,7 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
     """Return the response on lines that were left unexcited, and the part of it that the model does not explain."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
-        return ("experiment.detection = true would separate odd (friction) from even causes (offsets, direction).",)
+        return ("experiment.detection = true would tell odd distortion (friction) from even (offsets, direction).",)
     driven = levels.excited.motion
     joint = int(np.argmax(np.maximum(levels.odd.motion, levels.even.motion) / driven))
 
@@ -255,7 +255,7 @@ def _reason(change: float, seconds: float) -> str:
     """
     holds = "the identified values hold for the fitted periods"
     if change < 0.0:
-        warm = f"To obtain those of the warm arm, set experiment.warm_up = {_warm_up(seconds)}."
+        warm = f"To obtain the warm arm's values, set experiment.warm_up = {_warm_up(seconds)}."
         return f", as is typical while grease warms up: {holds}. {warm}"
     return (
         f", which warming up does not explain: {holds}. Look for a cable or part that began to rub, a loose screw, "

@@ -160,7 +160,7 @@ def chain_slips(config: "Config") -> Iterator[str]:
     elif config.stabiliser is None:
         yield (
             "stabiliser is missing: a spatial arm does not hang at rest, so a spring and a damper must hold it "
-            "on its path; or set experiment.pilot = true, which finds both"
+            "on its path. Give both, or set experiment.pilot = true, which finds them"
         )
     if config.known is not None:
         yield "known: only for planar arms; a URDF gives its own masses"

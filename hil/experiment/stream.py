@@ -250,7 +250,7 @@ class Stream:
         """What to do about periods of `samples` samples that differ from each other by `differences`."""
         further = periods_of_drift(differences, self._plan.settle_within)
         if further is None:
-            return "Check for backlash, a dragging cable or a slipping joint; or raise max_settling_periods."
+            return "Check for backlash, a dragging cable or a slipping joint, or raise max_settling_periods."
         seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
         return (
             f"The change decreases slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), "

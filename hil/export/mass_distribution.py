@@ -40,7 +40,7 @@ def distribute(model: ArmModel, link_length: float | None = None) -> tuple[LinkM
     """Links from the base outwards. Raises ExportError if no links of positive mass have these parameters."""
     p = model.values
     if len(model.joints) == 1:
-        _reject_length(link_length, "an arm with one joint has no elbow")
+        _reject_length(link_length, "an arm with one joint has no second link")
         moment = p["gravity_1"] / model.gravity if model.gravity else 0.0
         _positive("inertia_1", p["inertia_1"])
         return (_link(moment, p["inertia_1"], ROD, math.inf),)

@@ -111,7 +111,7 @@ def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago
     if changed != {_MODE} or cause not in _AT_A_LIMIT or modes_seen_ago > _MODES_SEEN_S:
         return ""
     last = f"{1e3 * modes_seen_ago:.0f} ms before it, every mode was still the one that had been set"
-    return f"{changed_settings(before, after)} This may have come after the stop: {last}."
+    return f"{changed_settings(before, after)} This may have happened after the stop: {last}."
 
 
 def _may_explain(register: str, cause: Cause | None) -> bool:

@@ -89,7 +89,7 @@ def _torque_of_pilot(config: Config) -> Iterator[Finding]:
     if config.experiment.pilot and config.experiment.peak_torque is not None:
         fix = (
             "`hil identify` ignores peak_torque: the pilot finds the torque, up to current_limit or voltage_limit. "
-            "Remove peak_torque; or set pilot = false to use it."
+            "Remove peak_torque, or set pilot = false to use it."
         )
         yield Finding(Level.WARNING, "experiment", "torque", "pilot = true takes precedence over peak_torque", fix)
     if not (config.is_chain or config.experiment.pilot) and config.experiment.peak_torque is None:
@@ -250,7 +250,7 @@ def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, 
 
 def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     torque = servo.read("Torque Enable")
-    fix = "Another program drives it: stop that program first; or power-cycle it."
+    fix = "Another program drives it: stop that program first, or power-cycle the servo."
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
 
 
@@ -378,7 +378,7 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     angle = within_limits(joint.within_turn(ticks).angle(ticks), config.joints[index].position_limit)
     rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
-    fix = f"arm.rest_pose is {rest:.3f} rad, arm.rest_tolerance allows {config.rest_tolerance:g}. " + rest_pose_hint(
+    fix = f"arm.rest_pose is {rest:.3f} rad; arm.rest_tolerance allows {config.rest_tolerance:g}. " + rest_pose_hint(
         angle, rest, config.rest_tolerance, zero
     )
     return _graded(abs(angle - rest) <= config.rest_tolerance, "pose", f"{angle:+.3f} rad", fix)

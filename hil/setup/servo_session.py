@@ -223,7 +223,7 @@ class ServoSession:
             if now != before:
                 yield (
                     f"{joint.title}: {_DELAY} was changed meanwhile from {2 * before} to {2 * now} us, by another "
-                    "program or a factory reset, which changes other settings too. To set it: "
+                    "program or a factory reset, which changes other settings too. To restore it: "
                     f"hil setup {self.bus.port.url} --id {joint.id} --return-delay-us {2 * before}"
                 )
 

@@ -59,7 +59,7 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
         compared = (
             "the simplest model"
             if choice.chosen == choice.plainest
-            else f"whose error is {_times(_inverse(choice.error_divided_by))} compared with the simplest model's"
+            else f"whose error, compared with the simplest model's, is {_times(_inverse(choice.error_divided_by))}"
         )
         print(f"Chosen on held-out segments: {choice.chosen}, {compared}.")
     if result.physical is not None:

@@ -38,8 +38,8 @@ def undetermined(estimate: ShootingEstimate) -> list[str]:
     if not found:
         return []
     return [
-        f"Not determined by this motion: {', '.join(found)}. They describe friction near standstill only together "
-        "with the other parameters; do not use them alone."
+        f"Not determined by this motion: {', '.join(found)}. They describe friction near standstill only in "
+        "combination with the other parameters; do not use them alone."
     ]
 
 
