@@ -77,7 +77,9 @@ class FakeServo(Described):
             if near := meant_name(model, all_model_names()):
                 raise ValueError(f"did you mean {near}?")
             others = ", ".join(all_model_names()[len(MODEL_NAMES) :])
-            raise ValueError(f"known models: {', '.join(MODEL_NAMES)}; by addresses and sizes only: {others}")
+            raise ValueError(
+                f"known models: {', '.join(MODEL_NAMES)}; known only by register addresses and sizes: {others}"
+            )
         return model
 
     @field_validator("direction")

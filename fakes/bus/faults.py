@@ -120,7 +120,7 @@ class Fault(Described):
     duration: Annotated[float, Field(gt=0, description="duration [s]; unlimited by default")] = math.inf
     servo: Annotated[int | None, Field(ge=0, le=252, description="bus ID of the servo; all servos by default")] = None
     probability: Annotated[
-        float, Field(ge=0, le=1, description="probability that it affects a packet, or that it happens at all")
+        float, Field(ge=0, le=1, description="packet faults: probability per packet; others: probability of occurring")
     ] = 1.0
     amount: Annotated[
         float | None,

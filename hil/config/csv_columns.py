@@ -77,7 +77,7 @@ class Columns(_Table):
     current: list[Column] | None = Field(None, description="one column per joint, in place of torque")
     current_unit: Literal["A", "mA"] | None = None
     torque_constant: list[Gain] | None = Field(
-        None, description="N m/A per joint at the output shaft; with current, or with voltage and resistance"
+        None, description="N m/A per joint at the output shaft; needed with current, or with voltage and resistance"
     )
     voltage: list[Column] | None = Field(None, description="motor voltage, one column per joint, in place of torque")
     voltage_unit: Literal["V", "mV"] | None = None

@@ -64,7 +64,9 @@ SLOW_INTERVAL_S = 0.25
 class PortConfig(Table):
     """`[port]`: the bus to which the servos are connected."""
 
-    url: str = Field(min_length=1, description='device or pyserial URL; "fake://" is the [fake] arm of the same file')
+    url: str = Field(
+        min_length=1, description='device or pyserial URL; "fake://" opens the [fake] arm of the same file'
+    )
     baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
     one_write: bool = Field(True, description="send goals and read request in one write; set as hil check advises")
     fast_sync_read: bool = Field(True, description="use Fast Sync Read where every servo's firmware supports it")
@@ -190,7 +192,7 @@ class Config(Table):
     stabiliser: StabiliserConfig | None = None
     clearance: ClearanceConfig = ClearanceConfig()
     known: KnownConfig | None = None
-    columns: dict[str, Any] | None = Field(None, description="for CSV files; hil.config.csv_columns checks it")
+    columns: dict[str, Any] | None = Field(None, description="for CSV files; checked by hil.config.csv_columns")
     fake: FakeArm | None = None
 
     @model_validator(mode="before")

@@ -177,5 +177,7 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
     if run.share < 1.0:
         lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which is shown here.")
     if run.refused == "" and (doubt := run.doubt(run.config)):
-        lines.append(f"hil identify decides using fewer of these arms. Using all {run.arms}, it is not safe: {doubt}.")
+        lines.append(
+            f"hil identify decides using fewer of these arms. With all {run.arms}, the experiment is not safe: {doubt}."
+        )
     return [*lines, f"NOT SAFE: {why}." if why else "SAFE. Not tested on hardware."]

@@ -304,7 +304,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     measured = (
         f"the noise of its angle ({noise:.2g} encoder steps RMS; rounding alone is 0.29)"
         if noise > NOISY * QUANTISATION_FLOOR_TICKS
-        else "its noise, which is that of encoder rounding"
+        else "its noise, which is only encoder rounding"
     )
     said = f"The residual of {config.joints[joint].name} is the largest: {over:.2f} times {measured};"
     if is_explained(estimate):

@@ -105,7 +105,9 @@ def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str
         "assumes the file's: the true values shown are scaled to match"
     )
     left = (
-        "" if len(values) == len(truth) else "; those that depend on several joints with different errors are not shown"
+        ""
+        if len(values) == len(truth)
+        else "; values that depend on several joints with different errors are not shown"
     )
     return Truth(values, f"{note}{left}.")
 

@@ -115,7 +115,7 @@ class StatusCheck:
         if self._is_foreign[joint]:
             return Cause.GOALS_LOST, (
                 f"does not hold the goals of this program: {held}, and it holds goals that this program never sent. "
-                "Another program commands it, or goals are changed on the way: end that program or unplug its "
+                "Another program commands it, or goals are changed on the way: stop that program or unplug its "
                 "controller; then check the adapter and the cable."
             )
         return Cause.GOALS_LOST, (

@@ -110,7 +110,7 @@ def _path(config: Config) -> Iterator[Finding]:
         yield Finding(Level.STOP, "experiment", "path", "refused", str(error))
     else:
         yield Finding(
-            Level.OK, "experiment", "path", "within the limits of torque" + ("" if config.is_fake else ", clear")
+            Level.OK, "experiment", "path", "within the torque limits" + ("" if config.is_fake else ", clear")
         )
 
 

@@ -371,7 +371,7 @@ def _about_torque(bus: ServoBus) -> str:
         return f"This command has not switched torque on; whether it is off could not be read: {error}"
     if on:
         return f"TORQUE IS ON at {' and '.join(on)}: it was on before this command."
-    return "Torque is off on all servos, read back; this command has not switched it on."
+    return "Torque is off on all servos, confirmed by reading it back; this command has not switched it on."
 
 
 def has_moved() -> bool:

@@ -147,7 +147,7 @@ def _check_versions(client: "Client", scheduler: str | None) -> None:
     try:
         client.wait_for_workers(1, timeout=600 if scheduler == "slurm" else 60)
     except TimeoutError as error:
-        raise ConfigError(f"The scheduler {scheduler or 'on this machine'} has no worker.") from error
+        raise ConfigError(f"The scheduler {scheduler or 'on this machine'} has no workers.") from error
     here = versions()
     try:
         everywhere = client.run(versions)

@@ -118,7 +118,7 @@ def _described(config: RecordingConfig, joints: int) -> ArmDescription:
             "columns.position, add a [[joints]] table with that joint's name, in order from the base outwards."
         )
     if len(names) != joints:
-        raise ConfigError(f"{len(names)} [[joints]], but {joints} columns of positions: give one per joint.")
+        raise ConfigError(f"{len(names)} [[joints]], but {joints} position columns: give one per joint.")
     try:
         return read_arm(Path(config.arm.urdf), names)
     except ArmFileError as error:

@@ -653,6 +653,6 @@ def test_servos_that_a_killed_program_left_behind_are_taken_over(
     as_found(was_left_by_a_killed_program)
     config = arm()
     said = run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
-    assert said == "Torque is off on both servos, read back."
+    assert said == "Torque is off on both servos, confirmed by reading it back."
     servos = ports[0].bus.servos.values()
     assert not any(servo.torque_enabled or servo.value("Bus Watchdog") for servo in servos)

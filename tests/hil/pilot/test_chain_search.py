@@ -437,7 +437,7 @@ def test_a_long_search_says_which_of_how_many_paths_and_amplitudes_it_simulates(
     said.trying("path 2 of at most 9, amplitude 3 of at most 4")
     said.tell(46, 72)
     (line,) = lines
-    assert line.endswith("path 2 of at most 9, amplitude 3 of at most 4, 46 of 72 simulations of this one.")
+    assert line.endswith("path 2 of at most 9, amplitude 3 of at most 4, 46 of 72 simulations of this amplitude.")
 
 
 def counting(monkeypatch: pytest.MonkeyPatch, unsafe_above: float) -> tuple[ChainSearch, list[tuple[float, str]]]:

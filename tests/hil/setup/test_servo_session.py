@@ -220,7 +220,7 @@ def test_a_servo_that_answers_again_after_torque_off_is_off_and_put_back(
     assert bench.changed() == []
     stopped = (tmp_path / "run" / "events.jsonl").read_text(encoding="utf-8")
     torque = "\n".join(stop.value.__notes__)
-    assert "Torque is off on both servos, read back." in torque and "rebooted" not in torque
+    assert "Torque is off on both servos, confirmed by reading it back." in torque and "rebooted" not in torque
     assert "NOT CONFIRMED" not in torque + capsys.readouterr().err
     if "answers again" in torque:
         assert "Joint 'elbow' (ID 2, XM430-W350) answers again" in stopped.splitlines()[-1]
