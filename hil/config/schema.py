@@ -148,7 +148,7 @@ class SafetyConfig(Table):
         0.6, le=5, description="rad/s, speed at which a stop lowers a spatial arm to its rest pose"
     )
     lower_time: PositiveFloat = Field(
-        10.0, le=60, description="s: longest duration of that lowering; on longer paths the arm moves faster"
+        10.0, le=60, description="s: longest duration of lowering; on longer paths the arm moves faster"
     )
     limit_chance: float = Field(
         0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"

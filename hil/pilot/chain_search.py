@@ -221,7 +221,7 @@ def _full(search: ChainSearch) -> str:
             return search.torque
         if number == tries:
             if isinstance(error, NotSettled | DidNotMove) and can_be_estimated(search.run.path):
-                search.say("The first path was recorded before that; the estimate uses it without a second path.")
+                search.say("The first path had already been recorded; the estimate uses it without a second path.")
                 return search.torque
             raise error
         search.learn(config, search.run)
