@@ -272,7 +272,7 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
     if held_out is None:
         return ("The model was not validated on a held-out motion: set experiment.held_out = true.",)
     worst = _percent(held_out)
-    said = f"It predicts a held-out motion to within {worst} of that motion's RMS, excluding encoder noise"
+    said = f"The model predicts a held-out motion to within {worst} of that motion's RMS, excluding encoder noise"
     if as_fitted is None or _percent(as_fitted) == worst:
         return (f"{said}.",)
     return (
