@@ -578,5 +578,5 @@ def test_a_stop_between_two_runs_says_that_torque_is_off(
                 pass
         raise stop
     (note,) = raised.value.__notes__
-    assert note.startswith(f"Torque is off on {'both' if runs else 'all'} servos") and "read back" in note
+    assert note.startswith(f"Torque is off on {'both' if runs else 'all'} servos") and "reading it back" in note
     assert ("has not switched it on" in note) is (runs == 0)
