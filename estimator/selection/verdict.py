@@ -202,7 +202,10 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
     """Return the response on lines that were left unexcited, and the part of it that the model does not explain."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
-        return ("experiment.detection = true would tell odd distortion (friction) from even (offsets, direction).",)
+        return (
+            "experiment.detection = true would separate odd distortion (friction) from even distortion (offsets, "
+            "direction).",
+        )
     driven = levels.excited.motion
     joint = int(np.argmax(np.maximum(levels.odd.motion, levels.even.motion) / driven))
 

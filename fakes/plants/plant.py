@@ -111,7 +111,7 @@ def load_plant(name: str, options: Mapping[str, object]) -> Plant:
     if name not in OWN_PLANTS and not _leave["code"]:
         raise PlantError(
             f'plant = "{name}" is code that this file wants to run, with {dict(options)}: nothing was run. Inspect it; '
-            "if you trust the file, use --allow-code, or hil.fakes.allow_code() in Python. Without it only "
+            "if you trust the file, use --allow-code, or hil.fakes.allow_code() in Python. Otherwise, only "
             f"{' and '.join(sorted(OWN_PLANTS))} are allowed"
         )
     module_name, _, factory_name = name.partition(":")

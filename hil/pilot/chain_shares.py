@@ -142,8 +142,8 @@ class SafeShares:
         if not self.is_exhausted:
             return ""
         return (
-            f" The search ended early, after {self.simulated / 3600.0:.0f} h of simulated motion: another "
-            "experiment.seed starts with other paths."
+            f" The search ended early, after {self.simulated / 3600.0:.0f} h of simulated motion: a different "
+            "experiment.seed starts from other paths."
         )
 
     def _helped_by_rate(self, config: Config, shares: tuple[float, ...]) -> str:

@@ -300,7 +300,9 @@ def _return_delay(config: Config, joint_config: JointConfig, _joint: Joint, serv
 def _baud(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     value = servo.read("Baud Rate")
     found = str(BAUD_RATES[value]) if value < len(BAUD_RATES) else f"unknown value {value}"
-    fix = f"Slow. Type: hil setup {_port(config)} --id {joint_config.id} --new-baud 1000000; then port.baud = 1000000"
+    fix = (
+        f"Slow. Type: hil setup {_port(config)} --id {joint_config.id} --new-baud 1000000; then set port.baud = 1000000"
+    )
     return _graded(config.port.baud >= 1_000_000, "baud", found, fix, Level.WARNING)
 
 
