@@ -391,7 +391,7 @@ class Guard:
             Cause.APART,
             f"has servos that no longer turn together: ID {ids[servo]} has turned {turned:+.3f} rad relative to the "
             "first one since the start. Its horn slips, a screw is loose, one of the encoders is wrong, or its "
-            "direction setting is.",
+            "direction setting is wrong.",
         )
 
     def _disagree(self, index: int, state: State) -> NoReturn:

@@ -46,7 +46,7 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
             for name in merged:
                 _remove(links[name], "inertial")
         if apart:
-            comment(link, f"without {', '.join(apart)}, moved by held joints: values described, not identified")
+            comment(link, f"without {', '.join(apart)}, moved by held joints: given by the description, not identified")
         if share < 1.0:
             reduced.append(
                 f"the full inertia that the description gives {', '.join(joint.movable)}; the file has "
