@@ -143,7 +143,7 @@ class FakeArm(Described):
         count = max(self.joints) + 1
         if set(self.joints) != set(range(count)):
             moved = ", ".join(str(joint + 1) for joint in self.joints)
-            raise ValueError(f"servos: they move the joints {moved}: each joint from 1 upwards needs a servo")
+            raise ValueError(f"servos: they move the joints {moved}, but each joint from 1 upwards needs a servo")
         arm = self.arm or self.chain
         if arm is not None and count != len(arm.drives):
             servos = f"{len(ids)} servos" + (f" on {count} joints" if count != len(ids) else "")
