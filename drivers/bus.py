@@ -182,8 +182,8 @@ class ServoBus:
         if self.config.watchdog_required:
             raise WrongModel(
                 f"{joint.title}: firmware {firmware} has no Bus Watchdog; {joint.servo.watchdog_firmware} or newer is "
-                "needed. Update it with DYNAMIXEL Wizard 2.0. With safety.allow_no_watchdog = true it is accepted, but "
-                "then nothing stops this servo when the program is killed or the cable is pulled."
+                "needed. Update it with DYNAMIXEL Wizard 2.0. With safety.allow_no_watchdog = true the servo is "
+                "accepted, but nothing then stops it when the program is killed or the cable is pulled."
             )
         self._without_watchdog.add(joint)
 
@@ -315,7 +315,7 @@ class ServoBus:
         self._last_answers = reply.servos
         state = self._converter.state(ticks, reply)
         if (strangers := exchange.heard.strangers) > MOST_STRANGERS:
-            raise shared(f"has sent {strangers} packets, or made servos send them,")
+            raise shared(f"has sent {strangers} packets, or requested them from servos,")
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def check_not_overruled(self, due: float) -> None:

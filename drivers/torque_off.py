@@ -76,7 +76,7 @@ class TorqueOff:
             if joint in self.rebooted:
                 yield (
                     f"{joint.title} was rebooted: its Bus Watchdog is no longer armed. Check its supply and its "
-                    "connector; a brief voltage dip is enough."
+                    "connector; a brief voltage dip is enough to reboot it."
                 )
 
     def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:
@@ -87,12 +87,12 @@ class TorqueOff:
         if not self.unconfirmed:
             count = len(self.confirmed)
             servos = {1: "the servo", 2: "both servos"}.get(count, f"all {count} servos")
-            return f"Torque is off on {servos}, read back."
+            return f"Torque is off on {servos}, confirmed by reading it back."
         names = " Nor for ".join(
             f"{and_list(str(joint).upper() for joint in joints)}. {why}" for why, joints in self._reasons()
         )
         if self.confirmed:
-            names = f"{names} Torque is off, read back, on {and_list(map(str, self.confirmed))}."
+            names = f"{names} Torque is off on {and_list(map(str, self.confirmed))}, confirmed by reading it back."
         alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
         if alone:
             return (

@@ -63,7 +63,9 @@ class FakeServo(Described):
         bool, Field(description="whether supply voltage and back-EMF also limit the current in current mode")
     ] = False
     thermal: Annotated[Thermal | None, Field(description="heating by the motor current; none by default")] = None
-    overload: Annotated[Overload | None, Field(description="when it shuts down on overload; never by default")] = None
+    overload: Annotated[
+        Overload | None, Field(description="conditions of its overload shutdown; by default it never shuts down")
+    ] = None
     registers: Annotated[
         dict[str, int], Field(description="other EEPROM registers with values different from the factory defaults")
     ] = {}  # noqa: RUF012  # pydantic copies it
@@ -75,7 +77,9 @@ class FakeServo(Described):
             if near := meant_name(model, all_model_names()):
                 raise ValueError(f"did you mean {near}?")
             others = ", ".join(all_model_names()[len(MODEL_NAMES) :])
-            raise ValueError(f"known models: {', '.join(MODEL_NAMES)}; by addresses and sizes only: {others}")
+            raise ValueError(
+                f"known models: {', '.join(MODEL_NAMES)}; known only by register addresses and sizes: {others}"
+            )
         return model
 
     @field_validator("direction")
@@ -139,7 +143,7 @@ class FakeArm(Described):
         count = max(self.joints) + 1
         if set(self.joints) != set(range(count)):
             moved = ", ".join(str(joint + 1) for joint in self.joints)
-            raise ValueError(f"servos: they move the joints {moved}: each joint from 1 upwards needs a servo")
+            raise ValueError(f"servos: they move the joints {moved}, but each joint from 1 upwards needs a servo")
         arm = self.arm or self.chain
         if arm is not None and count != len(arm.drives):
             servos = f"{len(ids)} servos" + (f" on {count} joints" if count != len(ids) else "")

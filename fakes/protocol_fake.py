@@ -130,7 +130,7 @@ class FakeSerial(SerialBase):
         if timeout is None and bus.on_the_way < size:
             raise serial.SerialException(
                 f"reading {size} bytes without a timeout would block forever: "
-                f"{bus.on_the_way} have arrived or are in transit; set a timeout"
+                f"only {bus.on_the_way} have arrived or are in transit; set a timeout"
             )
         taken = bus.read(size, math.inf if timeout is None else timeout)
         if len(taken) < size and self._pulls != bus.pulls:

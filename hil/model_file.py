@@ -61,7 +61,7 @@ def _no_result(folder: Path) -> str:
         return f"{folder} is not a run folder but contains some: did you mean {below[-1]}? List them: {listed}"
     return (
         f"{folder} is not a run folder: it has neither a result nor a recording. {command('identify', 'ARM.toml')} "
-        f"creates one; list those that you have: {command('runs')}"
+        f"creates one; to list existing runs: {command('runs')}"
     )
 
 
@@ -155,7 +155,7 @@ def _file(path: Path) -> Path:
 def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
     """Check that every term is present and known: a model without one of its terms would be silently wrong."""
     if joints not in RIGID_BODY:
-        raise ResultError(f"{path}: an arm of {joints} joints; this version of hil supports one or two.")
+        raise ResultError(f"{path} describes an arm of {joints} joints; this version of hil supports one or two.")
     needed = set(base_names(joints))
     possible = {*needed, *extra_names(joints)}
     missing, unknown = sorted(needed - values.keys()), sorted(values.keys() - possible)

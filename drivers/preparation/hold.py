@@ -38,7 +38,7 @@ def refuse_held(servos: Mapping[Joint, Servo]) -> None:
     if held:
         raise TorqueHeld(
             f"{' and '.join(joint.title for joint in held)}: torque is on, so another program drives or holds the arm, "
-            "or left it on. Switching it off would let the arm fall, so nothing was written. Stop that program; or "
+            "or left torque on. Switching it off would let the arm fall, so nothing was written. Stop that program, or "
             "hold the arm by hand and take it over with --take-over (BusConfig.take_over), which lets it sink slowly."
         )
 

@@ -73,14 +73,14 @@ def check_quiet(port: Port) -> None:
     heard = list(Framer().feed(port.read(_MOST_HEARD_BYTES, LISTEN_S)))
     targets = sorted({packet.id for packet in heard if not packet.is_status})
     if targets:
-        raise shared(f"asks ID {', '.join(map(str, targets))}")
+        raise shared(f"sends instructions to ID {', '.join(map(str, targets))}")
 
 
 def shared(what: str) -> BusShared:
     """Return the error for a bus with another active master; `what` describes what that master does."""
     return BusShared(
         f"Another master {what} on this bus, or the adapter echoes what this program sends. Two masters corrupt each "
-        "other's packets, and the other's goals would move the arm too: end that program, or unplug that controller."
+        "other's packets, and the other's goals would move the arm too: stop that program, or unplug that controller."
     )
 
 
@@ -91,7 +91,7 @@ def overruled(joint: Joint, found: Overruled) -> BusShared:
         by, before = "changed", f"and read {found.written} before the start"
     return BusShared(
         f"{joint.title[0].upper()}{joint.title[1:]} is {by} by another program: its {found.register} reads "
-        f"{found.value}, {before}. End that program, or unplug its controller."
+        f"{found.value}, {before}. Stop that program, or unplug its controller."
     )
 
 

@@ -142,7 +142,10 @@ def fit_as_printed(coefficient: Complex, excitation: Excitation, known: PaperArm
         goal = s * s * q
         rows = np.concatenate((A.real, A.imag))
         if linalg.matrix_rank(rows / np.linalg.norm(rows, axis=0)) < rows.shape[1]:
-            raise ModelError("both joints have the same torque on the same lines: (33) is singular; give each its own")
+            raise ModelError(
+                "both joints have the same torque on the same lines: eq. (33) is singular; give each joint its own "
+                "lines"
+            )
         found = linalg.lstsq(rows, np.concatenate((goal.real, goal.imag)), rcond=None)[0]
         masses.append(_nearest_masses(found, joint, known)[joint])
     return masses[0], masses[1]

@@ -36,21 +36,23 @@ def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) 
     missing.
     """
     if gravity <= 0.0:
-        raise ModelError("the paper's method linearises about the hanging pose, which requires gravity")
+        raise ModelError("the method of Zhu et al. linearises about the hanging pose, which requires gravity")
     lines = lines_of(period.filled())
     count = cut_off(lines) + 1
     Q = lines[:, 1:count]
     torque = held_lines(period.torque, period.rate, -period.command_to_sample)[:, 1:count]
     s = 1j * period.fundamental * np.arange(1, count)
     swing = np.degrees(np.ptp(period.filled(), axis=1))
-    remark = f"linearised about hanging; the joints swing {', '.join(f'{angle:.0f}' for angle in swing)} degrees"
+    remark = (
+        f"linearised about the hanging pose; the joints swing {', '.join(f'{angle:.0f}' for angle in swing)} degrees"
+    )
     if period.joints == 1:
         A = np.stack((s * s * Q[0], s * Q[0], Q[0]), axis=1)
         x, covariance = _solve(A, torque[0])
         single = ("inertia_1", "viscous_1", "gravity_1")
         return LinearisedEstimate(_named(single, x), _named(single, np.sqrt(np.diag(covariance))), remark)
     if length is None:
-        raise ModelError("the paper's method needs the length of link 1: give known.length_1")
+        raise ModelError("the method of Zhu et al. needs the length of link 1: give known.length_1")
     none = np.zeros_like(s)
     # Unknowns: D11, D12, D22, viscous_1, viscous_2, gravity_1, gravity_2.
     first = np.stack((s * s * Q[0], s * s * Q[1], none, s * Q[0], none, Q[0], Q[0] + Q[1]), axis=1)

@@ -37,7 +37,7 @@ class MassOnLink:
         if not (self.mass > 0.0 and self.inertia >= 0.0 and 0 <= self.link < base.chain.joints):
             raise ModelError(
                 f"a mass of {self.mass:g} kg with inertia {self.inertia:g} kg m^2 on link {self.link + 1} of "
-                f"{base.chain.joints}: the mass must be positive, the inertia non-negative, the link one of the arm's"
+                f"{base.chain.joints}: the mass must be positive, the inertia non-negative, and the link must exist"
             )
         c = np.array(self.at)
         about = self.mass * (c @ c * np.eye(3) - np.outer(c, c)) + self.inertia * np.eye(3)

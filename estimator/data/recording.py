@@ -172,7 +172,9 @@ def _check_times(recording: Recording) -> None:
 
 def _check_values(recording: Recording) -> None:
     if not (np.all(recording.position_step > 0.0) and np.isfinite(recording.command_to_sample)):
-        raise RecordingError(f"position_step {recording.position_step} rad must be positive, command_to_sample finite")
+        raise RecordingError(
+            f"position_step {recording.position_step} rad must be positive, and command_to_sample must be finite"
+        )
     if not recording.torque.any():
         raise RecordingError("all torques are 0: without torque the scale of the parameters cannot be determined")
     for joint in range(recording.joints):

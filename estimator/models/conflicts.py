@@ -38,7 +38,7 @@ _CHECKS = {
     "stribeck_velocity": "use slower motion to separate friction near standstill",
 }
 _DRIVE = "check the joint's servo model and mode"
-_LINK = "correct the mass, centre of mass and inertia of that link there, or check what the arm carries"
+_LINK = "correct that link's mass, centre of mass and inertia in the description, or check what the arm carries"
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Conflict:
         advice = next((check for kind, check in _CHECKS.items() if self.name.startswith(kind)), usual)
         return (
             f"{self.name} is {self.value:.3g} +- {self.std:.1g}, {self.deviations:.0f} standard deviations from "
-            f"{self.expected:.3g} {spread}, {_SOURCES[self.source]}: {advice}."
+            f"{self.expected:.3g} ({spread}), {_SOURCES[self.source]}: {advice}."
         )
 
 

@@ -105,7 +105,7 @@ class MomentumObserver:
     ) -> None:
         joints = len(largest)
         if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
-            raise ValueError(f"{joints} joints and a covariance of {covariance.shape}: 1 or 2, and 14 x 14, are needed")
+            raise ValueError(f"{joints} joints, covariance {covariance.shape}: 1 or 2 joints and (14, 14) are needed")
         self._joints = joints
         self._memory = np.zeros((_PENDING + 1, _COUNT))
         self._memory[_THETA] = [mean.get(name, 0.0) for name in NAMES]

@@ -138,7 +138,7 @@ def physical_quantities(
 def _check(known: Mapping[str, Known], joints: int) -> None:
     for name, item in known.items():
         if name not in QUANTITIES[joints]:
-            raise ModelError(f"known.{name}: an arm of {joints} joints has {', '.join(QUANTITIES[joints])}")
+            raise ModelError(f"known.{name}: an arm of {joints} joints has only {', '.join(QUANTITIES[joints])}")
         positive = name.startswith(("length", "mass_1", "mass_2"))
         if not np.isfinite(item.value) or item.std < 0.0 or (positive and item.value <= 0.0):
             raise ModelError(f"known.{name} = {item.value:g}, std {item.std:g}: must be a positive number in SI units")

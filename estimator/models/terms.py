@@ -182,7 +182,7 @@ _DECLARED = (
         standstill=True,
         log_spread=1.0,
     ),
-    Term("load", "1", "Coulomb friction per motor torque", part="stribeck_load", initial=0.02),
+    Term("load", "1", "Coulomb friction per unit of motor torque", part="stribeck_load", initial=0.02),
     Term(
         "presliding_stiffness",
         "N m/rad",

@@ -121,17 +121,17 @@ def _left(estimate: ShootingEstimate, evidence: SegmentEvidence, trust: Trust) -
 
 def _predicted(held_out: Array | None, length: float) -> str:
     if held_out is None:
-        return "It was not validated on a held-out motion: the recording is too short to hold out a part of it."
+        return "The model was not validated on a held-out motion: the recording is too short to hold out a part of it."
     return (
-        f"Fitted to every other segment of {length:g} s, it predicts the others to within "
+        f"Fitted to every other segment of {length:g} s, the model predicts the remaining ones to within "
         f"{100.0 * float(held_out.max()):.2g} % of the motion's RMS."
     )
 
 
 def _weakest(name: str, part: float, spoiled: bool) -> str:
     if part <= WELL_KNOWN or spoiled:
-        return f"The least well known parameter is {name}, to {100 * part:.2g} %."
+        return f"The least certain parameter is {name}, known to within {100 * part:.2g} %."
     if not np.isfinite(part):
         return f"This motion provides no information on {name}. To identify it: {IMPROVEMENT[kind_of(name)]}."
     improvement = IMPROVEMENT[kind_of(name)]
-    return f"The least well known parameter is {name}, to {100 * part:.2g} %. To improve it: {improvement}."
+    return f"The least certain parameter is {name}, known to within {100 * part:.2g} %. To improve it: {improvement}."

@@ -161,12 +161,14 @@ def _suspicion(estimate: Estimate, evidence: Evidence) -> str:
     if seen:
         what = _in_words(seen[0].part)
         advice = "" if evidence.tried_all else ' [model] friction = "auto" tries that.'
-        return f"It looks most like {what}, which would explain {100.0 * seen[0].explained:.0f} % of it.{advice}"
+        return (
+            f"The residual looks most like {what}, which would explain {100.0 * seen[0].explained:.0f} % of it.{advice}"
+        )
     if not evidence.tried_all and estimate.model.friction != "stribeck_load":
-        return 'No single term explains it; [model] friction = "auto" tries them together.'
+        return 'No single term explains the residual; [model] friction = "auto" tries them together.'
     return (
-        "No available term explains it. Possible causes: cogging or torque ripple, backlash, a loose screw, a sagging "
-        "supply or a dragging cable."
+        "No available term explains the residual. Possible causes: cogging or torque ripple, backlash, a loose screw, "
+        "a sagging supply or a dragging cable."
     )
 
 
@@ -179,19 +181,19 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
     """Return which parameters the model error may have biased, judged by their inflated standard errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst and trust == "no":
-        return "It may bias all parameters, whatever their standard errors say."
+        return "This error may bias all parameters, whatever their standard errors say."
     if not worst:
-        return "It does not affect the parameters significantly: including it, each is known to 2 % or better."
+        return "This error does not affect the parameters significantly: including it, each is known to 2 % or better."
     named = sorted(worst, key=lambda name: -worst[name])
     listed = ", ".join(f"{name} ({100.0 * worst[name]:.2g} %)" for name in named[:4])
     more = f" and {len(named) - 4} others" if len(named) > 4 else ""
     if trust == "no":
-        return f"It may bias everything, most of all {listed}{more}."
+        return f"This error may bias all parameters, most of all {listed}{more}."
     if trust == "yes":
-        return f"The standard errors include it: {listed}{more}; the others are known to 2 % or better."
+        return f"The standard errors include this: {listed}{more}; the other parameters are known to 2 % or better."
     return (
-        f"It may bias all of them: the standard errors include it ({listed}{more}; the others at most 2 %), but while "
-        "its cause is unknown, errors of several standard errors are possible."
+        f"This error may bias all parameters. The standard errors include it ({listed}{more}; the others at most 2 %), "
+        "but while its cause is unknown, errors of several standard errors are possible."
     )
 
 
@@ -199,7 +201,10 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
     """Return the response on lines that were left unexcited, and the part of it that the model does not explain."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
-        return ("experiment.detection = true would separate odd (friction) from even causes (offsets, direction).",)
+        return (
+            "experiment.detection = true would separate odd distortion (friction) from even distortion (offsets, "
+            "direction).",
+        )
     driven = levels.excited.motion
     joint = int(np.argmax(np.maximum(levels.odd.motion, levels.even.motion) / driven))
 
@@ -207,10 +212,10 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
         return f"{100.0 * float(level[joint] / driven[joint]):.2g} %"
 
     found = (
-        f"On lines that were not excited, joint {joint + 1} responds with {share(levels.odd.motion)} of an excited "
-        f"line's motion on odd ones (friction, gravity) and {share(levels.even.motion)} on even ones (offsets, "
-        f"direction-dependent effects); noise is {share(levels.noise)}. The model does not explain "
-        f"{share(levels.odd.left)} and {share(levels.even.left)}."
+        f"Joint {joint + 1} also responds on lines that were not excited. Relative to an excited line's motion: "
+        f"{share(levels.odd.motion)} on odd lines (friction, gravity), {share(levels.even.motion)} on even lines "
+        f"(offsets, direction-dependent effects), and {share(levels.noise)} noise. The model leaves "
+        f"{share(levels.odd.left)} (odd) and {share(levels.even.left)} (even) unexplained."
     )
     beyond = [
         hint
@@ -240,9 +245,9 @@ def _pushed(torque: TorqueChange | None) -> tuple[str, ...]:
         if seen
     )
     return (
-        f"Relative to the fitted motion, a constant torque of {found} acts in the held-out one, which explains the "
-        "difference better than a change of friction: in one of them something pushed or pulled the arm, a cable "
-        "tightened, it carried something, or its base tilted. Remove the cause and record again.",
+        f"Relative to the fitted motion, a constant torque of {found} acts in the held-out one. It explains the "
+        "difference better than a change of friction. In one of the two motions, something pushed or pulled the arm, a "
+        "cable tightened, the arm carried something, or its base tilted. Remove the cause and record again.",
     )
 
 
@@ -250,9 +255,9 @@ def _reason(change: float, seconds: float) -> str:
     """Return the possible cause of a change of friction, as the end of a sentence. While a servo warms up, its friction
     falls; a rise always indicates a fault.
     """
-    holds = "the values hold for the fitted periods"
+    holds = "the identified values hold for the fitted periods"
     if change < 0.0:
-        warm = f"To obtain those of the warm arm, set experiment.warm_up = {_warm_up(seconds)}."
+        warm = f"To obtain the warm arm's values, set experiment.warm_up = {_warm_up(seconds)}."
         return f", as is typical while grease warms up: {holds}. {warm}"
     return (
         f", which warming up does not explain: {holds}. Look for a cable or part that began to rub, a loose screw, "
@@ -267,14 +272,14 @@ def _warm_up(seconds: float) -> int:
 
 def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ...]:
     if held_out is None:
-        return ("It was not validated on a held-out motion: set experiment.held_out = true.",)
+        return ("The model was not validated on a held-out motion: set experiment.held_out = true.",)
     worst = _percent(held_out)
-    said = f"It predicts a held-out motion to within {worst} of that motion's RMS, excluding encoder noise"
+    said = f"The model predicts a held-out motion to within {worst} of that motion's RMS, excluding encoder noise"
     if as_fitted is None or _percent(as_fitted) == worst:
         return (f"{said}.",)
     return (
-        f"{said} with friction as it was at that time, one factor per joint taken from that motion itself; with "
-        f"friction as it was in the fitted motion, to within {_percent(as_fitted)}.",
+        f"{said}, if friction is rescaled to its level at that time (one factor per joint, taken from that motion). "
+        f"With friction as in the fitted motion, it predicts that motion to within {_percent(as_fitted)}.",
     )
 
 
@@ -295,17 +300,19 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
     name = validation.weakest
     part = validation.relative_std[name]
     if part <= WELL_KNOWN:
-        return (f"The least well known parameter is {name}, to {100 * part:.2g} %.",)
+        return (f"The least certain parameter is {name}, known to within {100 * part:.2g} %.",)
     improvement = improvement_of(name, torque_limit)
     if part > WEAK and not _is_weak(validation, name):
         share = 100 * validation.torque_std[name]
         return (
-            f"The least well known parameter is {name}, to {100 * part:.2g} %, which hardly affects this arm: its "
-            f"standard error is {share:.2g} % of the torque of the fitted motion. To improve it: {improvement}.",
+            f"The least certain parameter is {name}, known to within {100 * part:.2g} %. It hardly affects this arm: "
+            f"its standard error is {share:.2g} % of the torque of the fitted motion. To improve it: {improvement}.",
         )
     if not np.isfinite(part):
         return (f"This motion provides no information on {name}. To identify it: {improvement}.",)
-    return (f"The least well known parameter is {name}, to {100 * part:.2g} %. To improve it: {improvement}.",)
+    return (
+        f"The least certain parameter is {name}, known to within {100 * part:.2g} %. To improve it: {improvement}.",
+    )
 
 
 def _alike(validation: Validation) -> tuple[str, ...]:
@@ -326,5 +333,6 @@ def _outliers(estimate: Estimate, explained: bool) -> tuple[str, ...]:
     one = estimate.outliers == 1
     counted = "1 sample is an outlier and was" if one else f"{estimate.outliers} samples are outliers and were"
     return (
-        f"{counted} downweighted: a jolt, backlash, or late or damaged readings; the report's residuals show where.",
+        f"{counted} downweighted. Possible causes: a jolt, backlash, or late or damaged readings. The residuals in the "
+        "report show where.",
     )

@@ -113,14 +113,14 @@ _LEAST_REPEAT_S = 1e-3
 class Fault(Described):
     """One injected fault, immutable. `servo` is a bus ID at the time the fault begins; None means all servos."""
 
-    kind: Annotated[FaultKind, Field(strict=False, description="what goes wrong; see FAULTS")]
+    kind: Annotated[FaultKind, Field(strict=False, description="kind of fault; see FAULTS")]
     at: Annotated[
         float, Field(ge=0, allow_inf_nan=False, description="when it begins [s since the bus was created]")
     ] = 0.0
     duration: Annotated[float, Field(gt=0, description="duration [s]; unlimited by default")] = math.inf
     servo: Annotated[int | None, Field(ge=0, le=252, description="bus ID of the servo; all servos by default")] = None
     probability: Annotated[
-        float, Field(ge=0, le=1, description="probability that it affects a packet, or that it happens at all")
+        float, Field(ge=0, le=1, description="packet faults: probability per packet; others: probability of occurring")
     ] = 1.0
     amount: Annotated[
         float | None,

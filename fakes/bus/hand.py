@@ -32,7 +32,7 @@ _PULL_S = 0.01
 class Move(Described):
     """One movement of the hand, after which it holds the joint for `hold` seconds, indefinitely by default."""
 
-    servo: Annotated[int, Field(ge=0, le=252, description="bus ID of a servo of the joint")]
+    servo: Annotated[int, Field(ge=0, le=252, description="bus ID of one of the joint's servos")]
     to: Annotated[
         float | None,
         Field(ge=-4 * math.pi, le=4 * math.pi, allow_inf_nan=False, description="joint angle at the end [rad]"),
@@ -102,7 +102,9 @@ class Hand:
         now = self._time()
         free = {self._joint_of(move) for move in moves} - self._grips.keys()
         if moves and not isinstance(self._plant, CanBeHeld):
-            raise PlantError(f"{type(self._plant).__name__} has no hold(joint, velocity): the hand needs it")
+            raise PlantError(
+                f"{type(self._plant).__name__} has no hold(joint, velocity): moving a joint by hand needs it"
+            )
         for joint in free:
             self._hold(joint, None)  # a custom plant that cannot be held is refused now, not in the middle of a run
         self._to_come += [move.model_copy(update={"at": now + move.at}) for move in moves]

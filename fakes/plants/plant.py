@@ -111,7 +111,7 @@ def load_plant(name: str, options: Mapping[str, object]) -> Plant:
     if name not in OWN_PLANTS and not _leave["code"]:
         raise PlantError(
             f'plant = "{name}" is code that this file wants to run, with {dict(options)}: nothing was run. Inspect it; '
-            "if you trust the file, use --allow-code, or hil.fakes.allow_code() in Python. Without it only "
+            "if you trust the file, use --allow-code, or hil.fakes.allow_code() in Python. Otherwise, only "
             f"{' and '.join(sorted(OWN_PLANTS))} are allowed"
         )
     module_name, _, factory_name = name.partition(":")
@@ -175,7 +175,7 @@ class CheckedPlant:
     def hold(self, joint: int, velocity: float | None) -> None:
         """Grip, move or release a joint; raises PlantError if the plant does not support this."""
         if not isinstance(self._plant, CanBeHeld):
-            raise PlantError(f'plant "{self._name}" has no hold(joint, velocity): the hand needs it')
+            raise PlantError(f'plant "{self._name}" has no hold(joint, velocity): moving a joint by hand needs it')
         self._plant.hold(joint, velocity)
 
     def check(self) -> None:

@@ -29,7 +29,8 @@ class Overload(Described):
     """Shutdown after the current has been high for too long."""
 
     current_a: Annotated[
-        float, Field(gt=0, le=100, allow_inf_nan=False, description="motor current above which the timer runs [A]")
+        float,
+        Field(gt=0, le=100, allow_inf_nan=False, description="motor current above which the overload timer runs [A]"),
     ]
     time_s: Annotated[
         float, Field(gt=0, le=3600, allow_inf_nan=False, description="longest permitted time above that current [s]")

@@ -129,7 +129,7 @@ def dry_run(
     if checked.is_chain:
         if former is not None:
             raise ConfigError(
-                f"{shown}: --result: so far, dry runs of spatial arms accept only the description as the prior."
+                f"{shown}: --result is for planar arms; a spatial arm's dry run takes its prior from the description."
             )
 
         def tell(done: int, of: int) -> None:

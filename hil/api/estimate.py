@@ -92,7 +92,7 @@ def are_recordings(paths: Sequence[Path]) -> bool:
     if any(files) and not all(files):
         raise ValueError("give either one run folder or recordings (CSV, Parquet, MCAP), not both.")
     if not any(files) and len(paths) != 1:
-        raise ValueError("one run folder at a time; only recordings of other tools can be estimated together.")
+        raise ValueError("give one run folder at a time; only recordings of other tools can be estimated together.")
     return all(files)
 
 

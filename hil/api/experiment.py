@@ -125,9 +125,10 @@ def record(
 def _earlier(config: Config, shown: Path, path: Path) -> Result:
     """The result of an earlier run. Raises ConfigError, ResultError, RunFolderError."""
     if config.is_chain or not config.experiment.pilot:
-        why = "this arm is spatial" if config.is_chain else "this file has none, because it gives peak_torque"
+        why = "this arm is spatial" if config.is_chain else "this file gives peak_torque, so no pilot runs"
         raise ConfigError(
-            f"{shown}: an earlier run replaces the prior of a planar arm's pilot (experiment.pilot = true), but {why}."
+            f"{shown}: an earlier run can only replace the prior of a planar arm's pilot (experiment.pilot = true), "
+            f"but {why}."
         )
     return earlier_result(config, path)
 

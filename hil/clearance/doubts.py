@@ -33,8 +33,8 @@ def unchecked(space: Space) -> Iterator[str]:
     """Yield one sentence per pair of links that is not fully checked for contact."""
     for first, second in space.as_built:
         yield (
-            f"Some parts of {first!r} and {second!r} are closer than clearance.margin in nearly every pose, as if by "
-            "design. The distance between these parts is not checked; that between all other parts is."
+            f"Some parts of {first!r} and {second!r} are closer than clearance.margin in nearly every pose, apparently "
+            "by design. The distance between these parts is not checked; all other distances are."
         )
 
 
@@ -53,8 +53,8 @@ def _same_direction(config: Config, joint: JointConfig) -> str:
     given = list(joint.directions) if isinstance(joint.turns, list) else sign
     return (
         f"direction = {given} means that IDs {first} and {second} of joint {joint.name!r} turn the same way. Servos "
-        f"that face each other turn oppositely: they need direction = [{sign}, {-sign}], or they work against each "
-        f"other. {_how_to_compare(config)}"
+        f"that face each other turn oppositely: they need direction = [{sign}, {-sign}]; otherwise they work against "
+        f"each other. {_how_to_compare(config)}"
     )
 
 
@@ -62,10 +62,10 @@ def _how_to_compare(config: Config) -> str:
     """Say how to find out which way the two servos of a joint turn."""
     if config.arm.urdf is not None:
         guided = command("pose", config.path, "--guide")
-        return f"Only motion shows it: `{guided}` compares both while you turn the joint by hand."
+        return f"Only motion shows which is right: `{guided}` compares both servos while you turn the joint by hand."
     return (
-        "Only motion shows it: turn the joint by hand with torque off and compare both Present Positions in DYNAMIXEL "
-        "Wizard 2.0."
+        "Only motion shows which is right: with torque off, turn the joint by hand and compare the Present Positions "
+        "of both servos in DYNAMIXEL Wizard 2.0."
     )
 
 
@@ -78,7 +78,7 @@ def _weak(joint: JointConfig) -> str:
     unit = joint.drive_mode.goal_unit
     return (
         f"{joint.goal_limit_name} of joint {joint.name!r} = {joint.goal_limit:g} {unit} allows at most {torque:.2g} "
-        f"N m, no more than the typical dry friction of its servos, {friction:.2g} N m: it probably would not move. "
-        f"It takes about {2.0 * friction / joint.torque_per_goal:.2g} {unit} to move it without a load, and more to "
+        f"N m, no more than the typical dry friction of its servos, {friction:.2g} N m. The joint probably would not "
+        f"move. It needs about {2.0 * friction / joint.torque_per_goal:.2g} {unit} to move without a load, and more to "
         "lift one."
     )

@@ -98,7 +98,7 @@ def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule
     return (
         f'link "{name}": {why}. It is replaced by a {along if length > _NOTHING else "sphere at its joint"}'
         f"{', in addition to its other shapes' if has_others else ''}. The radius of {1e3 * capsule.radius:.0f} mm is "
-        f"a guess{end}: its clearance is uncertain."
+        f"a guess{end}, so the clearance to this link is uncertain."
     )
 
 

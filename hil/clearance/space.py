@@ -137,7 +137,7 @@ class Space:
         return (
             f"arm.rest_pose puts {first} {-1e3 * found.distance:.0f} mm into {second}: the pose, zero_ticks, a "
             "direction, [clearance] or the URDF's collision geometry is wrong. `hil pose` shows the pose as read from "
-            "the bus; pairs that do touch by design belong in clearance.ignore"
+            "the bus. Add pairs that touch by design to clearance.ignore"
         )
 
     def ends(self, position: Array) -> tuple[Array, Array]:

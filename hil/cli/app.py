@@ -35,9 +35,7 @@ def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
     allow_code: Annotated[
         bool,
-        typer.Option(
-            "--allow-code", help='Let a file\'s [fake] plant = "module:factory" run arbitrary code. Read it first.'
-        ),
+        typer.Option("--allow-code", help="Run the code that the file names in [fake] plant. Read that code first."),
     ] = False,
 ) -> None:
     del allow_code  # handled in main, wherever it appeared on the command line

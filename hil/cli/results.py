@@ -43,7 +43,8 @@ def report(
 def export(
     run: RunPath,
     formats: Annotated[
-        list[str], typer.Option("--format", metavar="FORMAT", help="urdf, mjcf, toml, json, csv, parquet, mcap or mat.")
+        list[str],
+        typer.Option("--format", metavar="FORMAT", help="One of urdf, mjcf, toml, json, csv, parquet, mcap, mat."),
     ],
     out: Annotated[
         Path | None,

@@ -120,9 +120,9 @@ def _print_difference(difference: "Difference") -> None:
         table.add_row(escape(change.name), *shown, "changed" if change.changed else "")
     console = result_console()
     print_fitting(console, table)
-    for lacking, names in (("after", difference.only_before), ("before", difference.only_after)):
+    for lacking, names in (("later", difference.only_before), ("earlier", difference.only_after)):
         if names:
-            say(console, f"Not in the model {lacking}: {', '.join(names)}.")
+            say(console, f"Not in the {lacking} model: {', '.join(names)}.")
     for line in (*difference.doubts, *_would_show(difference.detectable)):
         say(console, line)
     if any(": " in change.name for change in difference.changes):
@@ -139,8 +139,8 @@ def _would_show(detectable: "Mapping[str, float]") -> list[str]:
     never = [name for name, percent in detectable.items() if percent > _WHOLE]
     lines = []
     if least:
-        known = "Smallest changes of single terms that 95 of 100 such pairs of runs would detect"
+        known = "Smallest change of each term that 95 of 100 such pairs of runs would detect"
         lines.append(f"{known}: {', '.join(least)}.")
     if never:
-        lines.append(f"Not even a doubling would be detected: {', '.join(never)}.")
+        lines.append(f"In these, not even a doubling would be detected: {', '.join(never)}.")
     return lines

@@ -64,7 +64,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
             continue
         if max(-lower, upper) > _MOST_TURNED_RAD:
             in_rad = f"[{math.radians(lower):.3g}, {math.radians(upper):.3g}]"
-            yield f"{where}: are these degrees? They must be in radians, then {in_rad}."
+            yield f"{where}: are these degrees? Limits must be in radians, here {in_rad}."
             continue
         low, high = joint.position_limit
         free = POSITION_RESERVE * (high - low)
@@ -88,8 +88,8 @@ def doubted_gravity(config: "Config") -> Iterator[str]:
         return
     used = [round(each, 4) + 0.0 for each in base_gravity(config).tolist()]
     yield (
-        f"{arm.path.name}: its gravity is {list(arm.gravity)} m/s^2, which is not used: [arm] base and gravity "
-        f"give {used} in the frame of the base. {_mounted(np.array(arm.gravity))}"
+        f"{arm.path.name}: its gravity, {list(arm.gravity)} m/s^2, is not used. [arm] base and gravity give {used} "
+        f"in the frame of the base. {_mounted(np.array(arm.gravity))}"
     )
 
 
@@ -97,7 +97,7 @@ def _mounted(gravity: NDArray[np.float64]) -> str:
     """Say which settings give this gravity in the frame of the base (3,) [m/s^2]."""
     strength = float(np.linalg.norm(gravity))
     if strength <= _SAME_GRAVITY:
-        return "In the file, the arm is weightless: correct it."
+        return "The file sets gravity to zero: correct it."
     x, y, z = (-gravity / strength + 0.0).tolist()
     base = [round(angle, 4) for angle in (math.atan2(y, z), -math.asin(max(-1.0, min(1.0, x))), 0.0)]
     return f"If the arm is mounted as the file says, set base = {base} and gravity = {strength:.4g} under [arm]."
@@ -160,7 +160,7 @@ def chain_slips(config: "Config") -> Iterator[str]:
     elif config.stabiliser is None:
         yield (
             "stabiliser is missing: a spatial arm does not hang at rest, so a spring and a damper must hold it "
-            "on its path; or set experiment.pilot = true, which finds both"
+            "on its path. Give both, or set experiment.pilot = true, which finds them"
         )
     if config.known is not None:
         yield "known: only for planar arms; a URDF gives its own masses"
@@ -189,20 +189,21 @@ def _planar_slips(config: "Config") -> Iterator[str]:
     if config.arm.urdf is None and config.joint_path is not None:
         yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
     if config.model.base_tilt:
-        yield "model.base_tilt: the tilt of a planar arm equals a zero error of its first joint: use model.zeros"
+        yield "model.base_tilt: tilting a planar arm acts like a zero error of its first joint: use model.zeros"
 
 
 def _path_slips(config: "Config") -> Iterator[str]:
     if config.experiment.band is None:
         yield (
-            "experiment.lines: a spatial arm follows a path, whose highest frequency is the upper end of "
-            "experiment.band"
+            "experiment.lines: only for planar arms; a spatial arm follows a path, and the upper end of "
+            "experiment.band is its highest frequency"
         )
     high = (config.experiment.band or DEFAULT_BAND)[1]
     if config.experiment.period * high < _HARMONICS - 1e-9:
         yield (
             f"experiment.period = {config.experiment.period:g} s: a path needs at least {_HARMONICS} harmonics below "
-            f"the upper end of its band, {high:g} Hz: make it at least {_HARMONICS / high:.3g} s; 8 to 10 s are usual"
+            f"the upper end of its band, {high:g} Hz: set period to at least {_HARMONICS / high:.3g} s; 8 to 10 s are "
+            "usual"
         )
     if config.joint_path is None:
         return
@@ -218,8 +219,8 @@ def _path_slips(config: "Config") -> Iterator[str]:
         if speed > joint.velocity_limit:
             hint = in_other_units(speed, "rad/s", lambda limited: limited <= least)
             yield (
-                f"joint_path.speed: {speed:g} rad/s of {joint.name!r}: its velocity_limit is {joint.velocity_limit:g}"
-                + (f". {hint}" if hint else "")
+                f"joint_path.speed: {speed:g} rad/s for {joint.name!r}, above its velocity_limit of "
+                f"{joint.velocity_limit:g} rad/s" + (f". {hint}" if hint else "")
             )
 
 

@@ -33,7 +33,7 @@ class ClearanceConfig(Table):
 
     margin: float = Field(0.01, ge=0, le=0.5, description="m, minimum clearance along the whole planned motion")
     floor: _Floor = Field(
-        0.0, description='height of the table or floor above the base\'s origin, m; "none" if none is in reach'
+        0.0, description='height of the table or floor above the base\'s origin, m; "none" if neither is within reach'
     )
     boxes: list[BoxConfig] = Field([], description="other obstacles")
     ignore: list[Annotated[list[str], Field(min_length=2, max_length=2)]] = Field(

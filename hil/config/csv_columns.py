@@ -77,11 +77,11 @@ class Columns(_Table):
     current: list[Column] | None = Field(None, description="one column per joint, in place of torque")
     current_unit: Literal["A", "mA"] | None = None
     torque_constant: list[Gain] | None = Field(
-        None, description="N m/A per joint at the output shaft; with current, or with voltage and resistance"
+        None, description="N m/A per joint at the output shaft; needed with current, or with voltage and resistance"
     )
     voltage: list[Column] | None = Field(None, description="motor voltage, one column per joint, in place of torque")
     voltage_unit: Literal["V", "mV"] | None = None
-    pwm: list[Column] | None = Field(None, description="share of the supply voltage, one column per joint")
+    pwm: list[Column] | None = Field(None, description="fraction of the supply voltage, one column per joint")
     pwm_unit: Literal["1", "%"] | None = None
     supply_voltage: PositiveFloat | None = Field(None, le=1000, description="V, with pwm")
     resistance: list[Annotated[float, Field(gt=0, le=1000)]] | None = Field(
@@ -90,9 +90,11 @@ class Columns(_Table):
     torque_per_volt: list[Gain] | None = Field(
         None, description="N m/V per joint at standstill: stall torque over voltage, or torque_constant / resistance"
     )
-    between: Literal["held", "linear"] = Field("linear", description="held for a command, linear for a measurement")
+    between: Literal["held", "linear"] = Field(
+        "linear", description="torque between samples: held for a command, linear for a measurement"
+    )
     segment: PositiveFloat = Field(
-        1.0, le=60, description="s, duration of a shooting segment, each with an unknown initial state"
+        1.0, le=60, description="s, duration of each shooting segment; its initial state is estimated"
     )
     zeros_unknown: bool = Field(True, description="estimate each encoder's zero offset")
 
@@ -116,19 +118,19 @@ class Columns(_Table):
     def _consistent(self) -> Self:
         drives = [kind for kind in ("torque", "current", "voltage", "pwm") if getattr(self, kind) is not None]
         if len(drives) > 1:
-            raise ValueError(f"columns: {' and '.join(drives)} are both given: give only one, one column per joint")
+            raise ValueError(f"columns: {' and '.join(drives)} are both given: give only one of them")
         if self.time is not None and self.rate is not None:
             raise ValueError("columns: give either time or rate, not both")
         if self.current is not None and self.torque_constant is None:
-            raise ValueError("columns.torque_constant is missing: current needs it, N m/A per joint")
+            raise ValueError("columns.torque_constant is missing: current needs it [N m/A per joint]")
         if drives in (["voltage"], ["pwm"]):
             if self.torque_per_volt is None and (self.torque_constant is None or self.resistance is None):
                 raise ValueError(
-                    f"columns.torque_per_volt is missing: {drives[0]} needs it, N m/V per joint, or torque_constant "
+                    f"columns.torque_per_volt is missing: {drives[0]} needs it [N m/V per joint], or torque_constant "
                     "and resistance"
                 )
             if self.pwm is not None and self.supply_voltage is None:
-                raise ValueError("columns.supply_voltage [V] is missing: pwm is a share of it")
+                raise ValueError("columns.supply_voltage [V] is missing: pwm is a fraction of it")
         if self.position_unit == TICKS and self.ticks_per_turn is None:
             raise ValueError("columns.ticks_per_turn is missing: positions are in ticks (4096 for X-series servos)")
         self._one_each()
@@ -185,8 +187,8 @@ class RecordingConfig(BaseModel):
         count = len(self.columns.position or ())
         if count > PLANAR and self.arm.urdf is None:
             raise ValueError(
-                f"columns.position: {count} joints need arm.urdf, which gives the geometry, and [[joints]] with name = "
-                "for each of them; without a URDF, an arm has one or two joints"
+                f"columns.position: {count} joints need arm.urdf, which gives the geometry, and one [[joints]] table "
+                "each, with its name; without a URDF, an arm has one or two joints"
             )
         return self
 

@@ -28,16 +28,16 @@ class ExperimentConfig(Table):
     )
     pilot: bool = Field(False, description="find peak_torque with a small pilot run first, then raise it to the limits")
     design: Literal["low_crest", "optimal"] = Field("low_crest", description='"optimal" uses the pilot\'s model')
-    ramp: float = Field(1.0, ge=0, le=60, description="s, at start and end")
-    rest: float = Field(0.5, ge=0, le=60, description="s, time without torque beforehand")
+    ramp: float = Field(1.0, ge=0, le=60, description="s, torque ramp at start and end")
+    rest: float = Field(0.5, ge=0, le=60, description="s, time without torque before the motion")
     warm_up: float = Field(
         0.0,
         ge=0,
         le=3600,
-        description="s, duration of the same motion before the first recorded period, to warm up the friction",
+        description="s, how long to repeat the motion before the first recorded period, to warm up the joints",
     )
     settle_within: PositiveFloat = Field(
-        0.01, lt=1, description="RMS difference between periods, relative to the motion's RMS"
+        0.01, lt=1, description="largest RMS difference between settled periods, relative to the motion's RMS"
     )
     max_settling_periods: int = Field(5, ge=1, le=100)
     periods: int = Field(1, ge=1, le=1000, description="number of settled periods recorded")
@@ -50,15 +50,15 @@ class ExperimentConfig(Table):
         if abs(samples - round(samples)) > 1e-9 * samples:
             nearest = max(1, round(samples))
             raise ValueError(
-                f"rate * period = {samples:g}: must be a whole number of samples; the nearest: "
+                f"rate * period = {samples:g}: must be a whole number of samples; nearest valid value: "
                 f"period = {nearest / self.rate:.12g}"
             )
         if (self.band is None) == (self.lines is None):
             raise ValueError("give either band or lines")
         if self.detection and self.band is None:
             raise ValueError(
-                "detection chooses lines from a band; with experiment.lines, leave some odd harmonics out of the lists "
-                "yourself"
+                "detection chooses lines from experiment.band; with experiment.lines, omit some odd harmonics from the "
+                "lists yourself"
             )
         if self.band is not None:
             low, high = self.band
@@ -121,7 +121,7 @@ class ModelConfig(Table):
     cable: bool = Field(False, description=OPTIONS["cable"])
     encoder: bool = Field(False, description=OPTIONS["encoder"])
     lags: bool = Field(False, description=OPTIONS["lags"])
-    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, as far as gravity reveals it")
+    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, where gravity reveals it")
 
     @property
     def fixed_friction(self) -> Friction:

@@ -48,7 +48,7 @@ class JointConfig(Table):
     @classmethod
     def _of_the_first_servo(cls, ticks: object) -> object:
         if isinstance(ticks, list):
-            raise ValueError("it must be one whole number; for two servos, the first one's")  # noqa: TRY004  pydantic's
+            raise ValueError("it must be one whole number; for two servos, give the first one's")  # noqa: TRY004  pydantic's
         return ticks
 
     @field_validator("turns", mode="before")
@@ -108,7 +108,9 @@ class JointConfig(Table):
                 raise ValueError(f"{name} is missing; {mode} mode needs it")
         for name, value in zip(names[not pwm], values[not pwm], strict=True):
             if value is not None:
-                raise ValueError(f"{name} = {value:g}: it has no meaning in {mode} mode; {' and '.join(names[pwm])} do")
+                raise ValueError(
+                    f"{name} = {value:g}: it has no meaning in {mode} mode; use {' and '.join(names[pwm])}"
+                )
         return self
 
     @property

@@ -67,7 +67,7 @@ def _joint(joint: "JointConfig") -> Iterator[str]:
         )
     std = joint.torque_per_goal_std
     if std > joint.torque_per_goal:
-        percent = f"; if in percent, {std / 100 * joint.torque_per_goal:.3g}" if std < _PERCENT else ""
+        percent = f"; if it is in percent, write {std / 100 * joint.torque_per_goal:.3g}" if std < _PERCENT else ""
         yield (
             f"{name}_std of {where} = {std:g} {unit} is more than {name} itself"
             + (_meant(std, unit, joint.torque_per_goal) or f". It is a standard error in {unit}")

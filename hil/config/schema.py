@@ -64,9 +64,11 @@ SLOW_INTERVAL_S = 0.25
 class PortConfig(Table):
     """`[port]`: the bus to which the servos are connected."""
 
-    url: str = Field(min_length=1, description='device or pyserial URL; "fake://" is the [fake] arm of the same file')
+    url: str = Field(
+        min_length=1, description='device or pyserial URL; "fake://" opens the [fake] arm of the same file'
+    )
     baud: Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000] = 1_000_000
-    one_write: bool = Field(True, description="send goals and read request in one write; false if hil check says so")
+    one_write: bool = Field(True, description="send goals and read request in one write; set as hil check advises")
     fast_sync_read: bool = Field(True, description="use Fast Sync Read where every servo's firmware supports it")
 
 
@@ -118,24 +120,24 @@ class SafetyConfig(Table):
         0.08, ge=0.02, le=2.54, description="s, time without packets after which a servo stops by itself"
     )
     allow_no_watchdog: bool = Field(
-        False, description="accept firmware without a Bus Watchdog: nothing then stops the servo when packets cease"
+        False, description="accept firmware without a Bus Watchdog: if packets cease, nothing then stops the servo"
     )
     write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
     missing_time: PositiveFloat = Field(0.015, le=2, description="s, time for which a servo may fail to reply")
     late_time: PositiveFloat = Field(0.05, le=2, description="s, time for which deadlines may be missed")
     max_missing: int | None = Field(
-        None, ge=1, le=1000, description="consecutive lost replies, instead of missing_time"
+        None, ge=1, le=1000, description="allowed consecutive lost replies, instead of missing_time"
     )
     max_late: int | None = Field(None, ge=1, le=1000, description="consecutive missed deadlines, instead of late_time")
     rest_time: float = Field(3.0, gt=0, le=60, description="s, time allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, le=2, description="rad/s, speed below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, le=1e4, description="A/s (V/s in PWM mode): maximum rate of change of goals")
-    max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C inside a servo")
+    max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C, highest inside a servo")
     min_voltage: float = Field(0.0, ge=0, le=60, description="V; default: the models' factory shutdown thresholds")
     max_voltage: PositiveFloat = Field(30.0, le=60, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s, time for which a current may deviate from its goal")
     follow_share: PositiveFloat = Field(
-        0.3, le=1, description="fraction of the planned peak by which a current may deviate for longer"
+        0.3, le=1, description="deviation of a current allowed for longer, as a fraction of the planned peak"
     )
     take_over: bool = Field(
         False, description="take over an arm whose torque is on, and lower it slowly; by default such an arm is refused"
@@ -146,7 +148,7 @@ class SafetyConfig(Table):
         0.6, le=5, description="rad/s, speed at which a stop lowers a spatial arm to its rest pose"
     )
     lower_time: PositiveFloat = Field(
-        10.0, le=60, description="s: longest duration of that lowering; on longer paths the arm moves faster"
+        10.0, le=60, description="s: longest duration of lowering; on longer paths the arm moves faster"
     )
     limit_chance: float = Field(
         0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"
@@ -190,7 +192,7 @@ class Config(Table):
     stabiliser: StabiliserConfig | None = None
     clearance: ClearanceConfig = ClearanceConfig()
     known: KnownConfig | None = None
-    columns: dict[str, Any] | None = Field(None, description="for CSV files; hil.config.csv_columns checks it")
+    columns: dict[str, Any] | None = Field(None, description="for CSV files; checked by hil.config.csv_columns")
     fake: FakeArm | None = None
 
     @model_validator(mode="before")
@@ -258,7 +260,7 @@ class Config(Table):
             found = "no multiple" if lines == 0 else "only 1 multiple" if lines == 1 else f"only {lines} multiples"
             raise ValueError(
                 f"experiment.band = [{low:g}, {high:g}] Hz contains {found} of 1 / period = {1 / experiment.period:g} "
-                f"Hz; each of [[joints]] needs one of its own: lengthen period, or widen band"
+                f"Hz, but each of [[joints]] needs its own: lengthen period, or widen band"
             )
 
     def _check_pilot(self) -> None:
@@ -268,7 +270,9 @@ class Config(Table):
         if experiment.pilot and self.arm.link_lengths is None:
             raise ValueError("experiment.pilot = true needs arm.link_lengths [m], one for each of [[joints]]")
         if experiment.peak_torque is None and self.arm.link_lengths is None:
-            raise ValueError("experiment.peak_torque is missing: give it in N m, or arm.link_lengths and pilot = true")
+            raise ValueError(
+                "experiment.peak_torque is missing: set it in N m, or set arm.link_lengths and pilot = true"
+            )
         if experiment.design == "optimal" and not experiment.pilot:
             raise ValueError('experiment.design = "optimal" needs pilot = true: the design uses the pilot\'s model')
 

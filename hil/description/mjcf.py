@@ -138,14 +138,15 @@ class _Tree:
         if sprung:
             yield (
                 f"{_listed('joint', sprung)} a stiffness, but springs are not modelled: the identified parameters "
-                "would absorb the spring's torque. Remove the spring from the arm; if it has none, from the file"
+                "would absorb the spring's torque. Remove the spring from the arm; if the arm has none, remove it "
+                "from the file"
             )
         links = [body for body in range(1, model.nbody) if not {*bodies}.isdisjoint(self._way(body))]
         floating = [self.name(body) for body in links if model.body_gravcomp[body]]
         if floating:
             yield (
                 f"{_listed('body', floating)} gravcomp, which is not used: gravity acts on every link of a real arm, "
-                "and the torque that supports it is identified"
+                "and its torque is identified"
             )
         if any(np.any(model.tendon_stiffness[each]) for each in range(model.ntendon)):
             yield "a tendon has a stiffness, but tendons and springs are not modelled: their forces are ignored"
@@ -168,8 +169,8 @@ class _Tree:
             if before not in (WORLD, *self._way(body)) or loose:
                 where = self.name(loose[0]) if loose else name
                 raise ArmFileError(
-                    f'{self.path}: a joint before "{name}", at "{where}", is not among the arm\'s joints: name all, '
-                    "in order from the base"
+                    f'{self.path}: a joint before "{name}", at "{where}", is not among the arm\'s joints: name '
+                    "all of them, in order from the base"
                 )
         return moved
 

@@ -31,7 +31,8 @@ def moves(arm: ArmDescription, angles: Array, joint: int, up: Array | tuple[floa
     place, direction = axis_of(arm, angles, joint)
     velocity, up = np.cross(direction, end_point(arm, angles) - place), np.asarray(up)
     if float(np.linalg.norm(velocity)) < LEAST_LEVER:
-        return f"turns the end about its own axis, {_towards(direction, up)}, counter-clockwise as seen from that side"
+        axis = _towards(direction, up)
+        return f"turns the end about its own axis, which points {axis}, counter-clockwise as seen from that side"
     return f"moves the end {_towards(velocity, up)}"
 
 

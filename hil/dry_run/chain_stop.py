@@ -77,8 +77,8 @@ class ChainStops:
         if down.nearest.room < 0.0:
             return (
                 f"too little clearance when a stop lowers the arm, {down.nearest}, at least "
-                f"{1e3 * down.nearest.needed:.0f} mm required. A lower safety.lower_speed, a rest_pose farther from "
-                "obstacles and masses that are given more accurately help"
+                f"{1e3 * down.nearest.needed:.0f} mm required. Lower safety.lower_speed, choose a rest_pose farther "
+                "from obstacles, or give the masses more accurately"
             )
         if down.lies < LAID_DOWN:
             return (
@@ -162,12 +162,12 @@ def _helps(config: Config, at: int, longest: float, used: float, needed: float) 
     slower = "raise safety.lower_time" if longest >= config.safety.lower_time else "lower safety.lower_speed"
     if needed > joint.goal_limit * joint.torque_per_goal:
         wanted = f"{1.1 * needed / joint.torque_per_goal:.2g} {joint.drive_mode.goal_unit}"
-        first = f"Raise its {joint.goal_limit_name} to {wanted} if it bears that, "
+        first = f"Raise its {joint.goal_limit_name} to {wanted} if the servo tolerates that, "
     elif used > SATURATED:
         first = f"Raise its {joint.goal_limit_name}, {slower}, "
     else:  # what is left is friction, or an error of the masses, against a spring that is soft at a low rate
-        first = f"Raise experiment.rate above {config.experiment.rate:g}, with which its stabiliser gets stiffer, "
-    return f"{first}choose a rest_pose in which gravity pulls it less, or give the masses more accurately"
+        first = f"Raise experiment.rate above {config.experiment.rate:g}, which makes its stabiliser stiffer, "
+    return f"{first}choose a rest_pose in which gravity loads it less, or give the masses more accurately"
 
 
 def _lowered(

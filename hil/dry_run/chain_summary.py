@@ -166,7 +166,7 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         f"A stop lowers the arm in at most {lowering.seconds:.1f} s; {100 * lowering.lies:.0f} % of the simulated "
         f"stops reach the rest pose (at least {100 * LAID_DOWN:.0f} % are required); smallest clearance on the way: "
         f"{lowering.nearest}.",
-        f"Without commands (cable unplugged, program killed, servo failed) the arm falls. Hardest fall, from "
+        f"Without commands (cable unplugged, program killed, servo failed) the arm falls. Hardest fall, starting "
         f"{fall.moment:.1f} s into the path: {hit} {when} {fall.seconds:.2f} s, {100 * fall.height:.0f} cm down, "
         f"at {fall.speed:.1f} m/s.",
     ]
@@ -177,5 +177,7 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
     if run.share < 1.0:
         lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which is shown here.")
     if run.refused == "" and (doubt := run.doubt(run.config)):
-        lines.append(f"hil identify decides with fewer of these arms. With all {run.arms} arms, not safe: {doubt}.")
+        lines.append(
+            f"hil identify decides using fewer of these arms. With all {run.arms}, the experiment is not safe: {doubt}."
+        )
     return [*lines, f"NOT SAFE: {why}." if why else "SAFE. Not tested on hardware."]

@@ -62,9 +62,9 @@ def said_of_stops(config: Config, side: Array) -> str:
     if not found:
         return ""
     return (
-        f"Assumed to lie on their own mechanical stops in the rest pose, since nothing described touches them: "
-        f"{', '.join(found)}. If something else carries them there, name it in [clearance] (floor, boxes): otherwise "
-        "they may sag further than foreseen, by what is given in brackets, before position_limit stops the arm."
+        f"Nothing described supports these joints in the rest pose, so each is assumed to lie on its own mechanical "
+        f"stop: {', '.join(found)}. If something else supports them, name it in [clearance] (floor, boxes). Otherwise "
+        "they may sag by up to the angle in brackets before position_limit stops the arm."
     )
 
 

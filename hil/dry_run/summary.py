@@ -176,11 +176,11 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
         "99 %: in 99 of 100 arms, all peaks stay within these values. Chance: probability that this one quantity of an "
         "arm exceeds its limit; at a position or velocity limit the guard stops the arm, current is only clamped.",
         settling_text(config, shown),
-        f"If stopped at any moment, they overshoot their limits by up to {_each(config, stopped)}; if the program is "
-        f"killed or the cable unplugged, by up to {_each(config, planned[Way.SILENT])}.",
-        "If something drives them past a limit at these speeds, they overshoot it by up to the following. Braked: "
-        f"{_each(config, passed[Way.BRAKED])}. With torque cut: {_each(config, passed[Way.CUT])}. Keep that much space "
-        "clear.",
+        f"If stopped at any moment, the arms overshoot their limits by up to {_each(config, stopped)}; if the program "
+        f"is killed or the cable unplugged, by up to {_each(config, planned[Way.SILENT])}.",
+        "If something drives an arm past a limit at these speeds, it overshoots the limit by up to the following. "
+        f"Braked: {_each(config, passed[Way.BRAKED])}. With torque cut: {_each(config, passed[Way.CUT])}. Keep that "
+        "much space clear.",
         *(
             []
             if run.largest is None
@@ -218,13 +218,14 @@ def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> 
     if largest is None:
         return [
             *lines,
-            "For the whole experiment, no torque is known yet that is safe for every arm; the pilot will find it.",
+            "No torque is known yet that is safe for every arm in the whole experiment; the pilot will find it.",
             f"SAFE: {starts}{closer}. The guard would stop and brake {chance} of the simulated arms at these limits, "
-            "and the pilot learns from such a stop too.",
+            "and the pilot also learns from such stops.",
         ]
     return [
         *lines,
-        f"SAFE: {starts}{closer}: probability of a guard stop: {chance}. It then raises the torque from run to run.",
+        f"SAFE: {starts}{closer}: probability of a guard stop: {chance}. The pilot then raises the torque from run to "
+        "run.",
     ]
 
 

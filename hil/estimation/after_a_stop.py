@@ -24,7 +24,7 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
     if steps:
         return [
             f"The recording of {steps[-1].name} is kept; its motion was smaller than the limits allow. The estimate is "
-            "rougher than that of a finished run.",
+            "less accurate than that of a finished run.",
             next_step("estimate", steps[-1]),
         ]
     return [f"The recording up to that point is kept in {run.path}; no period had settled.", next_step(command, shown)]

@@ -236,7 +236,7 @@ def _verdict(
         trust = lowered(trust, "with care")
         sentences.append(
             "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
-            "the remaining distance. Use faster motion ([joint_path]), so that fewer joints stick."
+            "the remaining distance to it. Use faster motion ([joint_path]), so that fewer joints stick."
         )
     if estimate.at_bound:
         trust = lowered(trust, "with care")
@@ -248,8 +248,8 @@ def _verdict(
     sentences += conflict_sentences(estimate.conflicts, explained)
     if estimate.unseen:
         sentences.append(
-            f"In this motion gravity does not reveal {', '.join(estimate.unseen)}: not identifiable, and assumed to be "
-            "zero within the standard error."
+            f"Not identifiable from gravity in this motion: {', '.join(estimate.unseen)} (assumed to be zero within "
+            "the standard error)."
         )
     return Verdict(trust, weakest, tuple(sentences))
 
@@ -289,8 +289,8 @@ def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_p
     if not found:
         return ""
     return (
-        f"The standard errors of {', '.join(found)} are larger than the uncertainty that the URDF's values are assumed "
-        "to have: errors of the model, or a fit that stopped short, outweigh what the recording says about them."
+        f"The standard errors of {', '.join(found)} exceed the assumed uncertainty of the URDF's values. Model errors, "
+        "or a fit that stopped short, outweigh the information in the recording."
     )
 
 
@@ -306,7 +306,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     measured = (
         f"the noise of its angle ({noise:.2g} encoder steps RMS; rounding alone is 0.29)"
         if noise > NOISY * QUANTISATION_FLOOR_TICKS
-        else "its noise, which is that of encoder rounding"
+        else "its noise, which is only encoder rounding"
     )
     said = f"The residual of {config.joints[joint].name} is the largest: {over:.2f} times {measured};"
     if is_explained(estimate):
@@ -323,7 +323,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     if over > EXPLAINED:
         return f"{said} the model is incomplete.{tried} Possible causes: {causes}."
     return (
-        f"{said} but part of it repeats with the motion, which increases standard errors by a factor of "
-        f"up to {estimate.systematic:.1f}, and some values may be wrong by more than these indicate. A small effect is "
-        f"missing from the model: {causes}.{tried}"
+        f"{said} but part of it repeats with the motion. This increases standard errors by a factor of up to "
+        f"{estimate.systematic:.1f}, and some values may be wrong by more than their standard errors. A small effect "
+        f"is missing from the model: {causes}.{tried}"
     )

@@ -28,4 +28,4 @@ def torque_limit(config: Config, samples: NDArray[np.void], index: int | None = 
             f"position_limit of {joint.name}": float(max(below / (rest - low), above / (high - rest))),
         }
     setting = max(shares, key=lambda name: shares[name])
-    return f"the {setting} (the pilot used {100 * shares[setting]:.0f} % of it, which limited the torque)"
+    return f"the {setting} (the pilot reached {100 * shares[setting]:.0f} % of it, which limited its torque)"

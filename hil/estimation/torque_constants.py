@@ -107,8 +107,8 @@ def contradictions(
         found.append(
             f"The {_STATES[source]} of {joints[0]} and {joint} contradict each other by a factor of "
             f"{max(value, 1.0 / value):.3g}: {_relative(joints[0], [(joint, ratio)], source)}, and torque constants "
-            f"are uncertain by only {100 * spread:.2g} % relative to each other. All values, of all joints, are in the "
-            f"torque of {joints[0]} and as wrong as that: {_CHECK[source]}."
+            f"are uncertain by only {100 * spread:.2g} % relative to each other. The values of all joints are relative "
+            f"to the torque of {joints[0]} and share its error: {_CHECK[source]}."
         )
     return tuple(found)
 
@@ -121,7 +121,7 @@ def ratios_said(
     if not ratios or without:
         return ()
     stated = _capitalised(_relative(joints[0], ratios, source))
-    return (f"{stated}. All values, of all joints, are in the torque of {joints[0]}.",)
+    return (f"{stated}. The values of all joints are relative to the torque of {joints[0]}.",)
 
 
 def _capitalised(sentence: str) -> str:

@@ -102,10 +102,12 @@ def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str
     ]
     note = (
         f"The torque constants of the fake arm's motors differ from the file's ({', '.join(named)}), and the result "
-        "assumes the file's: the true values are scaled accordingly"
+        "assumes the file's: the true values shown are scaled to match"
     )
     left = (
-        "" if len(values) == len(truth) else "; those that depend on several joints with different errors are not shown"
+        ""
+        if len(values) == len(truth)
+        else "; values that depend on several joints with different errors are not shown"
     )
     return Truth(values, f"{note}{left}.")
 

@@ -196,9 +196,9 @@ class Guard:
                 index,
                 Cause.ERRORS,
                 f"reports an error ({describe_status_error(error)}) with its values, {_ERRORS_IN_A_ROW} times in a "
-                "row, although nothing that it was sent should cause one: whether it accepts its goals is unknown. "
-                "Power-cycle it and check its firmware; a device between adapter and servo may also be changing "
-                "replies.",
+                "row, although no packet sent to it should cause one. Whether it accepts its goals is unknown. "
+                "Power-cycle it and check its firmware. A device between adapter and servo may also be changing "
+                "its replies.",
             )
 
     def goals_are_lost(self, index: int, held: str) -> NoReturn:
@@ -206,8 +206,8 @@ class Guard:
         self._stop(
             index,
             Cause.GOALS_LOST,
-            f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF}. Goals are lost on the "
-            "way, or the servo refuses them: check its cable and limits.",
+            f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. Goals are lost on "
+            "the way, or the servo refuses them: check its cable and limits.",
         )
 
     def _stop_for(self, fault: int, state: State) -> NoReturn:
@@ -242,7 +242,7 @@ class Guard:
                     Cause.EARLY_MOTION,
                     f"moves before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
                     f"is allowed. {self._still_swings()} Otherwise check whether a hand or a cable pushes or holds it, "
-                    "or its horn slips.",
+                    "or whether its horn slips.",
                 )
 
     def _still_swings(self) -> str:
@@ -259,7 +259,7 @@ class Guard:
             Cause.UNLIKE_BEFORE,
             f"does not repeat its motion: under the same torque it is at {position:.3f} rad, far from where it was one "
             "period ago. Something pushes or holds it, its load has changed, it slips, or its encoder has failed. If "
-            f"none is so, it swings so far that its motion never repeats.{self._lower_torque}",
+            f"none applies, it swings so far that its motion never repeats.{self._lower_torque}",
         )
 
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
@@ -397,8 +397,8 @@ class Guard:
             index,
             Cause.APART,
             f"has servos that no longer turn together: ID {ids[servo]} has turned {turned:+.3f} rad relative to the "
-            "first one since the start. Its horn slips, a screw is loose, one of their encoders is wrong, or its "
-            "direction is.",
+            "first one since the start. Its horn slips, a screw is loose, one of the encoders is wrong, or its "
+            "direction setting is wrong.",
         )
 
     def _disagree(self, index: int, state: State) -> NoReturn:

@@ -113,7 +113,7 @@ class Lowering:
         away = np.abs(self._position[index] - np.array(state.position))
         if np.nanmax(away, initial=0.0) > LEAVES_RAD:
             joint = self._config.joints[int(np.nanargmax(away))].joint
-            raise SafetyStop(f"{joint.title} is {np.nanmax(away):.2f} rad off its path down.", Cause.UNEXPECTED)
+            raise SafetyStop(f"{joint.title} is {np.nanmax(away):.2f} rad off its lowering path.", Cause.UNEXPECTED)
 
     def late(self, seconds: float) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""

@@ -218,8 +218,9 @@ def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
     if NONE_HEARD not in str(stop) or not silent or not heard:
         return ""
     return (
-        f"No servo was heard then, but {' and '.join(heard)} answered afterwards and {' and '.join(map(str, silent))} "
-        "did not: a silent servo hides those after it. Check its cable and its supply."
+        f"No servo was heard at the stop, but {' and '.join(heard)} answered afterwards and "
+        f"{' and '.join(map(str, silent))} did not: a silent servo hides the replies of those after it. Check its "
+        "cable and its supply."
     )
 
 
@@ -241,7 +242,7 @@ def _check_unchanged(bus: ServoBus) -> Settings:
     before = {each: value for each, value in settings_at_start().items() if each[1] not in WRITTEN}
     now = settings_now(bus)
     if changed := changed_settings(before, now):
-        raise WrongSetting(f"{changed} Torque has not been switched on. End that program, then start again.")
+        raise WrongSetting(f"{changed} Torque has not been switched on. Stop that program, then start again.")
     return now
 
 
@@ -303,7 +304,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if wire > 1 / rate:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms of wire time alone at "
-            f"{bus.port.baud} baud, {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud rate with `hil setup`."
+            f"{bus.port.baud} baud: {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud rate with `hil setup`."
         )
     slowest = bus.port.latency + wire
     if slowest <= 1 / rate:
@@ -312,14 +313,14 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if file is not None:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which allows "
-            f"at most {1 / slowest:.0f} Hz, and this user may not change it. Type: {command_to_set(file)}"
+            f"at most {1 / slowest:.0f} Hz. This user may not change it. Type: {command_to_set(file)}"
         )
     if bus.port.latency_measured:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: even the fastest of many replies arrives {bus.port.latency * 1e3:.0f} ms "
-            f"later than its transmission takes. This latency allows at most {1 / slowest:.0f} Hz. If other programs "
-            "keep this computer busy, close them and start again. Otherwise the adapter is slow: lower the rate, or "
-            "use a wired adapter with a short latency, such as a U2D2."
+            f"later than its transmission time explains. This latency allows at most {1 / slowest:.0f} Hz. If other "
+            "programs keep this computer busy, close them and start again. Otherwise the adapter is slow: lower the "
+            "rate, or use a wired adapter with a short latency, such as a U2D2."
         )
 
 

@@ -118,7 +118,7 @@ class StatusCheck:
         if self._is_foreign[joint]:
             return Cause.GOALS_LOST, (
                 f"does not hold the goals of this program: {held}, and it holds goals that this program never sent. "
-                "Another program commands it, or goals are changed on the way: end that program or unplug its "
+                "Another program commands it, or goals are changed on the way: stop that program or unplug its "
                 "controller; then check the adapter and the cable."
             )
         return Cause.GOALS_LOST, (
@@ -162,12 +162,12 @@ class StatusCheck:
                 return None
             if self._is_anothers(joint, offset, now):
                 return Cause.STALE, (
-                    "returns another servo's data: its reply carries the clock of another joint. Replies are mixed up: "
-                    "check the adapter, and that every servo has its own ID."
+                    "returns another servo's data: its reply carries the clock of another joint. Replies are mixed up. "
+                    "Check the adapter, and that every servo has its own ID."
                 )
             return Cause.STALE, (
                 f"returns stale data: by its own clock its reply is {1e3 * abs(ahead):.0f} ms off. Replies "
-                "are delayed in transit, or it was rebooted. Check the adapter, its latency and its cable."
+                "are delayed in transit, or the servo was rebooted. Check the adapter, its latency and its cable."
             )
         least = offset if ahead < drifted else behind + drifted
         self._clock[joint] = least, now, readings + 1, 0

@@ -229,7 +229,9 @@ class Stream:
             difference = repetition.difference
             differences.append(difference)
             if difference <= self._plan.settle_within:
-                self._note(f"{segment.role}: period {period} is settled, {difference:.2%} from the one before")
+                self._note(
+                    f"{segment.role}: period {period} is settled, {difference:.2%} different from the one before"
+                )
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
                     self._check_motion(repetition.moved)
@@ -240,7 +242,7 @@ class Stream:
         raise NotSettled(
             f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
             f"drifts: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
-            f"{self._plan.settle_within:.1%}, and {self._plan.drift_within:.1%} for slow drift. "
+            f"{self._plan.settle_within:.1%} ({self._plan.drift_within:.1%} if it drifts slowly). "
             + self._advice(differences, samples)
         )
 
@@ -248,7 +250,7 @@ class Stream:
         """What to do about periods of `samples` samples that differ from each other by `differences`."""
         further = periods_of_drift(differences, self._plan.settle_within)
         if further is None:
-            return "Check for backlash, a dragging cable or a slipping joint; or raise max_settling_periods."
+            return "Check for backlash, a dragging cable or a slipping joint, or raise max_settling_periods."
         seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
         return (
             f"The change decreases slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), "
@@ -299,7 +301,7 @@ class Stream:
                 self._note("balanced")
                 return
             state = self._play(self._silence(window), Phase.COMING_TO_REST)
-        self._note("not balanced: without torque, friction may not hold the arm upright")
+        self._note("the arm is not balanced: without torque, friction may not hold it upright")
 
     def _play(self, goals: NDArray[np.float64], phase: Phase, period: int = -1) -> State:
         """Send goal currents (samples, joints) [A], one row per tick; return the last state."""

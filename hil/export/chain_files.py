@@ -42,15 +42,15 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
         apart = joint.movable if share > 0.0 else ()
         merged = [name for name in joint.fixed if name not in apart]
         if merged:
-            comment(link, f"including {', '.join(merged)}, fixed to it and without separate inertia")
+            comment(link, f"including {', '.join(merged)}, which is fixed to it and has no inertia of its own")
             for name in merged:
                 _remove(links[name], "inertial")
         if apart:
-            comment(link, f"without {', '.join(apart)}, which held joints move: described, not identified")
+            comment(link, f"without {', '.join(apart)}, moved by held joints: given by the description, not identified")
         if share < 1.0:
             reduced.append(
-                f"{100 * share:.2g} % of the inertia that the description gives {', '.join(joint.movable)}: "
-                f"the full inertia would leave no possible body for {joint.link}"
+                f"the full inertia that the description gives {', '.join(joint.movable)}; the file has "
+                f"{100 * share:.2g} % of it, because more would leave no possible body for {joint.link}"
             )
             for name in apart:
                 _scale_inertial(links[name], share)

@@ -68,7 +68,7 @@ def export(run: Path, name: str, out: Path | None = None, link_length: float | N
         return Written(name, path, recording.write(Recorded.open(run), path))
     if name not in FORMATS:
         raise ExportError(
-            f"{name!r} is not a format of hil export. Possible: {', '.join((*FORMATS, *RECORDING_FORMATS))}."
+            f"{name!r} is not a format of hil export. Available: {', '.join((*FORMATS, *RECORDING_FORMATS))}."
             + _each_its_own(name)
         )
     arm = FORMATS[name]
@@ -82,7 +82,7 @@ def _not_its_own(run: Path, out: Path | None, default: str) -> Path:
     if path.parent.resolve() != run.resolve() or path.name not in RunFolder(run).own_files():
         return path
     if out is not None:
-        raise ExportError(f"{path} is one of the run's own files, which would be lost: choose another file name.")
+        raise ExportError(f"{path} is one of the run's own files and would be overwritten: choose another file name.")
     return run / f"identified_{default}"
 
 

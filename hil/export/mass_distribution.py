@@ -40,7 +40,7 @@ def distribute(model: ArmModel, link_length: float | None = None) -> tuple[LinkM
     """Links from the base outwards. Raises ExportError if no links of positive mass have these parameters."""
     p = model.values
     if len(model.joints) == 1:
-        _reject_length(link_length, "an arm with one joint has no elbow")
+        _reject_length(link_length, "an arm with one joint has no second link")
         moment = p["gravity_1"] / model.gravity if model.gravity else 0.0
         _positive("inertia_1", p["inertia_1"])
         return (_link(moment, p["inertia_1"], ROD, math.inf),)
@@ -79,7 +79,7 @@ def _share_of_rod(p: Mapping[str, float]) -> float:
     needed = p["coupling"] ** 2 / (p["inertia_1"] * p["inertia_2"])
     if needed >= 1:
         raise ExportError(
-            f"inertia_1 * inertia_2 = {p['inertia_1'] * p['inertia_2']:.4g} is not above coupling^2 = "
+            f"inertia_1 * inertia_2 = {p['inertia_1'] * p['inertia_2']:.4g} must be greater than coupling^2 = "
             f"{p['coupling'] ** 2:.4g} kg^2 m^4: no links of positive mass have such inertias. Check the residual in "
             "the report; excite more, or choose a richer [model] friction."
         )

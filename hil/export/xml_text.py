@@ -19,7 +19,8 @@ def comment(parent: ET.Element, text: str) -> None:
 def describe(root: ET.Element, model: ArmModel, left: list[str]) -> None:
     """Add comments at the top of the file about its origin and what it cannot represent."""
     comment(
-        root, f"Written by hil {__version__} from an identified arm. Angles are hil's: joint 1 from the horizontal."
+        root,
+        f"Written by hil {__version__} from an identified arm. Joint 1 is measured from the horizontal.",
     )
     comment(root, "One of many dynamically equivalent mass distributions; only their base parameters were identified:")
     for name, value in model.values.items():

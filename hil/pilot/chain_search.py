@@ -68,7 +68,7 @@ class Said:
         """Report the progress of simulations after every SILENT_S of silence."""
         which = f"{self._trying}, " if self._trying else ""
         self._after_silence(
-            f"Still looking for a motion safe for all arms: {which}{done} of {total} simulations of this one."
+            f"Still looking for a motion safe for all arms: {which}{done} of {total} simulations of this amplitude."
         )
 
     def designing(self, done: int, total: int) -> None:
@@ -97,8 +97,9 @@ class ChainSearch(SafeShares):
         said = Said(say)
         paths = Paths.of(config, belief.torque, tell=said.designing)
         said.say(
-            f"Designed a path that leaves the worst base parameter {100 * paths.identify.worst:.2g} % of its prior "
-            f"standard error (held-out path, with random phases: {100 * paths.held_out.worst:.2g} %)."
+            "Designed a path that reduces the standard error of every base parameter to "
+            f"{100 * paths.identify.worst:.2g} % of its prior value or less (held-out path, with random phases: "
+            f"{100 * paths.held_out.worst:.2g} %)."
         )
         return cls(
             *(config, belief, paths, said.say),
@@ -220,7 +221,7 @@ def _full(search: ChainSearch) -> str:
             return search.torque
         if number == tries:
             if isinstance(error, NotSettled | DidNotMove) and can_be_estimated(search.run.path):
-                search.say("The path to identify was recorded before; the estimate uses it without a second path.")
+                search.say("The first path had already been recorded; the estimate uses it without a second path.")
                 return search.torque
             raise error
         search.learn(config, search.run)

@@ -123,7 +123,7 @@ class SafeShares:
             if times is None:
                 break
             self.say(
-                f"No share of the designed path is safe for all arms: {why}. Trying another path, {number + 1} of "
+                f"No amplitude of the designed path is safe for all arms: {why}. Trying another path, {number + 1} of "
                 f"{OTHER_SEEDS}."
             )
             most = most / times
@@ -142,8 +142,8 @@ class SafeShares:
         if not self.is_exhausted:
             return ""
         return (
-            f" The search ended early, after {self.simulated / 3600.0:.0f} h of simulated motion: another "
-            "experiment.seed starts with other paths."
+            f" The search ended early, after {self.simulated / 3600.0:.0f} h of simulated motion: a different "
+            "experiment.seed starts from other paths."
         )
 
     def _helped_by_rate(self, config: Config, shares: tuple[float, ...]) -> str:
@@ -163,8 +163,8 @@ class SafeShares:
                 continue
             if replace(self, given=faster, paths=paths)._largest(faster, shares)[0] is not None:
                 return (
-                    f" At experiment.rate = {rate:g}, a motion is safe: at {experiment.rate:g} Hz, the stabiliser must "
-                    "be softer than these arms need, or its delay would make it oscillate."
+                    f" At experiment.rate = {rate:g}, a motion is safe. At {experiment.rate:g} Hz, delay makes a stiff "
+                    "stabiliser oscillate, and a softer one is too weak for these arms."
                 )
         return ""
 
@@ -219,7 +219,7 @@ class SafeShares:
         found, why, shortage = self._found(config, shares[0], f"amplitude 1 of at most {len(shares)}")
         if found is not None or len(shares) == 1:
             return found, why, shortage
-        last_why, last_shortage = self._unsafe(config, shares[-1], SEARCH_ARMS, "the least amplitude")[1:]
+        last_why, last_shortage = self._unsafe(config, shares[-1], SEARCH_ARMS, "the smallest amplitude")[1:]
         if last_why:
             return None, last_why, max(shortage, last_shortage)
         for number, share in enumerate(shares[1:], 2):
@@ -319,17 +319,16 @@ def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
     else:
         side = "lower" if QUANTITIES[row] == "lowest position" else "upper"
         helps.append(
-            f"a position_limit of {joint.name!r} whose {side} end is {wanted:.2f} rad, if the arm allows it, or a "
+            f"a position_limit of {joint.name!r} with its {side} end at {wanted:.2f} rad, if the arm allows it, or a "
             f"rest_pose {abs(wanted - limit):.2f} rad farther from that end"
         )
     torque = QUANTITIES.index("torque")
     if peaks.quantile[torque, at] > SATURATED * peaks.limits[torque, at]:
-        helps.append(f"a larger {joint.goal_limit_name} of {joint.name!r}, all of which some arms need")
+        helps.append(f"a larger {joint.goal_limit_name} of {joint.name!r}, since some arms need all of it")
     if has_room:
         spread = _spread(config)
         helps.append(
-            f"masses in the URDF that are known better ([arm.prior] spread = {share * spread:.2g} instead of "
-            f"{spread:g})"
+            f"more accurate masses in the URDF ([arm.prior] spread = {share * spread:.2g} instead of {spread:g})"
         )
     return f"What helps: {'; '.join(helps)}"
 

@@ -79,7 +79,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
             config = search.held
             plan = search.waves(config)
         before, found = found.peak_torque, search.amplitude(config, 1.0, plan)
-        say("Repeating with less torque." if (found.peak_torque < before).any() else "Repeating with other waves.")
+        say("Repeating with less torque." if (found.peak_torque < before).any() else "Repeating with another waveform.")
 
 
 def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -> Array:

@@ -339,7 +339,11 @@ class Search:
         raise ExperimentError(
             f"{_and(_names(self.config, fast))} exceeded the velocity limit while breaking away, before moving far "
             f"enough to be measured ({said}). More torque would only increase the speed: raise velocity_limit."
-            + (f" {_and(_names(self.config, held))} did not move with all the torque allowed." if held.any() else "")
+            + (
+                f" {_and(_names(self.config, held))} did not move even with all the allowed torque."
+                if held.any()
+                else ""
+            )
         )
 
     def _give_up(self, config: Config, still: list[str]) -> None:

@@ -190,7 +190,7 @@ def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
         if peak > TORQUE_SHARE * most:
             raise NoHeadroom(
                 f"{config.path}: joint_path: {joint.name!r} needs about {peak:.3g} N m for this path, more than "
-                f"{100 * TORQUE_SHARE:.0f} % of its {most:.3g} N m, which leaves too little margin for errors of the "
+                f"{100 * TORQUE_SHARE:.0f} % of its {most:.3g} N m. That leaves too little margin for errors of the "
                 f"described masses: lower joint_path.speed or swing, or raise its {joint.goal_limit_name}."
             )
 

@@ -93,8 +93,8 @@ def too_slow(config: Config) -> str:
             return (
                 f"experiment.rate = {rate:g} is too low for the stabiliser of joint {joint.name!r}: its torque is "
                 f"based on a state {1e3 * DELAY_SAMPLES / rate:.0f} ms old. A stiffness of {stiffness:g} N m/rad then "
-                f"drives oscillations like a damping of -{drives:.2g} N m s/rad; only {damps:.2g}, including "
-                f"friction, opposes it. At least {rate * drives / damps:.0f} Hz is needed; or lower "
+                f"acts like a damping of -{drives:.2g} N m s/rad, but the stabiliser and friction together damp with "
+                f"only {damps:.2g}. Raise the rate to at least {rate * drives / damps:.0f} Hz, lower "
                 "stabiliser.stiffness, or raise stabiliser.damping."
             )
     return ""

@@ -123,8 +123,8 @@ def _quantity(
     if bits is not None and notes is not None:
         values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)
         notes.append(
-            f"{table.source}: column {full!r} wraps at 2^{bits}: its registers were read as unsigned numbers, and are "
-            "taken as signed ones here."
+            f"{table.source}: column {full!r} wraps at 2^{bits}: its registers were read as unsigned numbers; here "
+            "they are interpreted as signed."
         )
     if unit == TICKS and not ticks:
         raise CsvError(

@@ -59,7 +59,7 @@ def guessed(table: Table, columns: Columns) -> Columns:
         return Columns.model_validate(columns.model_dump(exclude_none=True) | found)
     except ValueError as error:
         said = str(error).split("Value error, ")[-1].split(" [type=")[0]
-        raise CsvError(f"{table.source}: {said}. Set [columns] in --config ARM.toml, config= in Python.") from error
+        raise CsvError(f"{table.source}: {said}. Set [columns] in --config ARM.toml (in Python: config=).") from error
 
 
 def said(columns: Columns, table: Table) -> str:

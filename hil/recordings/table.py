@@ -60,7 +60,7 @@ class Table:
         near = get_close_matches(name, [*self.columns, *bare], 1)
         meant = f" Did you mean {near[0]!r}?" if near else ""
         raise CsvError(
-            f"{self.source} has no column {name!r}; it has {self.listed()}.{meant} Set [columns] in the TOML."
+            f"{self.source} has no column {name!r}; it has {self.listed()}.{meant} Set [columns] in the TOML file."
         )
 
     def listed(self) -> str:

@@ -39,7 +39,7 @@ def _in_space(found: ChainDryRun) -> SpatialMotion | None:
         return None
     closest = int(np.argmin(found.foreseen.rooms[: len(motions)]))
     said = (
-        f"Of {len(motions)} simulated arms, the one with the least clearance: from the rest pose to the path, "
+        f"The simulated arm with the least clearance, out of {len(motions)}. It moves from the rest pose to the path, "
         "twice along it, and back."
     )
     ways = found.foreseen.ways

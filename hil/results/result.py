@@ -154,7 +154,7 @@ def result_from_json(value: Mapping[str, Any]) -> Result:
     found = from_json(kind, value)
     missing = [name for name in found.covariance.names if name not in found.quantities]
     if missing:
-        raise FormError(f"has {missing[0]!r} in its covariance, which is not a parameter")
+        raise FormError(f"has {missing[0]!r} in its covariance, but no such parameter")
     for row, (name, entries) in enumerate(zip(found.covariance.names, found.covariance.matrix, strict=False)):
         if any(variance < 0.0 for variance in entries[row : row + 1]):
             raise FormError(f"has a negative variance of {name!r} in its covariance")

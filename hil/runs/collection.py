@@ -95,8 +95,7 @@ def _no_run(path: Path) -> RunFolderError:
     if path.is_dir() and (steps := steps_of(path)):
         return RunFolderError(only_steps(path, steps))
     return RunFolderError(
-        f"{path} is not a run folder: it has neither run.json nor samples.npy. List those that you have: "
-        f"{command('runs')}"
+        f"{path} is not a run folder: it has neither run.json nor samples.npy. To list existing runs: {command('runs')}"
     )
 
 

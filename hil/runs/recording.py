@@ -253,7 +253,7 @@ def load_samples(path: Path, joints: int) -> NDArray[np.void]:
         count = samples.dtype["position"].shape if "position" in (samples.dtype.names or ()) else ()
         if count and count != (joints,):
             raise RunFolderError(
-                f"{path} and config.toml beside it are from different runs, with {count[0]} and {joints} joints."
+                f"{path} and the config.toml next to it are from different runs: {count[0]} and {joints} joints."
             )
         raise RunFolderError(f"{path} is not a recording by this version of hil: its columns differ.")
     recorded: NDArray[np.void] = samples[samples["phase"] != Phase.NOT_RECORDED]

@@ -166,7 +166,7 @@ class RunFolder:
         for needed in (run.config_path, run.run_path, run.samples_path):
             if not needed.is_file():
                 raise RunFolderError(
-                    f"{path} is not a run folder: it has no {needed.name}. List those that you have: {command('runs')}"
+                    f"{path} is not a run folder: it has no {needed.name}. To list existing runs: {command('runs')}"
                 )
         return run
 

@@ -83,7 +83,7 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
     said = f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."
     if (swapped := _swapped(before, after)) is not None:
         first, second = swapped
-        said += f" {first.title} has what {second} had: their IDs may have been swapped."
+        said += f" {first.title} now has what {second} had: their IDs may have been swapped."
     return said
 
 
@@ -111,8 +111,8 @@ def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago
     changed = {each[1] for each, value in before.items() if after.get(each, value) != value}
     if changed != {_MODE} or cause not in _AT_A_LIMIT or modes_seen_ago > _MODES_SEEN_S:
         return ""
-    last = f"{1e3 * modes_seen_ago:.0f} ms before it, the modes still were those that had been set"
-    return f"{changed_settings(before, after)} This may have come after the stop: {last}."
+    last = f"{1e3 * modes_seen_ago:.0f} ms before it, every mode was still the one that had been set"
+    return f"{changed_settings(before, after)} This may have happened after the stop: {last}."
 
 
 def _may_explain(register: str, cause: Cause | None) -> bool:

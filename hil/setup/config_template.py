@@ -96,7 +96,7 @@ def arm_toml(arm: ArmAnswers) -> str:
         _line("period = 10.0", "s"),
         _line(f"band = [0.1, {min(5.0, rate / 20):.1f}]", "Hz: its lines are assigned to the joints in turn"),
         _line("pilot = true", "find the torque: start small, then raise it to the limits"),
-        _line("ramp = 1.0", "s, at start and end"),
+        _line("ramp = 1.0", "s, torque ramp at start and end"),
         "seed = 1",
     ]
     model = [

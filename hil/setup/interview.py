@@ -101,7 +101,7 @@ def _one_baud(heard: Sequence[Heard]) -> tuple[int, list[Found]]:
     if len(usable) > 1:
         found = "; ".join(f"{baud}: ID {', '.join(str(one.id) for one in servos)}" for baud, servos in usable.items())
         raise ExperimentError(
-            f"Servos answer at more than one baud ({found}). Set them all to the same rate with hil setup."
+            f"Servos answer at more than one baud rate ({found}). Set them all to the same rate with hil setup."
         )
     return next(iter(usable.items()))
 
@@ -123,10 +123,10 @@ def _say_who_is_left_out(others: Sequence[Found], say: Say) -> None:
     if others:
         ids = ", ".join(str(found.id) for found in others)
         say(
-            f"LEFT OUT: ID {ids}. hil init describes planar arms of one or two joints; the others are neither read nor "
-            "moved, so hold or fix their joints. An arm of more joints, or one that is not planar, needs its URDF or "
-            "MJCF: copy configs/open_manipulator_x.toml, name the description in [arm] urdf, then type: hil pose "
-            "YOUR_FILE.toml"
+            f"LEFT OUT: ID {ids}. hil init describes planar arms of one or two joints; the other servos are neither "
+            "read nor moved, so hold or fix their joints. An arm of more joints, or one that is not planar, needs its "
+            "URDF or MJCF: copy configs/open_manipulator_x.toml, name the description in [arm] urdf, then type: hil "
+            "pose YOUR_FILE.toml"
         )
 
 

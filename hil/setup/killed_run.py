@@ -51,7 +51,7 @@ class Left:
         named = " and ".join(
             f"its {name} is {value} and was {self.kept.settings[name]}" for name, value in self.changed.items()
         )
-        cut = ", and its Goal Current is not restored beyond it" if _CURRENT_LIMIT in self.changed else ""
+        cut = ", and its Goal Current is restored only up to this limit" if _CURRENT_LIMIT in self.changed else ""
         return (
             f"{named} before the run of {self.kept.since}. Another program changed this during that run or since, so "
             f"it is left as it is{cut}. To change it back, use DYNAMIXEL Wizard 2.0."

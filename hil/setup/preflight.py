@@ -89,7 +89,7 @@ def _torque_of_pilot(config: Config) -> Iterator[Finding]:
     if config.experiment.pilot and config.experiment.peak_torque is not None:
         fix = (
             "`hil identify` ignores peak_torque: the pilot finds the torque, up to current_limit or voltage_limit. "
-            "Remove peak_torque; or set pilot = false to use it."
+            "Remove peak_torque, or set pilot = false to use it."
         )
         yield Finding(Level.WARNING, "experiment", "torque", "pilot = true takes precedence over peak_torque", fix)
     if not (config.is_chain or config.experiment.pilot) and config.experiment.peak_torque is None:
@@ -110,7 +110,7 @@ def _path(config: Config) -> Iterator[Finding]:
         yield Finding(Level.STOP, "experiment", "path", "refused", str(error))
     else:
         yield Finding(
-            Level.OK, "experiment", "path", "within the limits of torque" + ("" if config.is_fake else ", clear")
+            Level.OK, "experiment", "path", "within the torque limits" + ("" if config.is_fake else ", clear")
         )
 
 
@@ -250,7 +250,7 @@ def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, 
 
 def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     torque = servo.read("Torque Enable")
-    fix = "Another program drives it: stop that program first; or power-cycle it."
+    fix = "Another program drives it: stop that program first, or power-cycle the servo."
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
 
 
@@ -300,7 +300,9 @@ def _return_delay(config: Config, joint_config: JointConfig, _joint: Joint, serv
 def _baud(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     value = servo.read("Baud Rate")
     found = str(BAUD_RATES[value]) if value < len(BAUD_RATES) else f"unknown value {value}"
-    fix = f"Slow. Type: hil setup {_port(config)} --id {joint_config.id} --new-baud 1000000; then port.baud = 1000000"
+    fix = (
+        f"Slow. Type: hil setup {_port(config)} --id {joint_config.id} --new-baud 1000000; then set port.baud = 1000000"
+    )
     return _graded(config.port.baud >= 1_000_000, "baud", found, fix, Level.WARNING)
 
 
@@ -329,7 +331,7 @@ def _pwm_limit(_config: Config, joint_config: JointConfig, joint: Joint, servo: 
     needed = share * joint.servo.resistance if joint.mode is Mode.CURRENT else share
     found = f"{pwm} of {FULL_PWM_TICKS}, {volts:.1f} V at this supply"
     fix = (
-        f"It limits the voltage in every mode. The limit of {joint_config.goal_limit:g} needs {needed:.1f} V at "
+        f"It limits the voltage in every mode. current_limit = {joint_config.goal_limit:g} needs {needed:.1f} V at "
         "rest and more at speed: raise PWM Limit with DYNAMIXEL Wizard 2.0, or lower current_limit."
     )
     if volts < needed:
@@ -378,7 +380,7 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     angle = within_limits(joint.within_turn(ticks).angle(ticks), config.joints[index].position_limit)
     rest = config.arm.rest_pose[index]
     zero = joint.zero_ticks + round((angle - rest) / joint.position_unit)
-    fix = f"arm.rest_pose is {rest:.3f} rad, arm.rest_tolerance allows {config.rest_tolerance:g}. " + rest_pose_hint(
+    fix = f"arm.rest_pose is {rest:.3f} rad; arm.rest_tolerance allows {config.rest_tolerance:g}. " + rest_pose_hint(
         angle, rest, config.rest_tolerance, zero
     )
     return _graded(abs(angle - rest) <= config.rest_tolerance, "pose", f"{angle:+.3f} rad", fix)

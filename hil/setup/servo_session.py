@@ -224,7 +224,7 @@ class ServoSession:
             if now != before:
                 yield (
                     f"{joint.title}: {_DELAY} was changed meanwhile from {2 * before} to {2 * now} us, by another "
-                    "program or a factory reset, which changes other settings too. To set it: "
+                    "program or a factory reset, which changes other settings too. To restore it: "
                     f"hil setup {self.bus.port.url} --id {joint.id} --return-delay-us {2 * before}"
                 )
 
@@ -372,7 +372,7 @@ def _about_torque(bus: ServoBus) -> str:
         return f"This command has not switched torque on; whether it is off could not be read: {error}"
     if on:
         return f"TORQUE IS ON at {' and '.join(on)}: it was on before this command."
-    return "Torque is off on all servos, read back; this command has not switched it on."
+    return "Torque is off on all servos, confirmed by reading it back; this command has not switched it on."
 
 
 def has_moved() -> bool:

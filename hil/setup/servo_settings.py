@@ -120,7 +120,9 @@ def _set_id(servo: Servo, confirm: Confirm, new_id: int) -> tuple[Change, Servo]
 def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
     name, port, former = "Baud Rate", servo.port, servo.port.baud
     before, after = servo.read(name), BAUD_RATES.index(baud)
-    question = f"{servo.title}: change its baud from {former} to {baud}? All servos on a bus must use the same one."
+    question = (
+        f"{servo.title}: change its baud rate from {former} to {baud}? All servos on a bus must use the same one."
+    )
     if before == after:
         return Change(name, before, after, False)
     # First check that the adapter supports this rate: otherwise the servo would become unreachable.

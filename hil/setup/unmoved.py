@@ -40,8 +40,9 @@ def refuse_moved(before: Lies, now: Lies) -> None:
         if abs(turned) > MOST_RAD:
             raise ExperimentError(
                 f"{drive.title} has turned by {turned:+.3f} rad since this command first read it, before torque was "
-                f"switched on; at most {MOST_RAD} is allowed. Let the arm come to rest, then start again; check "
-                "whether a hand or a cable pushes or holds it, its horn slips, or another program changes its settings."
+                f"switched on; at most {MOST_RAD} is allowed. Let the arm come to rest, then start again. Check "
+                "whether a hand or a cable pushes or holds it, whether its horn slips, and whether another program "
+                "changes its settings."
             )
 
 

@@ -53,8 +53,8 @@ def arm_toml(study: Study, run: int) -> str:
             put(values, key, value)
         except KeyError as error:
             raise ConfigError(
-                f'{study.path}: vary."{key}": {arm_path(study).name} has no {error.args[0]!r} there. Keys are those of '
-                'the arm\'s TOML, list entries by number from 0, as in "fake.arm.drives.0.coulomb".'
+                f'{study.path}: vary."{key}": {arm_path(study).name} has no {error.args[0]!r} there. Use the keys of '
+                'the arm\'s TOML, with list entries numbered from 0, as in "fake.arm.drives.0.coulomb".'
             ) from None
     return tomli_w.dumps(values)
 

@@ -112,7 +112,7 @@ def _local(count: int, memory: str) -> Any:
     except RuntimeError as error:
         raise ConfigError(
             f"The workers did not start ({error}). A script must start them under `if __name__ == "
-            '"__main__":`, since each worker imports it; if memory is short, ask for fewer (--workers).'
+            '"__main__":`, since each worker imports it; if memory is short, request fewer workers (--workers).'
         ) from error
 
 
@@ -147,7 +147,7 @@ def _check_versions(client: "Client", scheduler: str | None) -> None:
     try:
         client.wait_for_workers(1, timeout=600 if scheduler == "slurm" else 60)
     except TimeoutError as error:
-        raise ConfigError(f"The scheduler {scheduler or 'on this machine'} has no worker.") from error
+        raise ConfigError(f"The scheduler {scheduler or 'on this machine'} has no workers.") from error
     here = versions()
     try:
         everywhere = client.run(versions)

@@ -80,7 +80,7 @@ def _hold(lock: int, out: Path) -> None:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        raise RunFolderError(f"Another process is working on the study in {out}: wait for it, or end it.") from error
+        raise RunFolderError(f"Another process is working on the study in {out}: wait for it, or stop it.") from error
 
 
 def _about(study: Study, runs: int) -> dict[str, Any]:

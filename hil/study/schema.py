@@ -87,7 +87,9 @@ class StudyTable(_Table):
 
     task: Task = Field(description="what one run does")
     config: str | None = Field(None, min_length=1, description="the arm's TOML or a bundled arm's name")
-    recordings: str | None = Field(None, min_length=1, description="for estimate: the folder of run folders")
+    recordings: str | None = Field(
+        None, min_length=1, description="for estimate: the folder that holds the run folders"
+    )
     runs: int | None = Field(
         None, ge=1, le=MOST_RUNS, description="number of rows; default: every combination of the lists"
     )

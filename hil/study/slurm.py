@@ -32,7 +32,9 @@ def slurm_cluster(count: int, memory: str, environment: Mapping[str, str]) -> It
     except ImportError as error:
         raise MissingExtra("--scheduler slurm needs dask-jobqueue: pip install 'hil[slurm]'.") from error
     if shutil.which("sbatch") is None:
-        raise ConfigError("--scheduler slurm: there is no sbatch here. Start the study where Slurm jobs are submitted.")
+        raise ConfigError(
+            "--scheduler slurm: sbatch was not found. Start the study on a machine that submits Slurm jobs."
+        )
     answers: list[str | None] = []
 
     class Job(SLURMJob):  # type: ignore[misc]

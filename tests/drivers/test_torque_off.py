@@ -119,8 +119,8 @@ def test_watchdogs_are_switched_off_whatever_fails() -> None:
 
 def test_what_is_said_of_one_servo_of_two_and_of_those_without_a_watchdog() -> None:
     first, second = JOINTS
-    assert str(TorqueOff((first,), ())) == "Torque is off on the servo, read back."
-    assert str(TorqueOff((first, second), ())) == "Torque is off on both servos, read back."
+    assert str(TorqueOff((first,), ())) == "Torque is off on the servo, confirmed by reading it back."
+    assert str(TorqueOff((first, second), ())) == "Torque is off on both servos, confirmed by reading it back."
     watched = str(TorqueOff((first,), ((second, "It is silent."),), frozenset((first,))))
     assert (
         "NOT CONFIRMED for JOINT 'B' (ID 2, XM430-W350). It is silent." in watched and "Bus Watchdog stops" in watched

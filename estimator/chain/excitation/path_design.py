@@ -92,7 +92,7 @@ class PathDesigner:
                 "harmonics below an eighth of the rate"
             )
         if (limits.low >= limits.high).any():
-            raise ExcitationError("no range of position is left for a path")
+            raise ExcitationError("no position range is left for a path")
         self._base, self._prior, self._limits, self._friction = base, prior, limits, friction
         self._samples, self._period = round(rate * period), period
         few = min(LOOKED_AT, self._samples)

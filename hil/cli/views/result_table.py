@@ -59,7 +59,7 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
         compared = (
             "the simplest model"
             if choice.chosen == choice.plainest
-            else f"whose error is {_times(_inverse(choice.error_divided_by))} compared with the simplest model's"
+            else f"whose error, compared with the simplest model's, is {_times(_inverse(choice.error_divided_by))}"
         )
         print(f"Chosen on held-out segments: {choice.chosen}, {compared}.")
     if result.physical is not None:
@@ -160,8 +160,8 @@ def _choice(result: SettledResult) -> list[str]:
         return [f"Model chosen from {among}: {choice.chosen}, the one with the fewest parameters."]
     if choice.error_divided_by <= 1.0 + _ALIKE:
         return [
-            f"Model chosen from {among}: {choice.chosen}. It predicts about as well as {choice.plainest}, but what it "
-            "adds is significant in the fitted motion."
+            f"Model chosen from {among}: {choice.chosen}. It predicts about as well as {choice.plainest}, but its "
+            "additional terms are significant in the fitted motion."
         ]
     smaller = f"its prediction error is {_times(_inverse(choice.error_divided_by))}"
     wider = "" if cost is None else f" and its standard errors are {_times(cost)}"

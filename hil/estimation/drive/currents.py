@@ -103,7 +103,7 @@ def _other(name: str, goal: Array, measured: Array) -> str:
     if part > OFTEN and _follows_small_goals(goal, measured) < SHORT:
         return (
             f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
-            f"high-torque samples, and as little at low torque, where nothing clips it: {why}"
+            f"high-torque samples, and equally little at low torque, where nothing clips it: {why}"
         )
     return ""
 
@@ -115,8 +115,8 @@ def _clipped(name: str, goal: Array, measured: Array, lower: str) -> str:
         return ""
     return (
         f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
-        "high-torque samples: the servo's own current limit or, at speed, the supply voltage clips it, if the reading "
-        f"is right; lower {lower} or raise the supply voltage."
+        "high-torque samples. If the reading is right, the servo's own current limit clips it or, at speed, the supply "
+        f"voltage does: lower {lower} or raise the supply voltage."
     )
 
 

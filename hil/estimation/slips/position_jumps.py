@@ -33,8 +33,8 @@ def jump_warnings(config: Config, facts: RunFacts, samples: NDArray[np.void]) ->
         found.append(
             f"{config.joints[index].name}: the position jumped by {size:+.3f} rad "
             f"({abs(size) / facts.position_step[index]:.0f} encoder steps) at {time:.2f} s{others}, which the velocity "
-            "before and after does not explain: everything after it is shifted. Check the horn's screws, the encoder's "
-            "magnet and the cable, then record again."
+            "before and after does not explain: all later positions are shifted. Check the horn's screws, the "
+            "encoder's magnet and the cable, then record again."
         )
     return found
 
@@ -51,7 +51,7 @@ def jump_disturbances(config: Config, facts: RunFacts, samples: NDArray[np.void]
         return ()
     return (
         f"The position of {' and '.join(names)} jumped during the recording (see the warning), so angles before and "
-        "after the jump do not belong together: the values may be wrong by more than their standard errors.",
+        "after the jump are inconsistent: the values may be wrong by more than their standard errors.",
     )
 
 

@@ -25,8 +25,8 @@ def causes(
 
 def _clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return tuple(
-        f"The torque of joint {each.joint} seems to have been limited to about {each.level:.3g} N m, which its column "
-        f"exceeds in {100 * each.beyond:.2g} % of the samples: with this limit, inverse dynamics leaves "
+        f"The torque of joint {each.joint} seems to have been limited to about {each.level:.3g} N m; its column "
+        f"exceeds that in {100 * each.beyond:.2g} % of the samples. With this limit, inverse dynamics leaves "
         f"{100 * each.residual:.2g} % of the torque unexplained instead of {100 * each.residual_given:.2g} %. A "
         "current limit or the supply voltage clips it (saturation): use the measured current, or smaller commands."
         for each in suspect_clipped(recordings)
@@ -41,5 +41,5 @@ def _drifting(recordings: Sequence[Recording]) -> tuple[str, ...]:
         f"The delay of the torque drifts from {1e3 * drift.start:+.3g} ms to {1e3 * drift.end:+.3g} ms in the course "
         f"of the recording ({1e6 * drift.relative:+.0f} ppm): with this drift, inverse dynamics leaves "
         f"{100 * drift.residual:.2g} % of the torque unexplained instead of {100 * drift.residual_given:.2g} %. Torque "
-        "and position have times of different clocks: correct one of them, or log both with the same clock.",
+        "and position were timed by different clocks: correct the times of one, or log both with the same clock.",
     )

@@ -118,7 +118,7 @@ def _described(config: RecordingConfig, joints: int) -> ArmDescription:
             "columns.position, add a [[joints]] table with that joint's name, in order from the base outwards."
         )
     if len(names) != joints:
-        raise ConfigError(f"{len(names)} [[joints]], but {joints} columns of positions: give one per joint.")
+        raise ConfigError(f"{len(names)} [[joints]], but {joints} position columns: give one per joint.")
     try:
         return read_arm(Path(config.arm.urdf), names)
     except ArmFileError as error:
@@ -172,10 +172,10 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         if found.systematic > SYSTEMATIC:
             trust = "with care"
             sentences.append(
-                "Part of the residual repeats with the motion, which increases standard errors by up to "
-                f"{found.systematic:.1f} times, and some values may be wrong by more than these indicate. An effect is "
-                "missing from the model: torque ripple or cogging, play or elasticity of the gears, a cable, friction "
-                "that depends on load or changes with time, or torques that differed from the commands."
+                "Part of the residual repeats with the motion. This increases standard errors by a factor of up to "
+                f"{found.systematic:.1f}, and some values may be wrong by more than their standard errors. An effect "
+                "is missing from the model: torque ripple or cogging, play or elasticity of the gears, a cable, "
+                "friction that depends on load or changes with time, or torques that differed from the commands."
             )
     else:
         trust = "with care"
@@ -190,7 +190,8 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         error, joint = float(foretold.max()), arm.joints[int(np.argmax(foretold))].name
         part = f"the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
         sentences.append(
-            f"Fitted to the rest, the torque on {part} is predicted to {100 * error:.1f} %, {joint} worst."
+            f"Fitted to the rest, the model predicts the torque on {part} to within {100 * error:.1f} % ({joint} "
+            "worst)."
         )
         trust = "no" if error > TORQUE_WRONG else "with care" if error > TORQUE_FORETOLD else trust
     if found.from_prior:
@@ -218,7 +219,7 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         trust = lowered(trust, "with care")
         sentences.append(
             "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
-            "the remaining distance. Record faster motion, so that fewer joints stick."
+            "the remaining distance to it. Record faster motion, so that fewer joints stick."
         )
     return Verdict(trust, weakest, tuple(sentences))
 

@@ -39,8 +39,8 @@ log = logging.getLogger(__name__)
 START_CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the inverse dynamics that start the likelihood: the first that can be used
 START_WIDTH = 0.05  # rad/s
 JUMPED = (
-    "A position jumped (see the warnings), so angles before and after the jump do not belong together: use only the "
-    "part before or after it, or put each part in a file of its own."
+    "A position jumped (see the warnings), so angles before and after the jump are inconsistent: use only the part "
+    "before or after it, or put each part in a file of its own."
 )
 NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 

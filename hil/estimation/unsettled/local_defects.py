@@ -118,8 +118,8 @@ def _constant(time: Array, values: Array) -> list[slice]:
 def _frozen(joint: _Joint) -> list[str]:
     return [
         f"The position of {joint.name} stays at {joint.position[part.start]:.4g} rad {_from_to(joint.time, part)}, "
-        "where the rest of the recording says that the joint should move: a frozen reading, or something held it. "
-        "Leave that part out."
+        "although the rest of the recording says that the joint should move: the reading was frozen, or something held "
+        "the joint. Leave that part out."
         for part in _constant(joint.time, joint.position)
         if joint.is_unexplained(part)
     ]
@@ -184,8 +184,8 @@ def _stop(joint: _Joint) -> list[str]:
             continue
         found.append(
             f"{joint.name[0].upper()}{joint.name[1:]} rebounds at {place:.4g} rad {at.size} times, {_at(time[at])}, "
-            "and never gets beyond: it hits a stop or an object there, which no model includes. Use the part before, "
-            "or record motion that stays away from it."
+            "and never moves past it: it hits a stop or an object there, which no model includes. Use the part before "
+            "the first impact, or record motion that stays clear of it."
         )
     return found
 
@@ -200,8 +200,8 @@ def _windows(joint: _Joint, window: float) -> list[str]:
     more = f" and {len(groups) - SHOWN} more" if len(groups) > SHOWN else ""
     times = float(levels[bad].max()) / max(joint.usual, 1e-12)
     return [
-        f"The residual of {joint.name} is up to {times:.0f} times the usual one in {parts}{more}: something else acted "
-        "on the arm there, or the recording is wrong. Look at that part, or leave it out."
+        f"The residual of {joint.name} is up to {times:.0f} times its usual value in {parts}{more}: something else "
+        "acted on the arm there, or the recording is wrong. Look at that part, or leave it out."
     ]
 
 

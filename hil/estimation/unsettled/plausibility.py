@@ -38,8 +38,8 @@ def undetermined(estimate: ShootingEstimate) -> list[str]:
     if not found:
         return []
     return [
-        f"Not determined by this motion: {', '.join(found)}. They describe friction near standstill only together "
-        "with the other parameters; do not use them alone."
+        f"Not determined by this motion: {', '.join(found)}. They describe friction near standstill only in "
+        "combination with the other parameters; do not use them alone."
     ]
 
 
@@ -70,8 +70,8 @@ def _pendulum(estimate: ShootingEstimate, gravity: float) -> list[str]:
     if PENDULUM[0] < length < PENDULUM[1]:
         return []
     return [
-        f"Inertia and weight of joint 1 are those of a pendulum of {length:.2g} m: check the units of time and angle, "
-        "and arm.gravity."
+        f"Inertia and weight of joint 1 are those of a pendulum {length:.2g} m long: check the units of time and "
+        "angle, and arm.gravity."
     ]
 
 
@@ -80,7 +80,7 @@ def _weight(estimate: ShootingEstimate, gravity: float) -> list[str]:
     for name, value, std in zip(estimate.names, estimate.value, estimate.std, strict=True):
         if kind_of(name) == "gravity" and gravity > 0.0 and value < -SURE * std:
             found.append(
-                f"{name} is {value:.3g} N m, negative: the angle is measured from the other side (columns.zero), or a "
+                f"{name} is {value:.3g} N m, negative: the angle's zero is half a turn off (columns.zero), or a "
                 "sign is reversed."
             )
     return found

@@ -129,8 +129,8 @@ def _zeroed(read: _Read, gravity: float) -> _Read:
     moved = tuple(replace(each, position=each.position + zeros[:, None]) for each in read.recordings)
     listed = ", ".join(f"{zero:.4g}" for zero in zeros)
     said = (
-        f"According to gravity, joint 1 is not measured from the horizontal: zero = [{listed}] rad was added. If that "
-        "is wrong, set columns.zero."
+        f"The torque of gravity shows that joint 1 is not measured from the horizontal: zero = [{listed}] rad was "
+        "added. If that is wrong, set columns.zero."
     )
     columns = read.columns.model_copy(update={"zero": zeros.tolist()})
     return replace(read, recordings=moved, columns=columns, notes=(*read.notes, said))

@@ -32,8 +32,8 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
     swapped = suspect_swapped(recordings)
     if swapped is not None and _is_clear(*swapped):
         raise CsvError(
-            f"{source}: the torque columns of joints 1 and 2 seem to be swapped: exchanged, {_unexplained(*swapped)}. "
-            "Exchange them in the file, or in [columns] of --config ARM.toml."
+            f"{source}: the torque columns of joints 1 and 2 seem to be swapped: with them exchanged, "
+            f"{_unexplained(*swapped)}. Exchange them in the file, or in [columns] of --config ARM.toml."
         )
     signs = suspect_signs(recordings)
     if signs is None:

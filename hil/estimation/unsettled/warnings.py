@@ -96,8 +96,8 @@ def _flat(recordings: Sequence[Recording], joint: int, name: str, unexplained: b
         at_most = float(np.mean(size > 0.9999 * size.max()))
         if (each.between == "linear" or unexplained) and FLAT < at_most < 0.9:
             return [
-                f"{name}: its torque stays at {size.max():.3g} N m in {100 * at_most:.0f} % of the samples: if the "
-                "current was clipped, use the measured current, or use less torque."
+                f"{name}: its torque stays at {size.max():.3g} N m in {100 * at_most:.0f} % of the samples. If the "
+                "current was clipped, use the measured current, or record with less torque."
             ]
     return []
 

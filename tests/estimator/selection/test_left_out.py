@@ -53,7 +53,7 @@ def test_what_is_missing_is_named_with_its_evidence(
     assert seen[part].evidence > 1.0
     verdict = judge(estimate, validate(period, estimate), Evidence(candidates=found))
     assert verdict.trust != "yes"
-    assert "It looks most like" in verdict.sentences[0] and 'friction = "auto"' in verdict.sentences[0]
+    assert "The residual looks most like" in verdict.sentences[0] and 'friction = "auto"' in verdict.sentences[0]
     tried = judge(estimate, validate(period, estimate), Evidence(candidates=found, tried_all=True))
     assert '"auto"' not in " ".join(tried.sentences)
 
@@ -198,6 +198,6 @@ def test_a_prediction_that_takes_friction_from_the_held_out_motion_says_so(ideal
     evidence = Evidence(held_out=np.array([0.001, 0.002]), held_out_as_fitted=np.array([0.03, 0.001]))
     verdict = judge(estimate, validation, evidence)
     (said,) = [each for each in verdict.sentences if "held-out" in each]
-    assert "0.2 %" in said and "from that motion itself" in said
-    assert "as it was in the fitted motion, to within 3 %" in said
+    assert "0.2 %" in said and "taken from that motion" in said
+    assert "With friction as in the fitted motion, it predicts that motion to within 3 %" in said
     assert verdict.trust == "yes"

@@ -40,7 +40,7 @@ def test_doubts_are_told_before_anything_moves(
         raise ExperimentError(told[0].message)
 
     monkeypatch.setattr(experiment, "run_experiment", move)
-    with pytest.raises(ExperimentError, match=r"Warning: current_limit of joint .* it probably would not move"):
+    with pytest.raises(ExperimentError, match=r"Warning: current_limit of joint .* The joint probably would not move"):
         start(tmp_path / "arm.toml", out=tmp_path / "run", on_progress=told.append)
     assert not (tmp_path / "run").exists()
 
@@ -51,11 +51,13 @@ def test_a_hint_that_fails_leaves_the_stop_as_it_is(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(experiment, "_how_to_go_on", fail)
     stop = SafetyStop("It has lost its torque.", Cause.TORQUE_OFF)
-    stop.add_note("Torque is off on both servos, read back.")
+    stop.add_note("Torque is off on both servos, confirmed by reading it back.")
     run, arm = _Run(), Path("arm.toml")
     with pytest.raises(SafetyStop) as caught, experiment._discarding(run, "identify", arm):  # type: ignore[arg-type]
         raise stop
-    assert caught.value is stop and caught.value.__notes__ == ["Torque is off on both servos, read back."]
+    assert caught.value is stop and caught.value.__notes__ == [
+        "Torque is off on both servos, confirmed by reading it back."
+    ]
 
 
 def test_a_recording_that_the_estimator_refuses_cannot_be_estimated(monkeypatch: pytest.MonkeyPatch) -> None:

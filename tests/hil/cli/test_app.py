@@ -129,7 +129,7 @@ def test_a_failure_is_one_message_and_an_exit_code(
     assert "Traceback" not in printed.err
     assert printed.out == ""
     if "outside" in said:
-        assert "Torque is off on both servos, read back." in printed.err
+        assert "Torque is off on both servos, confirmed by reading it back." in printed.err
         assert printed.err.splitlines()[-1].startswith("Next: hil check "), "the last line is what to type next"
 
 
@@ -187,7 +187,7 @@ def test_sigterm_ends_in_a_message_and_exit_code_143(arm_file: ArmFile, tmp_path
         message = process.stderr.read()
         assert process.wait() == 143
     assert "Stopped by SIGTERM." in message
-    assert "Torque is off on both servos, read back." in message
+    assert "Torque is off on both servos, confirmed by reading it back." in message
     assert "Traceback" not in message
 
 

@@ -58,7 +58,7 @@ def test_every_ready_file_is_right(path: Path) -> None:
         (
             "zero_ticks = 2048",
             "zero_ticks = [2048, 1902]",
-            r"zero_ticks = \[2048, 1902\]: .* for two servos, the first",
+            r"zero_ticks = \[2048, 1902\]: .* for two servos, give the first",
         ),
         ("[-4.2, 1.06]", "[-1.2, 1.06]", r"arm\.rest_pose: -1\.5708 rad for joint 'shoulder' is outside"),
         ("[0.80, 0.42]", "[0.80]", r"experiment\.peak_torque has 1 entries; it needs 2"),

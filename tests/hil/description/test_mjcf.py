@@ -61,7 +61,7 @@ def test_physics_that_is_not_modelled_is_named(tmp_path: Path, old: str, new: st
     [
         ("9.81 0 0", [0.0, 0.0, 0.0], "set base = [0.0, 1.5708, 0.0] and gravity = 9.81 under [arm]"),
         ("9.81 0 0", [0.0, 1.5708, 0.0], ""),
-        ("0 0 0", [0.0, 0.0, 0.0], "weightless"),
+        ("0 0 0", [0.0, 0.0, 0.0], "sets gravity to zero"),
         ("0 0 -9.81", [0.0, 1.0, 0.0], ""),  # MuJoCo's default, which says nothing about the arm
     ],
 )

@@ -9,7 +9,7 @@ from hil.plan.chain_model import limit_names
 from tests.support.paths import CONFIGS
 
 FALL = Fall(0.0, None, 1.0, 0.1, 1.0, np.zeros(3))
-HELPS = "Raise its voltage_limit to 7 V if it bears that"
+HELPS = "Raise its voltage_limit to 7 V if the servo tolerates that"
 FREE = Nearest(0.05, 0.01, ("hand", "floor"), 0)
 
 
@@ -43,7 +43,8 @@ def test_what_helps_depends_on_what_keeps_a_joint_from_the_rest_pose() -> None:
     joint, most = leg.joints[1], leg.safety.lower_time
     limit = joint.goal_limit * joint.torque_per_goal
     assert _helps(leg, 1, 0.5 * most, 1.0, 2.0 * limit).startswith(
-        f"Raise its current_limit to {2.2 * joint.goal_limit:.2g} A if it bears that, choose a rest_pose in which"
+        f"Raise its current_limit to {2.2 * joint.goal_limit:.2g} A if the servo tolerates that, choose a rest_pose in "
+        "which"
     )
     assert "Raise its current_limit, lower safety.lower_speed, " in _helps(leg, 1, 0.9 * most, 1.0, 0.5 * limit)
     assert "Raise its current_limit, raise safety.lower_time, " in _helps(leg, 1, 1.1 * most, 1.0, 0.5 * limit)

@@ -152,7 +152,7 @@ def test_a_table_for_a_person_with_what_the_servos_say(
         "SAFE",
         "Largest safe torque",
         "own current limit 3.21 A",
-        "With torque off at 400 per second",
+        "At 400 cycles per second with torque off",
         "settle",
     ):
         assert part in said, part

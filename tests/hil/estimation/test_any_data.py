@@ -106,7 +106,7 @@ def test_a_csv_that_is_wrong_is_named(
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda columns: columns | {"tau1": np.clip(columns["tau1"], -0.1, 0.1)}, "if the current was clipped"),
+        (lambda columns: columns | {"tau1": np.clip(columns["tau1"], -0.1, 0.1)}, "If the current was clipped"),
         (lambda columns: columns | {"q1": np.where(np.arange(2000) % 10 < 2, np.nan, columns["q1"])}, "20.0 % of its"),
         (lambda columns: columns | {"q1": -np.pi / 2 + (columns["q1"] + np.pi / 2) / 80.0}, "moved by only"),
     ],
@@ -120,7 +120,7 @@ def test_data_that_is_doubtful_comes_with_a_warning(
 
 def test_degrees_that_are_taken_for_radians_are_refused_at_once(capsys: pytest.CaptureFixture[str]) -> None:
     assert estimate_pendulum(lambda columns: columns | {"q1": np.degrees(columns["q1"])}) == 2
-    assert "In degrees?" in capsys.readouterr().err
+    assert "Is it in degrees?" in capsys.readouterr().err
 
 
 def test_torque_of_the_wrong_sign_is_an_error_that_says_where_to_look(capsys: pytest.CaptureFixture[str]) -> None:

@@ -74,7 +74,7 @@ def test_a_stretch_without_a_visible_cause_is_named_too() -> None:
     predicted = healthy().position + 1e-3
     predicted[0, 400:600] += 0.3
     (named,) = found(healthy(), predicted)
-    assert "residual of joint 1 is up to 301 times the usual one in 2 to 3 s" in named
+    assert "residual of joint 1 is up to 301 times its usual value in 2 to 3 s" in named
 
 
 def test_a_stop_is_named_with_its_angle() -> None:
@@ -85,7 +85,7 @@ def test_a_stop_is_named_with_its_angle() -> None:
     position = np.round(np.stack((np.sin(3.0 * time), free - 1.3 * beyond)) / step) * step
     recording = Recording(time, np.stack((np.cos(time), np.sin(5.0 * time))), position, np.full(2, step), "held")
     (named,) = found(recording, position + 0.05 * np.sin(time))
-    assert re.match(r"Joint 2 rebounds at 0\.(59|6)", named) and "and never gets beyond" in named
+    assert re.match(r"Joint 2 rebounds at 0\.(59|6)", named) and "and never moves past it" in named
 
 
 def drifting(recording: Recording) -> Recording:

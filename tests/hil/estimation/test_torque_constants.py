@@ -42,7 +42,7 @@ def test_a_ratio_beyond_the_uncertainty_of_torque_constants_is_a_contradiction(
     said = ratios_said(JOINTS, extra, "column", found)
     assert bool(said) is not contradictory
     assert all("elative to joint 1, joint 2 gives" in each for each in (*found, *said))
-    assert all("All values, of all joints, are in the torque of joint 1" in each for each in (*found, *said))
+    assert all("The values of all joints are relative to the torque of joint 1" in each for each in (*found, *said))
 
 
 def test_a_recording_whose_first_torque_is_too_small_is_used_with_care_at_most() -> None:

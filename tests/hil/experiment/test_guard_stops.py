@@ -224,7 +224,7 @@ def test_a_mode_that_may_have_changed_after_a_stop_at_a_limit_is_not_said_to_be_
         assert str(stop).startswith(changed) and "Symptom: Joint 'elbow'" in str(stop)
     else:
         assert str(stop).startswith("Joint 'elbow'") and "Symptom" not in str(stop)
-        assert re.search(r"peak_torque.* changed .* may have come after the stop: \d+ ms before it", str(stop))
+        assert re.search(r"peak_torque.* changed .* may have happened after the stop: \d+ ms before it", str(stop))
 
 
 def test_a_return_delay_that_another_program_raised_is_named_before_late_replies(
@@ -653,6 +653,6 @@ def test_servos_that_a_killed_program_left_behind_are_taken_over(
     as_found(was_left_by_a_killed_program)
     config = arm()
     said = run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
-    assert said == "Torque is off on both servos, read back."
+    assert said == "Torque is off on both servos, confirmed by reading it back."
     servos = ports[0].bus.servos.values()
     assert not any(servo.torque_enabled or servo.value("Bus Watchdog") for servo in servos)

@@ -172,7 +172,7 @@ def test_a_joint_held_for_a_moment_is_noticed_and_the_arm_lowered(tmp_path: Path
 
 def test_a_joint_that_stays_held_ends_the_lowering(tmp_path: Path) -> None:
     error, samples = play(tmp_path, with_fault(TEXT, f'kind = "stuck_joint"\nservo = 2\nat = {AT_S}'))
-    assert any("off its path down" in note for note in error.__notes__)
+    assert any("off its lowering path" in note for note in error.__notes__)
     assert (samples["phase"] == Phase.LOWERING).any()
 
 

@@ -124,7 +124,7 @@ def test_a_signal_stops_the_arm(arm: Arm, tmp_path: Path, ports: list[Any], numb
     with pytest.raises(StopRequested) as caught:
         run(arm(), tmp_path / "run", at_sample(900, lambda: os.kill(os.getpid(), number)))
     assert_no_torque(ports[0])
-    assert caught.value.__notes__ == ["Torque is off on both servos, read back."]
+    assert caught.value.__notes__ == ["Torque is off on both servos, confirmed by reading it back."]
     assert 900 <= len(load_samples(tmp_path / "run" / "samples.npy", 2)) < 1000
     assert signal.getsignal(number) is handler
 

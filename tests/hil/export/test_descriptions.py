@@ -180,7 +180,7 @@ def test_names_that_xml_does_not_like(identified: Path) -> None:
 
 
 def test_a_format_that_does_not_exist(identified: Path) -> None:
-    with pytest.raises(ExportError, match=r"'step' is not a format of hil export\. Possible: urdf, mjcf, toml"):
+    with pytest.raises(ExportError, match=r"'step' is not a format of hil export\. Available: urdf, mjcf, toml"):
         export(identified, "step")
 
 

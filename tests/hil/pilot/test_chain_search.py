@@ -275,7 +275,7 @@ def test_a_pilot_starts_where_the_arm_lies(tmp_path: Path, monkeypatch: pytest.M
 
 def test_a_period_too_short_for_a_path_is_a_mistake_in_the_file() -> None:
     text = LEG.read_text(encoding="utf-8").replace("period = 10.0", "period = 1.0")
-    with pytest.raises(ConfigError, match=r"experiment\.period = 1 s: .* make it at least"):
+    with pytest.raises(ConfigError, match=r"experiment\.period = 1 s: .* set period to at least"):
         parse_config(text, LEG)
 
 
@@ -314,7 +314,7 @@ def test_a_reserve_always_leaves_some_range() -> None:
         reserve = reserve.larger(0.01)
     assert reserve.position < 0.35
     config = chain_config(load_config(LEG))
-    with pytest.raises(NoSafeTorque, match="no range of position is left"):
+    with pytest.raises(NoSafeTorque, match="no position range is left"):
         Paths.of(config, ChainBelief.prior(config).torque, replace(RESERVE, position=0.5))
 
 
@@ -437,7 +437,7 @@ def test_a_long_search_says_which_of_how_many_paths_and_amplitudes_it_simulates(
     said.trying("path 2 of at most 9, amplitude 3 of at most 4")
     said.tell(46, 72)
     (line,) = lines
-    assert line.endswith("path 2 of at most 9, amplitude 3 of at most 4, 46 of 72 simulations of this one.")
+    assert line.endswith("path 2 of at most 9, amplitude 3 of at most 4, 46 of 72 simulations of this amplitude.")
 
 
 def counting(monkeypatch: pytest.MonkeyPatch, unsafe_above: float) -> tuple[ChainSearch, list[tuple[float, str]]]:
@@ -503,6 +503,6 @@ def test_a_refusal_names_a_rate_only_if_a_motion_is_safe_at_it(
     monkeypatch.setattr(chain_shares, "OTHER_SEEDS", 0)
     with pytest.raises(NoSafeTorque) as refused:
         search.safe(search.config, (1.0, 0.18))
-    assert (f"At experiment.rate = {named}, a motion is safe: at 50 Hz, the " in str(refused.value)) is bool(named)
+    assert (f"At experiment.rate = {named}, a motion is safe. At 50 Hz, delay " in str(refused.value)) is bool(named)
     assert tried[-1].stabiliser == belief.gains(config).at(tried[-1].experiment.rate)
     assert search.given.experiment.rate == 50.0 and search.paths is not None

@@ -167,5 +167,5 @@ def test_an_earlier_result_narrows_the_belief_and_is_dropped_when_the_arm_moves_
 
 def test_an_earlier_run_needs_a_pilot_to_start_from(in_steps: Any) -> None:
     _, path, _ = in_steps
-    with pytest.raises(ConfigError, match=r"pilot \(experiment\.pilot = true\), but this file has none"):
+    with pytest.raises(ConfigError, match=r"pilot \(experiment\.pilot = true\), but this file gives peak_torque"):
         hil.identify("fake_two_link", start_from=path)

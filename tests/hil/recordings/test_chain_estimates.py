@@ -109,7 +109,11 @@ def test_measured_torque_gives_the_regression_and_says_so(setup: bench.Setup) ->
 
 @pytest.mark.parametrize(
     ("urdf", "names", "said"),
-    [("", 4, "need arm.urdf"), ('urdf = "arm.urdf"', 3, "3 .*4 columns"), ('urdf = "absent.urdf"', 4, "absent.urdf")],
+    [
+        ("", 4, "need arm.urdf"),
+        ('urdf = "arm.urdf"', 3, "3 .*4 position columns"),
+        ('urdf = "absent.urdf"', 4, "absent.urdf"),
+    ],
 )
 def test_what_is_missing_is_named(setup: bench.Setup, urdf: str, names: int, said: str) -> None:
     with pytest.raises(ConfigError, match=said):

@@ -374,7 +374,7 @@ def test_absolute_angles_are_made_relative(tmp_path: Path) -> None:
 def test_angles_beyond_any_arm_are_refused_at_once(scale: float) -> None:
     """As degrees under a header without a unit, or one that states another."""
     path = write("a.csv", scale=(1.0, 1.0, scale, 1.0, 1.0))
-    with pytest.raises(CsvError, match=r"column 'q2' goes from .* In degrees\?.*config=\"ARM.toml\""):
+    with pytest.raises(CsvError, match=r"column 'q2' goes from .* Is it in degrees\?.*config=\"ARM.toml\""):
         read(path)
     assert read(path, Columns(position_unit="rad")).recordings, "the user says so"
     stated = write("b.csv", ("time", "q1", "q2 [rad]", "tau1", "tau2"), scale=(1.0, 1.0, 60.0, 1.0, 1.0))

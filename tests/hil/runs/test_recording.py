@@ -130,7 +130,7 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
             load_samples(path, 2)
     for content, said in (
         (np.zeros(3), "is not a recording by this version"),
-        (np.zeros(3, dtype=sample_type(1)), "config.toml beside it are from different runs, with 1 and"),
+        (np.zeros(3, dtype=sample_type(1)), "the config.toml next to it are from different runs: 1 and"),
         (np.array([{}, None]), "it holds Python objects, not numbers"),
     ):
         np.save(path, content)

@@ -220,7 +220,7 @@ def test_a_servo_that_answers_again_after_torque_off_is_off_and_put_back(
     assert bench.changed() == []
     stopped = (tmp_path / "run" / "events.jsonl").read_text(encoding="utf-8")
     torque = "\n".join(stop.value.__notes__)
-    assert "Torque is off on both servos, read back." in torque and "rebooted" not in torque
+    assert "Torque is off on both servos, confirmed by reading it back." in torque and "rebooted" not in torque
     assert "NOT CONFIRMED" not in torque + capsys.readouterr().err
     if "answers again" in torque:
         assert "Joint 'elbow' (ID 2, XM430-W350) answers again" in stopped.splitlines()[-1]
@@ -578,5 +578,5 @@ def test_a_stop_between_two_runs_says_that_torque_is_off(
                 pass
         raise stop
     (note,) = raised.value.__notes__
-    assert note.startswith(f"Torque is off on {'both' if runs else 'all'} servos") and "read back" in note
+    assert note.startswith(f"Torque is off on {'both' if runs else 'all'} servos") and "reading it back" in note
     assert ("has not switched it on" in note) is (runs == 0)

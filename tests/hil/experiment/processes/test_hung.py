@@ -277,7 +277,7 @@ OTHERS = [
 def test_a_signal_cuts_torque_although_something_hangs(tmp_path: Path, what: Hung, number: signal.Signals) -> None:
     ending = end_by(tmp_path, what, by(number))
     assert ending.goals <= MOST_COMMANDS
-    assert any("Torque is off on both servos, read back." in each for each in ending.events)
+    assert any("Torque is off on both servos, confirmed by reading it back." in each for each in ending.events)
     name = "Ctrl-C" if number == signal.SIGINT else number.name
     assert f"Stopped by {name}." in ending.said and ending.code == 128 + number
 
