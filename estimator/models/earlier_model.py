@@ -24,6 +24,11 @@ BACK = (5, 10)
 TIMES = 3.5
 """Standard deviations beyond which the mean residual torque is not explained by the earlier model."""
 
+RELATIVE_STD = 0.1
+"""Relative standard deviation of each term of the mean (inertia, gravity, friction), as a model that fits one motion is
+not exact in the next one: in a fast swing, terms several times as large as the commanded torque cancel.
+"""
+
 IN_A_ROW = 2
 """Successive lessons for which it must not be explained."""
 
@@ -112,6 +117,7 @@ def compare(past: Any, j: int, back: int, count: int, floor: float, rounding: fl
     for i in range(count):
         own = (now[at + _ROW + i] - then[at + _ROW + i]) / seconds
         if own != 0.0:
+            variance += (RELATIVE_STD * own * then[parameters + i]) ** 2
             for n in range(count):
                 other = (now[at + _ROW + n] - then[at + _ROW + n]) / seconds
                 variance += own * then[covariance + i * count + n] * other

@@ -50,7 +50,12 @@ def limit(back: int, lessons: int = 20, velocity: float = 1.0, stands: float = 0
     numbers = np.arange(2 * (lessons - back) + 2, 2 * lessons)  # from the sample after the moment compared with
     row = np.array([np.sin(numbers).mean(), np.cos(numbers).mean(), 1.0])
     seconds = DT * numbers.size
-    variance = row @ COVARIANCE @ row + NOISE + ROUNDING * FILTER_S / seconds
+    variance = (
+        row @ COVARIANCE @ row
+        + ((earlier_model.RELATIVE_STD * row * THETA) ** 2).sum()
+        + NOISE
+        + ROUNDING * FILTER_S / seconds
+    )
     held = max(stands, np.exp(-velocity * seconds / earlier_model.ELASTIC_RAD))
     return float(earlier_model.TIMES * np.sqrt(variance) + held * FRICTION)
 

@@ -78,7 +78,7 @@ def test_friction_that_would_drive_the_joint_is_not_learnt() -> None:
 @pytest.mark.parametrize("push", [0.4 * PEAK, -0.4 * PEAK])
 def test_a_push_on_a_hardly_known_joint_is_found_by_the_model_from_before(push: float, friction: float) -> None:
     """Learning alone follows it."""
-    assert alarm_of_hardly_known(push, friction, begins=1.0) < 0.3
+    assert alarm_of_hardly_known(push, friction, begins=1.0) < 0.5
     assert alarm_of_hardly_known(push, friction, begins=1.0, looks_back=False) == math.inf
 
 
