@@ -50,6 +50,11 @@ _BY_OTHER_GOALS = {
 }
 """Causes of a stop that another program's goals may have."""
 
+_BRAKING_WATCHDOG_S = 0.04
+"""Bus Watchdog while the arm is braked [s]: should the cable be unplugged meanwhile, the current of a brake must not
+flow for as long as that of an experiment might, whose next command may be late.
+"""
+
 _FORGETS = 0.98
 """Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
 
@@ -392,6 +397,8 @@ class Stream:
                 if late or self._stop.insisted:
                     return
                 state = self._bus.exchange(goals, between=True)
+                if number == 0:
+                    self._bus.shorten_watchdogs(_BRAKING_WATCHDOG_S)
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
 
     def _lower(self, lowering: Lowering, error: ExperimentError) -> None:

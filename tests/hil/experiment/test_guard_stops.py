@@ -531,6 +531,27 @@ def test_a_missed_deadline_ends_the_braking(arm: Arm, tmp_path: Path, ports: lis
     assert 2 <= braked_samples(arm, tmp_path / "run", ports, plan, lambda: stall(ports, 0.03)) <= 5
 
 
+def test_a_cable_unplugged_while_the_arm_is_braked_ends_the_current_within_the_time_of_a_stop(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    """Its watchdogs are shortened: those of the experiment would act 0.12 s or more after the signal."""
+    config = arm(("[experiment]\n", "[safety]\ndamp_time = 0.06\n\n[experiment]\n"))
+    begun: list[float] = []
+
+    def act() -> None:
+        begun.append(ports[-1].clock.now())
+        os.kill(os.getpid(), signal.SIGHUP)
+        swing_elbow(ports, 8.0)
+        call_at(ports[-1], begun[0] + 0.05, lambda: fault(ports, FaultKind.CABLE_PULLED))
+
+    run = RunFolder.create(tmp_path / "run", config)
+    with pytest.raises((StopRequested, TorqueNotOff)):
+        run_experiment(config, run, config.path, once(act), plan)
+    for servo in ports[-1].bus.servos.values():
+        assert 0.03 < servo.heard_at - begun[0] < 0.06, "it was braked until then"
+        assert servo.heard_at + servo.watchdog_s - begun[0] < 0.1
+
+
 def test_a_joint_whose_replies_are_missing_is_not_taken_to_be_at_rest(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
 ) -> None:
