@@ -84,7 +84,7 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.STUCK_BIT: _FORGED | {LIMIT, POSE},
     Kind.CONSTANT: _FORGED | {LIMIT, POSE},
     Kind.COLLISION: _BYTES | {MIXED},
-    Kind.DEAF: frozenset({SILENCE}),
+    Kind.DEAF: _LOST_GOALS | {SILENCE},  # with a chance below 1 it misses goals and answers other requests
     Kind.DEAF_TO_GOALS: _LOST_GOALS,
     Kind.TWICE_TOLD: _REPEATED,
     Kind.TORQUE_TAKEN: _LOST_GOALS,
