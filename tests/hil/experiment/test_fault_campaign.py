@@ -108,6 +108,7 @@ TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
     [
         (Kind.PUSHED, "state", UNLIKE_ANY, JUMP),
         (Kind.WEAK, "state", NO_TORQUE, CONTRADICTION),
+        (Kind.LOWERED_LIMIT, "state", "its Current Limit is 236, but current_limit = 1.2 A needs 447", CONTRADICTION),
         (Kind.DEAF, "state", "does not accept goals: some are lost. Goals are lost on the way.", CONTRADICTION),
         (Kind.GOAL_FIGHT, "state", "Another program commands it.", "stands still. Something blocks it."),
         (Kind.BIAS, "position", JUMP, NO_TORQUE),
