@@ -2,10 +2,10 @@
 
 A push or grip that begins while the arm is still being learnt changes what is learnt: sample by sample, parameters and
 noise follow it, and no residual stands out. The model from before the disturbance does not follow. Its prediction for
-all samples since then is therefore compared with the mean torque over that time: over the last 5 and the last 10
-lessons, 0.1 and 0.2 s. In the mean, effects that alternate with the motion (friction after a reversal, play, noise)
-cancel, and a push does not. Where the joint has hardly moved in that time, friction may have held it back: a gear gives
-way elastically before it slides.
+all samples since then is therefore compared with the mean torque over that time: over the last 5, 10 and 20 lessons,
+which are 0.1, 0.2 and 0.4 s. In the mean, effects that alternate with the motion (noise, play, ripple) cancel, and a
+push does not. Where the joint has hardly moved in that time, friction may have held it back: a gear gives way
+elastically before it slides.
 
 What a joint's equation, `torque - row theta`, contributes is summed over time, so that the mean over any two of the
 stored moments takes one subtraction. These functions are part of compiled loops.
@@ -18,7 +18,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 
-BACK = (5, 10)
+BACK = (5, 10, 20)
 """Numbers of lessons over which the mean is taken."""
 
 TIMES = 3.5

@@ -45,7 +45,7 @@ def compared(past: np.ndarray, back: int, floor: float = 0.0, joint: int = 1) ->
     return compare(past, joint, back, COUNT, floor, ROUNDING, FILTER_S)
 
 
-def limit(back: int, lessons: int = 20, velocity: float = 1.0, stands: float = 0.0) -> float:
+def limit(back: int, lessons: int = 40, velocity: float = 1.0, stands: float = 0.0) -> float:
     """Mean residual torque that the earlier model just explains [N m]."""
     numbers = np.arange(2 * (lessons - back) + 2, 2 * lessons)  # from the sample after the moment compared with
     row = np.array([np.sin(numbers).mean(), np.cos(numbers).mean(), 1.0])
@@ -64,14 +64,14 @@ def limit(back: int, lessons: int = 20, velocity: float = 1.0, stands: float = 0
 @pytest.mark.parametrize(("velocity", "stands"), [(1.0, 0.0), (0.1, 0.0), (0.0, 0.0), (1.0, 0.7)])
 def test_a_mean_counts_beyond_parameters_noise_and_friction(back: int, velocity: float, stands: float) -> None:
     most = limit(back, velocity=velocity, stands=stands)
-    assert compared(played(20, 0.999 * most, velocity, stands), back) == 0.0
-    assert compared(played(20, 1.001 * most, velocity, stands), back) == pytest.approx(1.001 * most)
-    assert compared(played(20, -1.001 * most, velocity, stands), back) == pytest.approx(-1.001 * most)
-    assert compared(played(20, 1.001 * most, velocity, stands), back, joint=0) == 0.0
+    assert compared(played(40, 0.999 * most, velocity, stands), back) == 0.0
+    assert compared(played(40, 1.001 * most, velocity, stands), back) == pytest.approx(1.001 * most)
+    assert compared(played(40, -1.001 * most, velocity, stands), back) == pytest.approx(-1.001 * most)
+    assert compared(played(40, 1.001 * most, velocity, stands), back, joint=0) == 0.0
 
 
 def test_a_mean_below_the_floor_does_not_count() -> None:
-    past = played(20, 3.0)
+    past = played(40, 3.0)
     assert compared(past, 5, floor=2.9) == pytest.approx(3.0)
     assert compared(past, 5, floor=3.1) == 0.0
 
