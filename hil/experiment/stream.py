@@ -194,7 +194,8 @@ class Stream:
         if moving:
             raise ExperimentError(
                 self._false_velocity(state, window)
-                or f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again."
+                or f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again. If it "
+                "moved by itself, another program commands it, or something pushes or holds it."
             )
 
     def _false_velocity(self, state: State, window: int) -> str:
