@@ -33,6 +33,7 @@ from hil.drivers.torque_off import (
     disarm_watchdogs,
     signals_held_back,
     tell_torque_off,
+    tell_watchdogs,
     was_rebooted,
 )
 
@@ -467,6 +468,14 @@ class ServoBus:
         if interrupts:
             raise interrupts[0]
         return self.torque_off_report
+
+    def shorten_watchdogs(self, seconds: float) -> None:
+        """Shorten the armed Bus Watchdogs to `seconds` [s], if they are longer, until torque is off.
+
+        Nothing is read back: a servo that does not hear this keeps the former time.
+        """
+        if seconds < self._watchdog:
+            tell_watchdogs(self.port, {drive: self._servos[drive] for drive in self._armed}, seconds)
 
     def repeat_torque_off(self) -> None:
         """Send torque off to all servos once more without waiting for an answer, in case a silent servo receives it."""

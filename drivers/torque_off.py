@@ -151,12 +151,24 @@ def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
 
     It is a Sync Write because other servos on the bus may be in use, and it is sent twice because a packet may be lost.
     """
+    _tell(port, servos, "Torque Enable", 0, times=2)
+
+
+def tell_watchdogs(port: Port, servos: Mapping[Joint, Servo], seconds: float) -> None:
+    """Set the Bus Watchdogs of all servos to `seconds` [s] in one packet; a failure leaves them as they are."""
+    _tell(port, servos, "Bus Watchdog", max(1, round(seconds / WATCHDOG_UNIT)))
+
+
+def _tell(port: Port, servos: Mapping[Joint, Servo], register: str, value: int, times: int = 1) -> None:
+    """Write a register of one byte on all servos, without waiting for an answer."""
     every = list(servos.values())
-    entry = every[0].table["Torque Enable"]
+    if not every:
+        return
+    entry = every[0].table[register]
     body = entry.address.to_bytes(2, "little") + entry.size.to_bytes(2, "little")
-    body += b"".join(bytes((servo.id, 0)) for servo in every)
+    body += b"".join(bytes((servo.id, value)) for servo in every)
     with suppress(DriverError):
-        port.write(2 * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
+        port.write(times * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
 
 
 def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> None:

@@ -48,6 +48,7 @@ class Witness:
 
     def __init__(self, bus: FakeBus) -> None:
         self._plant = bus.plant
+        self._servos = bus._servos
         self._tell = [_teller(servo) for servo in bus._servos]
         self._next = bus.time + STEP_S
         self._times: list[float] = []
@@ -98,6 +99,8 @@ class Witness:
             before, most = felt[joint], each.amount * self._largest[joint]
             match each.kind:
                 case Kind.WEAK:
+                    # A weaker motor induces less voltage, and one that is turned round the opposite one.
+                    before += (1.0 - each.amount) * self._held_back(joint)
                     felt[joint] = each.amount * before
                     self._missing[joint] += before - felt[joint]
                 case Kind.SATURATED:
@@ -120,6 +123,13 @@ class Witness:
                     felt[joint] = before + most * self._resists(joint, each)
                     self._missing[joint] += before - felt[joint]
         return felt
+
+    def _held_back(self, joint: int) -> float:
+        """Current by which the back-EMF reduces that of a motor driven by voltage [A]; 0 for one driven by current."""
+        servo = self._servos[joint]
+        if servo.operating_mode != PWM_MODE:
+            return 0.0
+        return servo.model.back_emf_v_s * self._plant.velocity[joint] / servo.model.resistance_ohm
 
     def _slip(self, joint: int, attack: Attack, now: float) -> None:
         done = min(1.0, (now - attack.start) / SLIPS_S)

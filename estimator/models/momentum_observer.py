@@ -22,6 +22,9 @@ its noise is lower, since most of the noise only arises in motion.
 What friction can hold includes the viscous friction at the speeds of the usual motion: over a small motion, in which
 the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once it stands.
 
+While little is known about an arm, the model follows a disturbance as if it were the arm. Then the mean torque over the
+last tenths of a second is also compared with the model from before (`earlier_model`).
+
 Errors of the model last longer than the interval between two updates, and so does the rounding of a velocity that stays
 below one tick: they are not new information each time. Therefore each update counts only as a fraction of one.
 """
@@ -35,7 +38,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled, only_version
-from hil.estimator.models import standstill
+from hil.estimator.models import earlier_model, standstill
 
 NAMES = (
     *("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
@@ -80,8 +83,9 @@ _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6,
 # Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration; mean square velocity.
 _TAUGHT, _TEACHES, _SQUARED = 0, 2, 4
 # The constants: joints, interval, floors; from 4 drifts; then two minimum noises, the highest floors and their
-# friction.
+# friction; whether the arm is hardly known.
 _HIGHEST = 4 + _COUNT + 2
+_HARDLY_KNOWN = _HIGHEST + 3
 
 
 class MomentumObserver:
@@ -93,6 +97,7 @@ class MomentumObserver:
     interval: time between two samples [s].
     frictions: multiple of dry friction, as far as it is known, to which `largest` is raised if it is smaller: near
     standstill, friction behaves differently from the model.
+    hardly_known: whether only the torque is known beforehand; then means are compared with the earlier model, too.
     """
 
     def __init__(
@@ -102,6 +107,8 @@ class MomentumObserver:
         largest: Array,
         interval: float,
         frictions: float = 0.0,
+        *,
+        hardly_known: bool = False,
     ) -> None:
         joints = len(largest)
         if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
@@ -119,7 +126,9 @@ class MomentumObserver:
         drift = _LEAST_DRIFT**2 * np.diag(covariance)
         least_noise = (_FIRST_NOISE_SHARE * 0.1 * highest) ** 2
         friction = [FLOOR_SHARE * frictions]
-        self._constants = np.concatenate(([joints, interval, *floor], drift, least_noise, highest, friction))
+        further = (drift, least_noise, highest, friction, [float(hardly_known)])
+        self._constants = np.concatenate(([joints, interval, *floor], *further))
+        self._past = earlier_model.memory(_COUNT)
         self._loop: Callable[..., int] = _observe
         self.observe(
             (0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf
@@ -134,7 +143,8 @@ class MomentumObserver:
         """
         if self._joints == 1:
             position, velocity, torque = (position[0], 0.0), (velocity[0], 0.0), (torque[0], 0.0)
-        return self._loop(self._memory, self._rests, self._constants, *position, *velocity, *torque, seconds)
+        constants = self._constants
+        return self._loop(self._memory, self._rests, self._past, constants, *position, *velocity, *torque, seconds)
 
     @property
     def lacking(self) -> list[float]:
@@ -324,13 +334,45 @@ def _floor(m: Any, k: Any, j: int) -> float:
     return float(max(k[2 + j], min(k[_HIGHEST + j], k[_HIGHEST + 2] * dry)))
 
 
+def _look_back(
+    m: Any,
+    past: Any,
+    k: Any,
+    j: int,
+    row: Any,
+    velocity: float,
+    stands: float,
+    friction: float,
+    rounding: float,
+    dt: float,
+) -> float:
+    """Process joint j's sample; return its mean residual torque if the earlier model has not explained it for long
+    enough, otherwise 0.
+
+    stands: filtered indicator of standstill. friction: static friction [N m]. rounding: variance of the residual.
+    """
+    single = m[_SINGLE]
+    _add(past, j, single[_TORQUE + j], stands, velocity, row, dt)
+    if single[_LESSON] == 0.0:  # this sample is a lesson
+        _describe(past, j, _COUNT, single[_NOISE + j], friction)
+        floor, found = _floor(m, k, j), 0.0
+        for back in _BACK:
+            mean = _compare(past, j, back, _COUNT, floor, rounding, FILTER_S)
+            found = mean if found == 0.0 else found
+        _keep(past, j, found)
+        if j == int(k[0]) - 1:
+            _store(past, m[_THETA], m[_COVARIANCE:_PENDING])
+    return float(_unexplained(past, j))
+
+
 def _observe_loop(
-    m: Any, rests: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, dt: float
+    m: Any, rests: Any, past: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, dt: float
 ) -> int:
     momentum, rest = np.zeros((2, _COUNT)), np.zeros((2, _COUNT))
     _regressors(momentum, rest, q1, q2, v1, v2)
     if dt > _LONGEST_GAP * k[1]:
         _begin_anew(m, momentum, rest, t1, t2)
+        _forget_past(past)
         for j in range(int(k[0])):
             _forget(rests[j])
         return -1
@@ -356,7 +398,8 @@ def _observe_loop(
         lacking, left_open = _lacks(m, j, row, gain)
         single[_LACKING + j] = lacking
         stands = min(max(single[_STANDS + j], 0.0), 1.0)
-        holds, rounding = stands * _static_friction(m, rests[j], j), _of_rounding(m, j, slope, math.cos(q2))
+        static, rounding = _static_friction(m, rests[j], j), _of_rounding(m, j, slope, math.cos(q2))
+        holds = stands * static
         quiet = 1.0 - (1.0 - _STANDING_NOISE) * stands
         noise, floor = quiet * quiet * single[_NOISE + j], _floor(m, k, j)
         spread = left_open + rounding + noise
@@ -368,6 +411,10 @@ def _observe_loop(
         held = abs(lacking) - _CERTAIN * math.sqrt(left_open)
         if _is_blocked(m, rests[j], j, distance, row, held, quiet * floor, noise, rounding, dt):
             alarm = j
+        if k[_HARDLY_KNOWN] > 0.0:
+            mean = _look_back(m, past, k, j, row, v1 if j == 0 else v2, stands, static, rounding, dt)
+            if mean != 0.0:
+                single[_LACKING + j], alarm = mean, j
         taught = min(beyond * beyond - left_open - rounding, _CLIPPED * single[_NOISE + j])
         _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), dt * (1.0 - stands), single[_SAMPLES + j] > 0.0)
         if lesson and not is_beyond and not _is_suspect(rests[j]):
@@ -382,7 +429,11 @@ _regressors, _begin_anew, _filter, _lacks, _learn = map(_inner, (_regressors, _b
 _keep_dissipative = _inner(_keep_dissipative)
 _withstood, _forget, _look_at_rest = standstill.withstood, standstill.forget, standstill.look
 _variance, _blocked, _is_suspect = standstill.variance, standstill.blocked, standstill.is_suspect
+_BACK, _compare, _describe = earlier_model.BACK, earlier_model.compare, earlier_model.describe
+_add, _store, _forget_past = earlier_model.add, earlier_model.store, earlier_model.forget
+_keep, _unexplained = earlier_model.keep, earlier_model.unexplained
 _static_friction, _is_blocked = map(_inner, (_static_friction, _is_blocked))
 _second_moment, _of_rounding = map(_inner, (_second_moment, _of_rounding))
 _alarms, _teach_noise, _floor, _remember_speed = map(_inner, (_alarms, _teach_noise, _floor, _remember_speed))
+_look_back = _inner(_look_back)
 _observe: Callable[..., int] = compiled(_observe_loop)

@@ -328,16 +328,20 @@ class Guard:
 
     def _not_its_velocity(self, index: int, velocity: float) -> str:
         said, reach = f"reports a velocity of {velocity:+.2f} rad/s", "that no servo of this model can reach"
+        slips = ""
         if travels := self.recent.travels(index):
             moved, seconds, *_ = travels[0]
             way = f"which changed by {moved:+.4f} rad in the last {1e3 * seconds:.0f} ms"
             said += f" that contradicts its position, {way}"
-            said += f", and {reach}" * self.recent.is_unreachable(index, velocity)
+            if self.recent.is_unreachable(index, velocity):
+                said += f", and {reach}"
+            else:
+                slips = ", or its horn has just begun to slip"
         else:
             said += f" {reach}"
         return (
-            f"{said}: this reading is wrong. Check the servo and whether a device between adapter and servo changes "
-            "its replies; replace the servo if it happens again."
+            f"{said}: this reading is wrong{slips}. Check the servo and whether a device between adapter and servo "
+            "changes its replies; replace the servo if it happens again."
         )
 
     def _not_followed(self, index: int, state: State) -> NoReturn:

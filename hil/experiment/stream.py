@@ -50,6 +50,11 @@ _BY_OTHER_GOALS = {
 }
 """Causes of a stop that another program's goals may have."""
 
+_BRAKING_WATCHDOG_S = 0.04
+"""Bus Watchdog while the arm is braked [s]: should the cable be unplugged meanwhile, the current of a brake must not
+flow for as long as that of an experiment might, whose next command may be late.
+"""
+
 _FORGETS = 0.98
 """Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
 
@@ -189,7 +194,8 @@ class Stream:
         if moving:
             raise ExperimentError(
                 self._false_velocity(state, window)
-                or f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again."
+                or f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again. If it "
+                "moved by itself, another program commands it, or something pushes or holds it."
             )
 
     def _false_velocity(self, state: State, window: int) -> str:
@@ -394,6 +400,8 @@ class Stream:
                 if late or self._stop.insisted:
                     return
                 state = self._bus.exchange(goals, between=True)
+                if number == 0:
+                    self._bus.shorten_watchdogs(_BRAKING_WATCHDOG_S)
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
 
     def _lower(self, lowering: Lowering, error: ExperimentError) -> None:

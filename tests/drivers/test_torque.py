@@ -249,3 +249,19 @@ def test_torque_that_reads_0_is_off_whatever_error_the_replies_report(
         assert put_back(servo, {**settings, "Goal Current": 7}) == {"Goal Current": (0, 7)}
         with pytest.raises(ServoRefused, match="data range"):
             servo.read("Goal Current")
+
+
+def test_watchdogs_are_shortened_in_one_packet_and_never_prolonged(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ServoBus.open(fake_config()) as bus, bus.torque(watchdog=0.08):
+        seen = [written(bus, servo_id, monkeypatch) for servo_id in (1, 2)]
+        for seconds in (0.1, 0.08):
+            bus.shorten_watchdogs(seconds)
+        assert seen == [[], []]
+        bus.shorten_watchdogs(0.04)
+        bus.port.clock.wait_until(bus.port.clock.now() + 0.01)
+        bus.exchange([0.0, 0.0])
+        for servo_id, each in zip((1, 2), seen, strict=True):
+            assert (WATCHDOG, 2) in [(address, value) for address, value, _ in each]
+            assert servos(bus)[servo_id].value("Bus Watchdog") == 2

@@ -16,7 +16,20 @@ def alarm_after(push: float, friction: float, frictions: float, begins: float = 
     mean = {"inertia_1": INERTIA, "viscous_1": VISCOUS, "coulomb_1": 0.08}
     std = {"inertia_1": 0.3 * INERTIA, "viscous_1": 0.5 * VISCOUS, "coulomb_1": 0.06, "offset_1": 0.04}
     covariance = np.diag([std.get(name, 0.0) ** 2 for name in NAMES])
-    observer = MomentumObserver(mean, covariance, np.array([PEAK]), INTERVAL, frictions)
+    return watched_by(MomentumObserver(mean, covariance, np.array([PEAK]), INTERVAL, frictions), push, friction, begins)
+
+
+def alarm_of_hardly_known(push: float, friction: float, begins: float, *, looks_back: bool = True) -> float:
+    """The same if only the torque is known beforehand."""
+    std = {"inertia_1": 0.3, "viscous_1": 1.0, "offset_1": 0.3, "gravity_1": 0.3, "tilt_1": 0.3, "coulomb_1": 0.3}
+    covariance = np.diag([(PEAK * std.get(name, 0.0)) ** 2 for name in NAMES])
+    observer = MomentumObserver(
+        {"coulomb_1": 0.04}, covariance, np.array([PEAK]), INTERVAL, 3.0, hardly_known=looks_back
+    )
+    return watched_by(observer, push, friction, begins)
+
+
+def watched_by(observer: MomentumObserver, push: float, friction: float, begins: float) -> float:
     q = v = 0.0
     torque = 0.0
     tick = 2 * math.pi / 4096
@@ -59,3 +72,16 @@ def test_friction_that_would_drive_the_joint_is_not_learnt() -> None:
         drives = -0.05 * math.copysign(1.0, speed) - 5.0 * INERTIA * math.sin(angle)
         assert observer.observe((0.2 * math.sin(angle),), (speed,), (drives,), INTERVAL) < 0
     assert all(observer.parameters[name] > -2e-3 for name in ("viscous_1", "coulomb_1"))
+
+
+@pytest.mark.parametrize("friction", [0.02, 0.05])
+@pytest.mark.parametrize("push", [0.4 * PEAK, -0.4 * PEAK])
+def test_a_push_on_a_hardly_known_joint_is_found_by_the_model_from_before(push: float, friction: float) -> None:
+    """Learning alone follows it."""
+    assert alarm_of_hardly_known(push, friction, begins=1.0) < 0.5
+    assert alarm_of_hardly_known(push, friction, begins=1.0, looks_back=False) == math.inf
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.02, 0.05, 0.1])
+def test_a_healthy_hardly_known_joint_is_never_stopped(friction: float) -> None:
+    assert alarm_of_hardly_known(0.0, friction, begins=6.0) == math.inf

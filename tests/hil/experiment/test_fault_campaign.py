@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from benchmarks.fault_campaign.campaign import Outcome, inject_drawn, prepare
 from benchmarks.fault_campaign.draw import Drawn
 from benchmarks.fault_campaign.judge import judge_words, received, since_again
 from benchmarks.fault_campaign.twin import has_healthy_twin
+from benchmarks.fault_campaign.witness import CURRENT_MODE, PWM_MODE, Witness
 from benchmarks.faults import campaign, figures
 from hil.drivers.servo_model import Mode
 
@@ -106,6 +108,8 @@ TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
     [
         (Kind.PUSHED, "state", UNLIKE_ANY, JUMP),
         (Kind.WEAK, "state", NO_TORQUE, CONTRADICTION),
+        (Kind.LOWERED_LIMIT, "state", "its Current Limit is 236, but current_limit = 1.2 A needs 447", CONTRADICTION),
+        (Kind.DEAF, "state", "does not accept goals: some are lost. Goals are lost on the way.", CONTRADICTION),
         (Kind.GOAL_FIGHT, "state", "Another program commands it.", "stands still. Something blocks it."),
         (Kind.BIAS, "position", JUMP, NO_TORQUE),
         (Kind.BIAS, "current", NO_TORQUE, JUMP),
@@ -117,6 +121,18 @@ def test_a_message_that_names_another_fault_is_misleading(kind: Kind, field: str
     drawn = Drawn((Attack(kind, 1.0, 2.0, field=field),), ())
     assert judge_words(drawn, right) == (True, False)
     assert judge_words(drawn, wrong) == (False, True)
+
+
+@pytest.mark.parametrize(("mode", "felt", "sensed"), [(PWM_MODE, -0.7, 0.7), (CURRENT_MODE, 0.3, -0.3)])
+def test_a_motor_that_is_turned_round_brakes_itself_as_any_motor_does(mode: int, felt: float, sensed: float) -> None:
+    """At 2 rad/s, -0.3 A at 0.2 V from 1 ohm and 0.25 V s: turned round it induces -0.5 V instead of 0.5 V."""
+    model = SimpleNamespace(back_emf_v_s=0.25, resistance_ohm=1.0)
+    plant = SimpleNamespace(joints=1, position=(0.0,), velocity=(2.0,), current=(felt,))
+    witness = Witness(SimpleNamespace(plant=plant, _servos=[], time=0.0))  # type: ignore[arg-type]
+    witness._servos = [SimpleNamespace(operating_mode=mode, model=model)]  # type: ignore[list-item]
+    witness.disturb(0, Attack(Kind.WEAK, 1.0, 2.0, amount=-1.0))
+    assert witness._driven_by((-0.3,), 1.5) == pytest.approx([felt])
+    assert witness.current == pytest.approx((sensed,))
 
 
 def test_a_healthy_twin_is_found_for_a_healthy_arm_and_a_stuck_one_but_not_for_one_that_freezes_in_motion() -> None:

@@ -83,6 +83,7 @@ def test_a_velocity_beyond_its_limit_that_contradicts_the_position(
     assert stop.value.cause is cause
     assert ("contradicts its position" in str(stop.value)) == (cause is Cause.FROZEN)
     assert ("can reach" in str(stop.value)) == (claimed == 60.0)
+    assert ("begun to slip" in str(stop.value)) == (cause is Cause.FROZEN and claimed != 60.0)
 
 
 def test_a_frozen_encoder_is_seen_between_lost_replies(arm: Arm) -> None:

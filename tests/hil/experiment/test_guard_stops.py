@@ -449,7 +449,7 @@ def test_an_arm_that_is_still_moving_when_the_rest_is_over(
 FALSE_VELOCITY = (
     r"'elbow' \(ID 2.* reports a velocity of 0\.\d\d rad/s before the start, but its position .* by 0\.000\d rad"
 )
-MOVES = r"^The arm is moving before the start: joint 'elbow'"
+MOVES = r"^The arm is moving before the start: joint 'elbow'.* another program commands it, or something pushes"
 
 
 @pytest.mark.parametrize(("before_the_end", "said"), [(20, FALSE_VELOCITY), (1, MOVES)])
@@ -529,6 +529,27 @@ def test_a_second_signal_ends_the_braking_at_once(
 
 def test_a_missed_deadline_ends_the_braking(arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan) -> None:
     assert 2 <= braked_samples(arm, tmp_path / "run", ports, plan, lambda: stall(ports, 0.03)) <= 5
+
+
+def test_a_cable_unplugged_while_the_arm_is_braked_ends_the_current_within_the_time_of_a_stop(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    """Its watchdogs are shortened: those of the experiment would act 0.12 s or more after the signal."""
+    config = arm(("[experiment]\n", "[safety]\ndamp_time = 0.06\n\n[experiment]\n"))
+    begun: list[float] = []
+
+    def act() -> None:
+        begun.append(ports[-1].clock.now())
+        os.kill(os.getpid(), signal.SIGHUP)
+        swing_elbow(ports, 8.0)
+        call_at(ports[-1], begun[0] + 0.05, lambda: fault(ports, FaultKind.CABLE_PULLED))
+
+    run = RunFolder.create(tmp_path / "run", config)
+    with pytest.raises((StopRequested, TorqueNotOff)):
+        run_experiment(config, run, config.path, once(act), plan)
+    for servo in ports[-1].bus.servos.values():
+        assert 0.03 < servo.heard_at - begun[0] < 0.06, "it was braked until then"
+        assert servo.heard_at + servo.watchdog_s - begun[0] < 0.1
 
 
 def test_a_joint_whose_replies_are_missing_is_not_taken_to_be_at_rest(

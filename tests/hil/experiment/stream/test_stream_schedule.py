@@ -65,6 +65,9 @@ class Bus:
     def read_status_next(self) -> None:
         self.calls.append(("status",))
 
+    def shorten_watchdogs(self, seconds: float) -> None:
+        self.calls.append(("watchdogs", seconds))
+
     def times(self, kind: str) -> list[float]:
         return [call[1] for call in self.calls if call[0] == kind]
 
@@ -363,6 +366,10 @@ def test_a_stop_brakes_at_once_and_for_60_ms_at_most(
     assert bus.times("between") == pytest.approx(
         [*first, *(begun + TAKES_S + apart * number for number in range(1, count))]
     )
+    # No sooner than the brake, which replaces the goals that led to the stop.
+    kinds = [call[0] for call in bus.calls if call[0] in ("between", "watchdogs")]
+    assert kinds == ["between", "watchdogs", *["between"] * (count - 1)][: 2 * count]
+    assert bus.times("watchdogs") == [0.04] * bool(count)
     samples = stream._recorder.samples[1:]
     assert len(samples) == count and set(samples["phase"]) <= {Phase.BRAKING} and set(samples["period"]) <= {-1}
     assert len(guard.of("look")) == looks

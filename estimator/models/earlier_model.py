@@ -1,0 +1,141 @@
+"""Compares the mean torque of the last tenths of a second with that of the model as it was before them.
+
+A push or grip that begins while the arm is still being learnt changes what is learnt: sample by sample, parameters and
+noise follow it, and no residual stands out. The model from before the disturbance does not follow. Its prediction for
+all samples since then is therefore compared with the mean torque over that time: over the last 5, 10 and 20 lessons,
+which are 0.1, 0.2 and 0.4 s. In the mean, effects that alternate with the motion (noise, play, ripple) cancel, and a
+push does not. Where the joint has hardly moved in that time, friction may have held it back: a gear gives way
+elastically before it slides.
+
+What a joint's equation, `torque - row theta`, contributes is summed over time, so that the mean over any two of the
+stored moments takes one subtraction. These functions are part of compiled loops.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from hil.estimator.arrays import Array
+
+BACK = (5, 10, 20)
+"""Numbers of lessons over which the mean is taken."""
+
+TIMES = 3.5
+"""Standard deviations beyond which the mean residual torque is not explained by the earlier model."""
+
+RELATIVE_STD = 0.1
+"""Relative standard deviation of each term of the mean (inertia, gravity, friction), as a model that fits one motion is
+not exact in the next one: in a fast swing, terms several times as large as the commanded torque cancel.
+"""
+
+IN_A_ROW = 2
+"""Successive lessons for which it must not be explained."""
+
+ELASTIC_RAD = 0.03
+"""Distance after a reversal within which dry friction may differ from that of a sliding joint by as much as it holds at
+standstill [rad]; this share falls exponentially with the distance covered.
+"""
+
+_SLOTS = max(BACK)
+# A moment: sums over time (seconds; per joint torque, indicator of standstill, speed, row), then per joint the variance
+# of the noise and the static friction, then the parameters and their covariance. The last row but one of the memory
+# holds the present moment; the last one, the number of those stored, the next row to write, and per joint the
+# successive lessons that were not explained and, once they are enough, the mean residual.
+_SECONDS = 0
+_TORQUE, _STANDS, _WAY, _ROW = range(4)
+_STORED, _NEXT, _LASTS, _FOUND = 0, 1, 2, 4
+
+
+def memory(count: int) -> Array:
+    """Memory for two joints with `count` parameters each: nothing is stored yet."""
+    return np.zeros((_SLOTS + 2, 1 + 2 * (_ROW + count) + 4 + count + count * count))
+
+
+def forget(past: Any) -> None:
+    """Discard the stored moments: what happened since the previous sample is unknown."""
+    past[_SLOTS + 1] = 0.0
+
+
+def add(past: Any, j: int, torque: float, stands: float, velocity: float, row: Any, dt: float) -> None:
+    """Add a sample of joint `j`, `dt` [s] after the previous one.
+
+    torque, row: equation of the joint, filtered [N m]. stands: filtered indicator of standstill. velocity: in rad/s.
+    """
+    now, at = past[_SLOTS], 1 + j * (_ROW + row.size)
+    if j == 0:
+        now[_SECONDS] += dt
+    now[at + _TORQUE] += dt * torque
+    now[at + _STANDS] += dt * stands
+    now[at + _WAY] += dt * abs(velocity)
+    for i in range(row.size):
+        now[at + _ROW + i] += dt * row[i]
+
+
+def describe(past: Any, j: int, count: int, noise: float, friction: float) -> None:
+    """Set joint `j`'s variance of the noise and its static friction [N m], which are stored with the next moment."""
+    at = 1 + 2 * (_ROW + count)
+    past[_SLOTS, at + j], past[_SLOTS, at + 2 + j] = noise, friction
+
+
+def store(past: Any, theta: Any, covariance: Any) -> None:
+    """Store the present moment with the parameters `theta` and their `covariance`."""
+    count, head = theta.size, past[_SLOTS + 1]
+    row = past[int(head[_NEXT])]
+    at = 1 + 2 * (_ROW + count) + 4
+    row[:at] = past[_SLOTS, :at]
+    row[at : at + count] = theta
+    at += count
+    for i in range(count):
+        row[at + i * count : at + (i + 1) * count] = covariance[i]
+    head[_NEXT] = (head[_NEXT] + 1.0) % _SLOTS
+    head[_STORED] = min(head[_STORED] + 1.0, float(_SLOTS))
+
+
+def compare(past: Any, j: int, back: int, count: int, floor: float, rounding: float, filter_s: float) -> float:
+    """Return joint `j`'s mean residual torque over the last `back` lessons [N m]; 0 if the earlier model explains it.
+
+    count: number of parameters. floor: smallest mean that counts [N m]. rounding: variance of one sample's residual due
+    to rounded velocities. filter_s: time constant of the equation's filter [s].
+    """
+    now, head = past[_SLOTS], past[_SLOTS + 1]
+    if head[_STORED] < back:
+        return 0.0
+    then = past[int(head[_NEXT] - back) % _SLOTS]
+    seconds = now[_SECONDS] - then[_SECONDS]
+    at, model = 1 + j * (_ROW + count), 1 + 2 * (_ROW + count)
+    parameters, covariance = model + 4, model + 4 + count
+    mean = (now[at + _TORQUE] - then[at + _TORQUE]) / seconds
+    for i in range(count):
+        mean -= (now[at + _ROW + i] - then[at + _ROW + i]) / seconds * then[parameters + i]
+    stands = (now[at + _STANDS] - then[at + _STANDS]) / seconds
+    held = max(stands, np.exp((then[at + _WAY] - now[at + _WAY]) / ELASTIC_RAD))
+    beyond = abs(mean) - held * then[model + 2 + j]
+    if beyond <= floor:
+        return 0.0
+    variance = then[model + j] + rounding * min(filter_s / seconds, 1.0)
+    for i in range(count):
+        own = (now[at + _ROW + i] - then[at + _ROW + i]) / seconds
+        if own != 0.0:
+            variance += (RELATIVE_STD * own * then[parameters + i]) ** 2
+            for n in range(count):
+                other = (now[at + _ROW + n] - then[at + _ROW + n]) / seconds
+                variance += own * then[covariance + i * count + n] * other
+    return float(mean) if beyond > TIMES * np.sqrt(max(variance, 0.0)) else 0.0
+
+
+def keep(past: Any, j: int, mean: float) -> None:
+    """Process the result of joint `j`'s comparisons: a mean residual, or 0 if the earlier model explains it."""
+    head = past[_SLOTS + 1]
+    head[_LASTS + j] = head[_LASTS + j] + 1.0 if mean != 0.0 else 0.0
+    head[_FOUND + j] = mean if head[_LASTS + j] >= IN_A_ROW else 0.0
+
+
+def unexplained(past: Any, j: int) -> float:
+    """Return joint `j`'s mean residual torque that has not been explained for long enough [N m], otherwise 0."""
+    return float(past[_SLOTS + 1, _FOUND + j])
+
+
+_inner: Any = numba.njit(nogil=True, error_model="numpy")
+forget, add, describe, store, compare = map(_inner, (forget, add, describe, store, compare))
+keep, unexplained = map(_inner, (keep, unexplained))
