@@ -17,7 +17,7 @@ from benchmarks.fault_campaign.witness import CURRENT_MODE, PWM_MODE, Witness
 from benchmarks.faults import campaign, figures
 from hil.drivers.servo_model import Mode
 
-INJECTIONS = 312
+INJECTIONS = 300
 
 PERIOD_S = 1.2
 """Period of the multisines: shorter than in the script's campaign, to save processor time."""
