@@ -31,6 +31,7 @@ from hil.drivers.torque_off import (
     cut_again,
     cut_torque,
     disarm_watchdogs,
+    is_torque_on,
     signals_held_back,
     tell_torque_off,
     was_rebooted,
@@ -469,6 +470,25 @@ class ServoBus:
     def repeat_torque_off(self) -> None:
         """Send torque off to all servos once more, without waiting for an answer, for one that does not answer yet."""
         tell_torque_off(self.port, self._servos)
+
+    def torque_now(self) -> dict[Joint, bool | None]:
+        """Read whether torque is on at each servo that is not reported as unconfirmed; None where that is unknown."""
+        report = self.torque_off_report
+        unconfirmed = set() if report is None else {joint for joint, _ in report.unconfirmed}
+        return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
+
+    def cut_again(self, on: Collection[Joint]) -> None:
+        """Cut torque that another program has switched on since `torque_off`; what `torque_now` reads then counts."""
+        interrupts: list[BaseException] = []
+        with signals_held_back():
+            cut_torque(self.port, {joint: self._servos[joint] for joint in on}, (), 0.0, interrupts)
+        if interrupts:
+            raise interrupts[0]
+
+    def report_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> None:
+        """Let `torque_off_report` say that another program keeps torque on (`TorqueOff.with_driven`)."""
+        report = self.torque_off_report or TorqueOff(tuple(self._servos), ())
+        self.torque_off_report = report.with_driven(on, silent)
 
     def confirm_later(self, drive: Joint) -> bool:
         """Cut the torque of a servo (a key of `drives`) that `torque_off` could not confirm as off, and read it back.
