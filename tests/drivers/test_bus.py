@@ -52,6 +52,30 @@ def test_fast_sync_read_is_used_where_every_firmware_has_it(
         assert bus.exchange([0.0, 0.0]).missing == (False, False)
 
 
+@pytest.mark.parametrize("noise", ["fffffd00", "fffffd00020c005500", "fffffd0002fa0055"])
+def test_what_begins_like_a_packet_before_each_reply_does_not_prevent_settings(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch, noise: str
+) -> None:
+    with ServoBus.connect(fake_config()) as bus:
+        servo = bus.servo(bus.joints[1])
+        write, read, pending = bus.port.write, bus.port.read, [b""]
+
+        def noisy_write(data: bytes) -> None:
+            pending[0] = bytes.fromhex(noise)
+            write(data)
+
+        def noisy_read(count: int, timeout: float) -> bytes:
+            first, pending[0] = pending[0][:count], pending[0][count:]
+            return first or read(count, timeout)
+
+        monkeypatch.setattr(bus.port, "write", noisy_write)
+        monkeypatch.setattr(bus.port, "read", noisy_read)
+        before = bus.port.clock.now()
+        servo.write("Operating Mode", 0)
+        assert servo.read("Operating Mode") == 0
+        assert bus.port.clock.now() - before < 0.01, "no wait for what the noise announces"
+
+
 def test_fast_sync_read_can_be_forbidden(fake_config: Make) -> None:
     with ServoBus.open(fake_config(fast_sync_read=False)) as bus:
         assert not bus.prepared.fast
