@@ -5,10 +5,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from hil.drivers.control_table import load_control_table, model_names
-from hil.drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel
+from hil.drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel, WrongReply
 from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
-from hil.drivers.others.heard import MOST_STRANGERS
+from hil.drivers.others.heard import MOST_MIXED_UP, MOST_STRANGERS
 from hil.drivers.packet import ALERT, HardwareError
 from hil.drivers.port import Port, open_port
 from hil.drivers.preparation.cadence import CHECK_S, cadence
@@ -306,7 +306,8 @@ class ServoBus:
 
         between: whether this exchange lies between two samples (`Exchange.cycle`).
         A servo that does not reply is marked as missing. Raises PortLost; BusShared if instructions of another master
-        are heard repeatedly; ValueError for a goal that is not a finite number.
+        are heard repeatedly; WrongReply if servos repeatedly answer with each other's ID; ValueError for a goal that is
+        not a finite number.
         """
         if self._in_pairs and len(goals) == len(self.joints):
             goals = [goals[joint] / self._of.count(joint) for joint in self._of]
@@ -317,6 +318,8 @@ class ServoBus:
         state = self._converter.state(ticks, reply)
         if (strangers := exchange.heard.strangers) > MOST_STRANGERS:
             raise shared(f"has sent {strangers} packets, or made servos send them,")
+        if exchange.heard.mixed_up > MOST_MIXED_UP:
+            raise WrongReply(exchange.heard.mixed_up_advice(self.port.url))
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def check_not_overruled(self, due: float) -> None:

@@ -86,7 +86,7 @@ class SdkPort:
         self._deadline = self._port.clock.now() + timeout
 
 
-class ResyncingPacketHandler(Protocol2PacketHandler):
+class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     """The SDK's packet handler, except that noise before a reply costs nothing.
 
     The SDK gives up where bytes that look like the beginning of a packet do not become one. Here the search goes on

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from hil.drivers.bus import BusConfig, ServoBus
-from hil.drivers.errors import PortLost, ServoFault, ServoRefused, WrongSetting
+from hil.drivers.errors import PortLost, ServoFault, ServoRefused, WrongReply, WrongSetting
 from hil.drivers.joint import Joint
 from hil.drivers.packet import HardwareError
 from hil.drivers.servo_model import Mode, servo_model
@@ -50,6 +50,17 @@ def test_fast_sync_read_is_used_where_every_firmware_has_it(
     with ServoBus.open(fake_config(url)) as bus:
         assert bus.prepared.fast is fast
         assert bus.exchange([0.0, 0.0]).missing == (False, False)
+
+
+def test_servos_that_answer_with_each_others_id_end_the_exchange(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ServoBus.open(fake_config()) as bus, pytest.raises(WrongReply, match=r"IDs 2, 1, although each .* `hil scan"):
+        monkeypatch.setattr(bus.prepared.heard, "senders", [2, 1])
+        for count in (2, 3):
+            monkeypatch.setattr(bus.prepared.heard, "mixed_up", count)
+            bus.exchange([0.0, 0.0])
+            assert count == 2
 
 
 @pytest.mark.parametrize("noise", ["fffffd00", "fffffd00020c005500", "fffffd0002fa0055"])
