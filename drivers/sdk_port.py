@@ -93,7 +93,7 @@ class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     behind them, until time is up.
     """
 
-    def rxPacket(self, port: SdkPort, fast_option: bool) -> tuple[list[int], int]:  # noqa: N802
+    def rxPacket(self, port: SdkPort, _fast_option: bool) -> tuple[list[int], int]:  # noqa: N802
         received = b""
         while True:
             packet, missing = _first_status(received)
