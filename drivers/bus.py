@@ -5,10 +5,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from hil.drivers.control_table import load_control_table, model_names
-from hil.drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel
+from hil.drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel, WrongReply
 from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
-from hil.drivers.others.heard import MOST_STRANGERS
+from hil.drivers.others.heard import MOST_MIXED_UP, MOST_STRANGERS
 from hil.drivers.packet import ALERT, HardwareError
 from hil.drivers.port import Port, open_port
 from hil.drivers.preparation.cadence import CHECK_S, cadence
@@ -31,6 +31,7 @@ from hil.drivers.torque_off import (
     cut_again,
     cut_torque,
     disarm_watchdogs,
+    is_torque_on,
     signals_held_back,
     tell_torque_off,
     tell_watchdogs,
@@ -306,7 +307,8 @@ class ServoBus:
 
         between: whether this exchange lies between two samples (`Exchange.cycle`).
         A servo that does not reply is marked as missing. Raises PortLost; BusShared if instructions of another master
-        are heard repeatedly; ValueError for a goal that is not a finite number.
+        are heard repeatedly; WrongReply if servos repeatedly answer with each other's ID; ValueError for a goal that is
+        not a finite number.
         """
         if self._in_pairs and len(goals) == len(self.joints):
             goals = [goals[joint] / self._of.count(joint) for joint in self._of]
@@ -317,6 +319,8 @@ class ServoBus:
         state = self._converter.state(ticks, reply)
         if (strangers := exchange.heard.strangers) > MOST_STRANGERS:
             raise shared(f"has sent {strangers} packets, or requested them from servos,")
+        if exchange.heard.mixed_up > MOST_MIXED_UP:
+            raise WrongReply(exchange.heard.mixed_up_advice(self.port.url))
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def check_not_overruled(self, due: float) -> None:
@@ -480,6 +484,25 @@ class ServoBus:
     def repeat_torque_off(self) -> None:
         """Send torque off to all servos once more without waiting for an answer, in case a silent servo receives it."""
         tell_torque_off(self.port, self._servos)
+
+    def torque_now(self) -> dict[Joint, bool | None]:
+        """Read whether torque is on at each servo that is not reported as unconfirmed; None where that is unknown."""
+        report = self.torque_off_report
+        unconfirmed = set() if report is None else {joint for joint, _ in report.unconfirmed}
+        return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
+
+    def cut_again(self, on: Collection[Joint]) -> None:
+        """Cut torque that another program has switched on since `torque_off`; what `torque_now` reads then counts."""
+        interrupts: list[BaseException] = []
+        with signals_held_back():
+            cut_torque(self.port, {joint: self._servos[joint] for joint in on}, (), 0.0, interrupts)
+        if interrupts:
+            raise interrupts[0]
+
+    def report_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> None:
+        """Let `torque_off_report` say that another program keeps torque on (`TorqueOff.with_driven`)."""
+        report = self.torque_off_report or TorqueOff(tuple(self._servos), ())
+        self.torque_off_report = report.with_driven(on, silent)
 
     def confirm_later(self, drive: Joint) -> bool:
         """Cut the torque of a servo (a key of `drives`) that `torque_off` could not confirm as off, and read it back.

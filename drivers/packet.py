@@ -23,7 +23,7 @@ MAX_LENGTH = 1024
 
 _FRONT = Struct("<4sBH")  # header, ID, LEN
 _STUFFED = b"\xff\xff\xfd"
-_NO_ID = (0xFD, 0xFF)
+NO_ID = (0xFD, 0xFF)
 """IDs that no servo can have, because they could be part of a header."""
 
 
@@ -172,7 +172,7 @@ class Framer:
             if len(buffer) < 7:
                 return None
             length = buffer[5] | buffer[6] << 8
-            if length < 3 or length > self._longest or buffer[4] in _NO_ID:
+            if length < 3 or length > self._longest or buffer[4] in NO_ID:
                 self._drop(1)
                 continue
             end = 7 + length

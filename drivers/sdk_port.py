@@ -1,9 +1,21 @@
-"""The port on which the packet handler of `dynamixel-sdk` works, in place of the SDK's own PortHandler."""
+"""The port on which the packet handler of `dynamixel-sdk` works, in place of the SDK's own PortHandler, and a packet
+handler that finds the answer behind noise.
+"""
 
+from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, Protocol2PacketHandler
+
+from hil.drivers.packet import HEADER, MAX_LENGTH, NO_ID, Instruction, crc, unstuff
 from hil.drivers.port import Port
 
 PATIENCE_S = 0.018
 """Time that set-up work waits for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
+
+
+_SHORTEST = 11
+"""Bytes of a status packet without data."""
+
+_BEFORE_LENGTH, _FRONT = 7, 8
+"""Bytes of a packet that LEN does not count, and up to its instruction."""
 
 
 class SdkPort:
@@ -72,3 +84,46 @@ class SdkPort:
 
     def _set_timeout(self, timeout: float) -> None:
         self._deadline = self._port.clock.now() + timeout
+
+
+class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
+    """The SDK's packet handler, except that noise before a reply costs nothing.
+
+    The SDK gives up where bytes that look like the beginning of a packet do not become one. Here the search goes on
+    behind them, until time is up.
+    """
+
+    def rxPacket(self, port: SdkPort, _fast_option: bool) -> tuple[list[int], int]:  # noqa: N802
+        received = b""
+        while True:
+            packet, missing = _first_status(received)
+            if packet:
+                payload = unstuff(packet[_BEFORE_LENGTH:-2])  # the SDK's own removeStuffing gets some data wrong
+                size = (len(payload) + 2).to_bytes(2, "little")
+                return [*packet[: _BEFORE_LENGTH - 2], *size, *payload, *packet[-2:]], COMM_SUCCESS
+            more = port.readPort(missing)
+            received += more
+            if not more and port.isPacketTimeout():
+                return list(received), COMM_RX_CORRUPT if received else COMM_RX_TIMEOUT
+
+
+def _first_status(received: bytes) -> tuple[bytes, int]:
+    """The first intact status packet in what was received; b"" if there is none, and how many bytes to read for it.
+
+    Never more than belong to that packet, so that the next one stays whole.
+    """
+    missing = _SHORTEST - next(size for size in range(len(HEADER) - 1, -1, -1) if received.endswith(HEADER[:size]))
+    at = received.find(HEADER)
+    while at >= 0:
+        front = received[at : at + _FRONT]
+        if len(front) < _FRONT:
+            missing = min(missing, _SHORTEST - len(front))
+        elif front[4] not in NO_ID and front[-1] == Instruction.STATUS:
+            end = at + _BEFORE_LENGTH + int.from_bytes(front[5:7], "little")
+            packet = received[at:end]
+            if at + _SHORTEST <= end <= at + MAX_LENGTH and end > len(received):
+                missing = min(missing, end - len(received))
+            elif len(packet) >= _SHORTEST and crc(packet[:-2]) == int.from_bytes(packet[-2:], "little"):
+                return packet, 0
+        at = received.find(HEADER, at + 1)
+    return b"", missing

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TypeVar
 
-from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, PacketHandler
+from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS
 
 from hil.drivers.control_table import ControlTable, Register
 from hil.drivers.errors import NoReply, ServoRefused, WrongReply
 from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError
 from hil.drivers.port import Port
-from hil.drivers.sdk_port import SdkPort
+from hil.drivers.sdk_port import ResyncingPacketHandler, SdkPort
 
 _T = TypeVar("_T")
 
@@ -44,7 +44,7 @@ class Servo:
         self.table = table
         self.title = title or f"The {table.model} with ID {servo_id}"
         self._sdk_port = SdkPort(port)
-        self._sdk = PacketHandler(2.0)
+        self._sdk = ResyncingPacketHandler()
 
     def ping(self, attempts: int = _ATTEMPTS) -> int:
         """Return the model number reported at this ID; raises NoReply, WrongReply, PortLost."""

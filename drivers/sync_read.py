@@ -167,15 +167,21 @@ class SyncRead:
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
         found: dict[int, Answer] = {}
-        latest = -1
+        latest, is_repeated = -1, False
         for packet in Framer(longest=self._longest).feed(received):
             if packet.is_status and packet.id in self._ids and (answer := self._answer(packet)):
                 turn = self._ids.index(packet.id)
                 if turn <= latest:
-                    found.clear()  # servos answer in order, so the earlier ones belong to an earlier request
+                    # Servos answer in order, so the earlier ones belong to an earlier request,
+                    # or a servo has answered with another one's ID.
+                    found.clear()
+                    is_repeated = True
                 found[packet.id], latest = answer, turn
         # Servos answer in order, so nothing follows the last one.
-        return [found.get(servo_id) for servo_id in self._ids], self._ids[-1] in found
+        is_over = self._ids[-1] in found
+        if is_repeated and len(found) < len(self._ids):
+            found.clear()  # whose answers these are is unknown
+        return [found.get(servo_id) for servo_id in self._ids], is_over
 
     def senders(self, received: bytes) -> list[int]:
         packets = Framer(longest=self._longest).feed(received)

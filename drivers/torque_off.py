@@ -47,6 +47,8 @@ class TorqueOff:
     unwatched: joints, of either group, whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
     rebooted: confirmed joints whose servos had lost the watchdog that was armed before torque came on.
+    driven: joints in neither group: their servos' torque is on, because another program switches it on whenever it is
+    cut.
     """
 
     confirmed: tuple[Joint, ...]
@@ -54,6 +56,25 @@ class TorqueOff:
     unwatched: frozenset[Joint] = frozenset()
     later: frozenset[Joint] = frozenset()
     rebooted: frozenset[Joint] = frozenset()
+    driven: tuple[Joint, ...] = ()
+
+    @property
+    def is_off(self) -> bool:
+        """Whether torque is off on every servo, read back."""
+        return not self.unconfirmed and not self.driven
+
+    def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
+        """The report after another program has switched torque on again.
+
+        on: joints on whose servos it still is, however often it is cut. silent: those that do not answer since.
+        """
+        why = "Another program had switched its torque on again, and it has not answered since."
+        return replace(
+            self,
+            confirmed=tuple(joint for joint in self.confirmed if joint not in {*on, *silent}),
+            unconfirmed=(*self.unconfirmed, *((joint, why) for joint in silent)),
+            driven=tuple(on),
+        )
 
     def with_later(self, joint: Joint, *, rebooted: bool) -> "TorqueOff":
         """The report after the servo of an unconfirmed joint has answered again and been read back as off."""
@@ -84,6 +105,20 @@ class TorqueOff:
         yield from by_reason(self.unconfirmed).items()
 
     def _outcome(self) -> str:
+        if not self.driven:
+            return self._outcome_alone()
+        told = [
+            f"TORQUE IS ON AT {and_list(str(joint).upper() for joint in self.driven)}: ANOTHER PROGRAM SWITCHES IT ON "
+            "AS OFTEN AS IT IS CUT. CUT THE SUPPLY NOW, then end that program."
+        ]
+        if self.unconfirmed:
+            told.append(self._outcome_alone())
+        elif self.confirmed:
+            told.append(f"Torque is off, read back, on {and_list(map(str, self.confirmed))}.")
+        return " ".join(told)
+
+    def _outcome_alone(self) -> str:
+        """The outcome for the servos that no other program drives."""
         if not self.unconfirmed:
             count = len(self.confirmed)
             servos = {1: "the servo", 2: "both servos"}.get(count, f"all {count} servos")
@@ -189,6 +224,16 @@ def cut_again(servo: Servo, *, armed: bool) -> bool:
     if armed:
         servo.write_despite_error("Bus Watchdog", 0)
     return rebooted
+
+
+def is_torque_on(servo: Servo) -> bool | None:
+    """Whether a servo's torque is on; None if it does not answer, or if its answers may belong to other questions."""
+    with suppress(DriverError):
+        first = servo.read_despite_error("Torque Enable")
+        is_its_own = servo.read_despite_error("ID") == servo.id
+        if is_its_own and servo.read_despite_error("Torque Enable") == first:
+            return bool(first)
+    return None
 
 
 def was_rebooted(servo: Servo) -> bool:

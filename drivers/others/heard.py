@@ -6,10 +6,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from hil.drivers.packet import BROADCAST_ID, HEADER, Framer, Instruction, Packet
 from hil.drivers.sync_read import Answer, GroupRead
 
-__all__ = ["MOST_STRANGERS", "Heard"]
+__all__ = ["MOST_MIXED_UP", "MOST_STRANGERS", "Heard"]
 
 MOST_STRANGERS = 2
 """Tolerated number of foreign packets heard during an experiment; a late reply can look like one."""
+
+MOST_MIXED_UP = 2
+"""Tolerated number of replies with IDs that do not fit; no answer of such a reply is used."""
 
 _RECENT_S = 0.1
 _INSTRUCTIONS = frozenset(Instruction) - {Instruction.STATUS}
@@ -38,6 +41,8 @@ class Heard:
         """
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
+        self.mixed_up = 0
+        """How many replies in which each servo answered had IDs that do not fit, since a reply was last late."""
         self.strangers = 0
         """Number of received packets that this program neither sent nor requested: another master is on the bus."""
 
@@ -53,7 +58,11 @@ class Heard:
         packets = _packets_within(received)
         self._count_strangers(packets, echoes=echoes)
         if any(packet.is_status for packet in packets):
-            self.late_at = now
+            self._was_late(now)
+
+    def _was_late(self, now: float) -> None:
+        """A reply was late or repeated, which also brings the IDs of the replies before it out of order."""
+        self.late_at, self.mixed_up = now, 0
 
     def instead(self, read: GroupRead, received: bytes, answers: Sequence[Answer], now: float, *, echoes: bool) -> None:
         """Examine bytes received instead of the regular reply to `read`; `answers` were found in them."""
@@ -61,10 +70,12 @@ class Heard:
         if not echoes:
             self.strangers += sum(self._is_anothers(*front) for front in _fronts_of_instructions(received))
         if any(front in self._expected - read.expected for front in _fronts_of_replies(received)):
-            self.late_at = now  # the beginning of a reply to an earlier request
+            self._was_late(now)  # the beginning of a reply to an earlier request
         complete = sum(answer is not None for answer in answers) / len(answers)
         if complete < 1.0 and len(received) > complete * read.reply_size + _PART_OF_A_REPLY:
             self.damaged_at, self.senders = now, read.senders(received)
+            is_whole = len(received) == read.reply_size and len(self.senders) == len(self._ids)
+            self.mixed_up += is_whole and set(self.senders) <= set(self._ids) and tuple(self.senders) != self._ids
 
     def continued(self, before: bytes, received: bytes, now: float) -> None:
         """Examine bytes that may be the rest of a reply that was incomplete when time was up.
@@ -73,7 +84,7 @@ class Heard:
         """
         whole = [packet for packet in _packets_within(before + received) if packet.is_status]
         if len(whole) > len(_packets_within(before)) + len(_packets_within(received)):
-            self.late_at = now
+            self._was_late(now)
 
     def advice(self, now: float, url: str) -> str:
         """What was received in the last 0.1 s instead of complete and timely replies, and what to do about it; "" if
@@ -92,13 +103,17 @@ class Heard:
                 f"Intact replies came with ID {', '.join(map(str, dict.fromkeys(strange)))}, which was not addressed: "
                 f"a servo's ID has changed, or its reply is another servo's. `hil scan {url}` lists the IDs."
             )
-        if len(set(self.senders)) < len(self.senders):
-            return (
-                f"Intact replies came with the IDs {', '.join(map(str, self.senders))}, although each servo was "
-                "asked once: replies are repeated or mixed up, or two servos have the same ID. "
-                f"`hil scan {url}` lists the IDs."
-            )
+        if self.mixed_up or len(set(self.senders)) < len(self.senders):
+            return self.mixed_up_advice(url)
         return "Bytes arrived, but damaged or incomplete: check the cables and what else may be sending on the bus."
+
+    def mixed_up_advice(self, url: str) -> str:
+        """What to do about servos that answer with IDs that do not fit."""
+        return (
+            f"Intact replies came with the IDs {', '.join(map(str, self.senders))}, although each servo was "
+            "asked once: replies are repeated or mixed up, or two servos have the same ID. "
+            f"`hil scan {url}` lists the IDs."
+        )
 
     def _count_strangers(self, packets: Sequence[Packet], *, echoes: bool) -> None:
         if not echoes:

@@ -29,6 +29,11 @@ _STALE_READINGS = 2
 _GOALS_MISSED = 2
 """Consecutive mismatches before a goal counts as lost, because a single packet may be lost."""
 
+_FOREIGN_GOALS, _FOREIGN_S = 3, 10.0
+"""Number of status readings with a goal that this program never sent, and the time in which they prove that goals are
+changed now and then [s]. Noise cannot change a goal, since its checksum would fail.
+"""
+
 _REMEMBERED = 256
 """Number of latest goals that are kept."""
 
@@ -53,6 +58,8 @@ class StatusCheck:
         self._held: list[float | None] = [None] * len(config.joints)
         self._agreed_at = [0] * len(config.joints)
         self._is_foreign = [False] * len(config.joints)
+        self._foreign_at: list[deque[float]] = [deque(maxlen=_FOREIGN_GOALS) for _ in config.joints]
+        """Times of the latest status readings with a goal that this program never sent, by joint [s]."""
         # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
         self._clock = [(0.0, 0.0, 0, 0)] * len(config.joints)
 
@@ -85,7 +92,11 @@ class StatusCheck:
                 "has lost its torque: Torque Enable reads 0 although this program switched it on. It was rebooted, its "
                 "supply failed for a moment, or another program uses this bus."
             )
-        return self._watchdog(status) or self._goal(joint, status, sent) or self.look_at_clock(joint, status.tick, now)
+        return (
+            self._watchdog(status)
+            or self._goal(joint, status, sent, now)
+            or self.look_at_clock(joint, status.tick, now)
+        )
 
     def _watchdog(self, status: Status) -> tuple[Cause, str] | None:
         if status.watchdog == self._armed:
@@ -103,19 +114,23 @@ class StatusCheck:
             "program uses this bus, or the servo was rebooted."
         )
 
-    def _goal(self, joint: int, status: Status, sent: float) -> tuple[Cause, str] | None:
+    def _goal(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
         if abs(status.goal - sent) < self._half_tick[joint]:
             self._missed[joint] = 0
             self._held[joint], self._agreed_at[joint], self._is_foreign[joint] = None, self._cycles, False
             return None
         self._held[joint] = status.goal
-        self._is_foreign[joint] |= self._never_sent(joint, status.goal)
+        foreign_at = self._foreign_at[joint]
+        if self._never_sent(joint, status.goal):
+            self._is_foreign[joint] = True
+            foreign_at.append(now)
+        is_repeated = len(foreign_at) == _FOREIGN_GOALS and now - foreign_at[0] <= _FOREIGN_S
         self._missed[joint] += 1
-        if self._missed[joint] < _GOALS_MISSED:
+        if self._missed[joint] < _GOALS_MISSED and not is_repeated:
             return None
         unit = self._unit[joint]
         held = f"it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent"
-        if self._is_foreign[joint]:
+        if self._is_foreign[joint] or is_repeated:
             return Cause.GOALS_LOST, (
                 f"does not hold the goals of this program: {held}, and it holds goals that this program never sent. "
                 "Another program commands it, or goals are changed on the way: stop that program or unplug its "

@@ -6,8 +6,9 @@ reason. If a killed program left saved settings behind, these count as the servo
 (`killed_run`).
 """
 
+import re
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -51,12 +52,18 @@ SETTINGS_NAME = "servo_settings.json"
 """Name of the copy of the saved settings in the run folder."""
 
 
+_MOST_CUTS = 5
+"""How often torque is cut again at the end if another program switches it on."""
+
 REBOOT_S = 0.6
 """A servo that does not answer at the end may be booting; it is tried again after this time [s]."""
 
 
 _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
 """Said if every servo has answered in the end, and nothing else is wrong."""
+
+_TELLS_OF_TORQUE = re.compile("torque (off )?is", re.IGNORECASE)
+"""Found in each sentence that says whether torque is off (`TorqueOff`)."""
 
 COUNT_DOWN_S = 5.0
 """Time between the warning that an arm will move again after a stopped run and switching torque on [s].
@@ -92,6 +99,10 @@ class ServoSession:
     """Whether the servos are the arm's and no other program holds them, so that they may be written to."""
     _cut: dict[Joint, dict[str, int]] = field(default_factory=dict)
     """Goals that could only be restored as far as a lowered limit allows, with their values."""
+    _on_again: dict[Joint, int] = field(default_factory=dict)
+    """Servos whose torque another program has switched on since it was cut, with how often it was cut again."""
+    _torque: dict[Joint, bool | None] = field(default_factory=dict)
+    """What was read last about each servo's torque (`ServoBus.torque_now`)."""
     shared: int = 0
     """Number of inner blocks that have used the bus."""
     was_stopped: bool = False
@@ -173,13 +184,57 @@ class ServoSession:
     def end(self) -> list[str]:
         """Restore every servo's settings; return one message per reason for which some could not be restored.
 
-        Never raises DriverError.
+        Torque is read last of all, and cut again where another program has switched it on meanwhile; the settings are
+        restored again after that. Never raises DriverError.
         """
         failed = self._put_back(self._kept)
+        while failed and self._cut_again(failed):
+            pass
         if failed:
             clock = self.bus.port.clock
             clock.wait_until(clock.now() + REBOOT_S)
             failed = self._put_back(failed)
+        left = self._what_is_left(failed)
+        while self._cut_again(failed):
+            left = self._what_is_left(failed)
+        return [*self._switched_on_by_another(), *left]
+
+    def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
+        """Cut torque where it is on and restore these servos' settings; return whether there was anything to do.
+
+        failed: receives the errors of the servos whose settings could not be restored.
+        """
+        if not self._is_ours:
+            return False
+        self._torque = self.bus.torque_now()
+        on = [joint for joint, is_on in self._torque.items() if is_on]
+        if not on or max(self._on_again.get(joint, 0) for joint in on) >= _MOST_CUTS:
+            return False
+        self.bus.cut_again(on)
+        for joint in on:
+            self._on_again[joint] = self._on_again.get(joint, 0) + 1
+            failed.pop(joint, None)
+        failed |= self._put_back(joint for joint in on if joint in self._kept)
+        return True
+
+    def _switched_on_by_another(self) -> Iterator[str]:
+        """Say at which servos another program switched torque on after it had been cut, unless it still is on."""
+        on = [joint for joint, is_on in self._torque.items() if is_on]
+        silent = [joint for joint in self._on_again if self._torque.get(joint, True) is None]
+        if on or silent:
+            self.bus.report_driven(on, silent)
+        if off := [joint for joint in self._on_again if joint not in {*on, *silent}]:
+            yield (
+                f"Another program switched torque on at {and_list(map(str, off))} while the settings were being "
+                "restored. It was cut again and was still off when it was read last of all. End that program before "
+                "you reach into the arm: it may switch torque on again."
+            )
+
+    def _what_is_left(self, failed: Mapping[Joint, DriverError]) -> list[str]:
+        """A message for each reason why a setting is not as it was.
+
+        failed: the errors of the servos whose settings could not be restored.
+        """
         return [
             *self._not_reached(),
             *self._changed_delays(failed),
@@ -318,16 +373,41 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             raise
         finally:
             _outermost.reset(token)
+            told = str(bus.torque_off_report)
             with signals_held_back():
                 left = session.end()
-            instead = confirmed_later(bus, stopped) if isinstance(stopped, TorqueNotOff) else None
-            if ended := instead or stopped:
-                for line in left:  # after what stopped the arm and the state of its torque, which matter more
-                    ended.add_note(line)
-            elif left:
-                raise ExperimentError(" ".join(left))
-            if instead is not None:
-                raise instead from None
+            _end_with(bus, stopped, left, told)
+
+
+def _end_with(bus: ServoBus, stopped: BaseException | None, left: Sequence[str], told: str) -> None:
+    """Add what is left to say to the exception that ended the block, or raise another one where it does not apply.
+
+    told: the sentence about torque before the settings were restored.
+    """
+    report = bus.torque_off_report
+    instead: BaseException | None = None
+    if isinstance(stopped, TorqueNotOff):
+        instead = confirmed_later(bus, stopped)
+    elif report is not None and not report.is_off:
+        instead = TorqueNotOff(str(report))
+        if stopped is not None:
+            _retract(stopped, told)
+            instead.last_samples = getattr(stopped, "last_samples", None)
+    if ended := instead or stopped:
+        for line in left:  # after what stopped the arm and the state of its torque, which matter more
+            ended.add_note(line)
+    elif left:
+        raise ExperimentError(" ".join(left))
+    if isinstance(instead, TorqueNotOff):
+        raise instead
+    if instead is not None:
+        raise instead from None
+
+
+def _retract(stopped: BaseException, told: str) -> None:
+    """Remove a sentence about torque that no longer holds from an exception's notes."""
+    if notes := getattr(stopped, "__notes__", None):
+        notes[:] = [rest for note in notes if (rest := note.replace(told, "").strip())]
 
 
 def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
@@ -337,7 +417,7 @@ def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
     """
     report = bus.torque_off_report
     error.args = (str(report),)
-    if report is None or report.unconfirmed:
+    if report is None or not report.is_off:
         return None
     cause = error.__context__ or ExperimentError(_LATE_CONFIRMED)
     cause.add_note(str(report))
@@ -355,7 +435,7 @@ def _telling_of_torque(bus: ServoBus) -> Iterator[None]:
         raise
     except BaseException as ended:
         is_stop = isinstance(ended, KeyboardInterrupt | StopRequested)
-        told = any("torque" in note.lower() for note in getattr(ended, "__notes__", []))
+        told = any(_TELLS_OF_TORQUE.search(note) for note in getattr(ended, "__notes__", []))
         if not told and (is_stop or bus.torque_off_report is not None):
             with signals_held_back():
                 ended.add_note(_about_torque(bus))

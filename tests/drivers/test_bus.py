@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from hil.drivers.bus import BusConfig, ServoBus
-from hil.drivers.errors import PortLost, ServoFault, ServoRefused, WrongSetting
+from hil.drivers.errors import PortLost, ServoFault, ServoRefused, WrongReply, WrongSetting
 from hil.drivers.joint import Joint
 from hil.drivers.packet import HardwareError
 from hil.drivers.servo_model import Mode, servo_model
@@ -50,6 +50,41 @@ def test_fast_sync_read_is_used_where_every_firmware_has_it(
     with ServoBus.open(fake_config(url)) as bus:
         assert bus.prepared.fast is fast
         assert bus.exchange([0.0, 0.0]).missing == (False, False)
+
+
+def test_servos_that_answer_with_each_others_id_end_the_exchange(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ServoBus.open(fake_config()) as bus, pytest.raises(WrongReply, match=r"IDs 2, 1, although each .* `hil scan"):
+        monkeypatch.setattr(bus.prepared.heard, "senders", [2, 1])
+        for count in (2, 3):
+            monkeypatch.setattr(bus.prepared.heard, "mixed_up", count)
+            bus.exchange([0.0, 0.0])
+            assert count == 2
+
+
+@pytest.mark.parametrize("noise", ["fffffd00", "fffffd00020c005500", "fffffd0002fa0055"])
+def test_what_begins_like_a_packet_before_each_reply_does_not_prevent_settings(
+    fake_config: Make, monkeypatch: pytest.MonkeyPatch, noise: str
+) -> None:
+    with ServoBus.connect(fake_config()) as bus:
+        servo = bus.servo(bus.joints[1])
+        write, read, pending = bus.port.write, bus.port.read, [b""]
+
+        def noisy_write(data: bytes) -> None:
+            pending[0] = bytes.fromhex(noise)
+            write(data)
+
+        def noisy_read(count: int, timeout: float) -> bytes:
+            first, pending[0] = pending[0][:count], pending[0][count:]
+            return first or read(count, timeout)
+
+        monkeypatch.setattr(bus.port, "write", noisy_write)
+        monkeypatch.setattr(bus.port, "read", noisy_read)
+        before = bus.port.clock.now()
+        servo.write("Operating Mode", 0)
+        assert servo.read("Operating Mode") == 0
+        assert bus.port.clock.now() - before < 0.01, "no wait for what the noise announces"
 
 
 def test_fast_sync_read_can_be_forbidden(fake_config: Make) -> None:

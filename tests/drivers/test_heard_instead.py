@@ -42,6 +42,25 @@ def test_nor_are_two_replies_with_the_same_id(fast: bool) -> None:
     assert said(both(2, 2, fast=fast), fast=fast).startswith("Intact replies came with the IDs 2, 2, although")
 
 
+@pytest.mark.parametrize(("ids", "fast"), [((2, 2), False), ((1, 1), False), ((2, 1), False), ((2, 2), True)])
+def test_a_reading_under_another_servos_id_is_no_reading(ids: tuple[int, int], fast: bool) -> None:
+    fine, wrong = both(1, 2, fast=fast), both(*ids, fast=fast)
+    cycles = exchange(Wire((fine, wrong)), fast=fast)
+    assert None not in cycles.cycle([0, 0]).servos and cycles.heard.mixed_up == 0
+    assert cycles.cycle([0, 0]).servos == [None, None]
+    assert cycles.heard.mixed_up == 1
+    assert cycles.heard.mixed_up_advice("here").startswith(f"Intact replies came with the IDs {ids[0]}, {ids[1]}, ")
+
+
+def test_replies_out_of_order_because_they_are_late_are_not_taken_for_mixed_up_ones() -> None:
+    wire = Wire((answer(2, 4, 5, 6) + answer(1, 1, 2, 3),))
+    cycles = exchange(wire)
+    assert cycles.cycle([0, 0]).servos == [None, None] and cycles.heard.mixed_up == 1
+    wire.waiting = answer(2, 4, 5, 6)
+    cycles.cycle([0, 0])
+    assert cycles.heard.mixed_up == 0
+
+
 @pytest.mark.parametrize("fast", [False, True])
 def test_damaged_ones_are(fast: bool) -> None:
     fine = both(1, 2, fast=fast)

@@ -1,7 +1,7 @@
 """The codec compared with the manual's printed packets and with dynamixel-sdk, and under noise."""
 
 import pytest
-from dynamixel_sdk import Protocol2PacketHandler
+from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, Protocol2PacketHandler
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
@@ -18,6 +18,7 @@ from hil.drivers.packet import (
     stuff,
     unstuff,
 )
+from hil.drivers.sdk_port import ResyncingPacketHandler
 
 settings.register_profile("no deadline", deadline=None)  # a busy machine is not a failure
 settings.load_profile("no deadline")
@@ -197,6 +198,36 @@ def test_the_sdk_reads_our_statuses(servo_id: int, error: int, data: bytes) -> N
     assert result == 0
     assert (received[4], received[8]) == (servo_id, error)
     assert bytes(received[9 : 9 + len(data)]) == data
+
+
+FALSE_STARTS = st.sampled_from(
+    [
+        b"\xff\xff\xfd",
+        b"\xff\xff\xfd\x00",
+        b"\xff\xff\xfd\x00\x01\x0c\x00\x55\x00",
+        b"\xff\xff\xfd\x00\x01\x04\x00\x55\x00\x00\x00",
+        b"\xff\xff\xfd\x00\x01\xfa\x00\x55",
+        b"\xff\xff\xfd\x00\x01\xff\xff\x55",
+        b"\x00\x55",
+    ]
+)
+
+
+@given(st.lists(FALSE_STARTS, max_size=4).map(b"".join), st.integers(0, MAX_ID), BODIES)
+def test_a_reply_is_found_behind_what_only_begins_like_one_and_nothing_behind_it_is_taken(
+    noise: bytes, servo_id: int, data: bytes
+) -> None:
+    following = encode_status(7, 0, b"\x01")
+    wire = _Wire(noise + encode_status(servo_id, 0, data) + following)
+    received, result = ResyncingPacketHandler().rxPacket(wire, False)  # type: ignore[arg-type]
+    assert (result, received[4], bytes(received[9:-2])) == (0, servo_id, data)
+    assert int.from_bytes(received[5:7], "little") == len(data) + 4
+    assert wire.incoming == following
+
+
+@pytest.mark.parametrize(("received", "result"), [(b"", COMM_RX_TIMEOUT), (b"\xff\xff\xfd\x00\x01", COMM_RX_CORRUPT)])
+def test_time_is_up_without_a_reply(received: bytes, result: int) -> None:
+    assert ResyncingPacketHandler().rxPacket(_Wire(received), False)[1] == result  # type: ignore[arg-type]
 
 
 def test_data_that_the_sdk_gets_wrong() -> None:

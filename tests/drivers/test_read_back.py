@@ -69,6 +69,23 @@ def test_a_goal_written_once_is_no_proof(fake_config: Make, when: int) -> None:
         after_each(bus, once, 100)
 
 
+@pytest.mark.parametrize(("every", "is_found"), [(400, True), (600, False)])
+def test_goals_written_now_and_then_are_found_by_the_third(fake_config: Make, every: int, is_found: bool) -> None:
+    times = iter(range(10_000))
+
+    def seldom(servos: Any) -> None:
+        if next(times) % every == 20:
+            servos[1].write(102, b"\xf9\xff")
+
+    with driven(fake_config(interval=INTERVAL)) as bus:
+        if is_found:
+            with pytest.raises(BusShared, match=r"shoulder.*another program: its Goal Current reads -7"):
+                after_each(bus, seldom, 2 * every + 30)
+            assert next(times) <= 2 * every + 22
+        else:
+            after_each(bus, seldom, 2 * every + 30)
+
+
 @pytest.mark.parametrize("when", [20, 21, 22])
 def test_nor_is_a_goal_of_ours_from_long_ago_seen_twice(fake_config: Make, when: int) -> None:
     """Lost writes leave it, and the status detects those."""

@@ -70,6 +70,22 @@ def test_goals_that_were_never_sent_are_not_lost_goals(arm: Arm, held: Sequence[
     assert ("Goals are lost" in found[1]) != is_foreign
 
 
+@pytest.mark.parametrize(("between_s", "held", "is_found"), [(4.0, -0.1, True), (6.0, -0.1, False), (1.0, 0.05, False)])
+def test_goals_that_are_changed_now_and_then_are_found_by_the_third(
+    arm: Arm, between_s: float, held: float, is_found: bool
+) -> None:
+    """A goal of this program that is still held may be due to lost packets."""
+    check = StatusCheck(arm())
+    found = []
+    for time in range(3):
+        for goal, read in ((0.05, 0.05), (0.1, held), (0.1, 0.1)):
+            check.sent((goal, goal))
+            found.append(check.look(0, FINE._replace(goal=read, tick=time * between_s), goal, time * between_s))
+    assert [each is not None for each in found] == [False] * 7 + [is_found, False]
+    if found[-2] is not None:
+        assert found[-2][0] is Cause.GOALS_LOST and "this program never sent" in found[-2][1]
+
+
 def readings(check: StatusCheck, clock: Callable[[float], float], until: float) -> tuple[float, str] | None:
     """Readings every 35 ms; returns when stale replies are detected, and the message."""
     for index in range(int(until / 0.035)):

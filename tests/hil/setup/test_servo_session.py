@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import serial
 
+from hil.cli.errors import message
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongSetting
@@ -240,6 +241,75 @@ def test_a_servo_that_rebooted_is_named_with_those_that_were_fine(
         assert "'elbow' (ID 2, XM430-W350) answered afterwards and joint 'shoulder' (ID 1, XM430-W350) did not" in cause
         assert "adapter" not in cause, "the fault is not in what all servos share"
     assert bench.changed() == []
+
+
+def drive_again(bench: Bench, after: int, times: int) -> list[int]:
+    """Let another program switch torque on at servo 2 once it has been cut and `after` more packets were written.
+
+    It does so again `after` packets after each further cut, `times` in all. Returns a list of the times it did.
+    """
+    servo, write = bench.servos[2], bench.port.write
+    packets, done = [0], [0]
+
+    def watched(data: bytes) -> Any:
+        written = write(data)
+        packets[0] = 0 if servo.torque_enabled else packets[0] + 1
+        if packets[0] > after and done[0] < times:
+            done[0] += 1
+            for address, value in ((98, b"\x00"), (102, b"\x28\x00"), (100, b"\x28\x00"), (64, b"\x01")):
+                servo.write(address, value)
+            for address in (102, 100):
+                servo.write(address, b"\x28\x00")
+        return written
+
+    bench.port.write = watched
+    return done
+
+
+@pytest.mark.parametrize(
+    ("after", "stop"),
+    [(0, None), (5, None), (40, None), (20, SafetyStop("It swings.", Cause.LATE))],
+    ids=["at_once", "early", "late", "stopped"],
+)
+def test_torque_that_another_program_switches_on_after_it_was_cut_is_cut_again_and_settings_are_restored(
+    arm: Arm, bench: Bench, after: int, stop: HilError | None, state_folder: Path
+) -> None:
+    config = arm(SHORT)
+    with pytest.raises(HilError) as ended, servo_session(config), servo_session(config) as bus:
+        with bus.torque(config.safety.watchdog):
+            pass
+        done = drive_again(bench, after, 1)
+        if stop is not None:
+            raise stop
+    assert done == [1] and not any(servo.torque_enabled for servo in bench.servos.values())
+    assert bench.changed() == [] and not list(state_folder.glob("*.json"))
+    said = "\n".join((str(ended.value), *ended.value.__notes__))
+    assert "Another program switched torque on at joint 'elbow' (ID 2, XM430-W350)" in said
+    assert "Torque is off on both servos, read back." in said and "could not be restored" not in said
+    assert stop is None or ended.value is stop
+
+
+@pytest.mark.parametrize("stop", [None, SafetyStop("It swings.", Cause.LATE)], ids=["complete", "stopped"])
+def test_torque_that_another_program_keeps_switching_on_is_said_in_capitals(
+    arm: Arm, bench: Bench, stop: HilError | None
+) -> None:
+    config = arm(SHORT)
+    with pytest.raises(TorqueNotOff) as ended, servo_session(config), servo_session(config) as bus:
+        try:
+            with bus.torque(config.safety.watchdog):
+                pass
+            drive_again(bench, 0, 1_000_000)
+            if stop is not None:
+                raise stop
+        except HilError as error:
+            error.add_note(str(bus.torque_off_report))
+            raise
+    assert bench.servos[2].torque_enabled
+    said = message(ended.value)
+    assert said.startswith("hil: TORQUE IS ON AT JOINT 'ELBOW' (ID 2, XM430-W350): ANOTHER PROGRAM SWITCHES IT ON")
+    assert "CUT THE SUPPLY NOW" in said and "Torque is off, read back, on joint 'shoulder' (ID 1" in said
+    assert "both servos" not in "\n".join((said, *getattr(stop, "__notes__", ())))
+    assert ("It swings." in said) is (stop is not None)
 
 
 def test_a_killed_run_is_put_back_by_the_next_one_and_by_check(
