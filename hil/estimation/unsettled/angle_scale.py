@@ -8,7 +8,7 @@ encoder zeros as given.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_sh
 
 Array = NDArray[np.float64]
 
+SPRING = "cable_stiffness_1"
 CERTAIN = 4.0  # standard errors of a spring that is worth a closer look
 LEAST = 0.01  # deviation of a scale from 1
 FARTHEST = 0.5, 2.0
@@ -31,12 +32,11 @@ RESTS = 0.2  # largest torque of the spring where the joint would hang, relative
 
 @dataclass(frozen=True)
 class _Scale:
-    """Angles of joint `joint`, counted from 0, that seem to be `factor` times the true ones.
+    """Angles of joint 1 that seem to be `factor` times the true ones.
 
     by_zero: whether the encoder zero says the same.
     """
 
-    joint: int
     factor: float
     by_zero: bool
 
@@ -44,49 +44,45 @@ class _Scale:
 def angle_scale(
     recordings: Sequence[Recording], estimate: ShootingEstimate, origin: Sequence[float] = ()
 ) -> tuple[str, ...]:
-    """A sentence for each joint whose spring, and encoder zero, may be a wrong scale of its angle.
+    """A sentence if the spring and the encoder zero of joint 1 may be a wrong scale of its angle.
 
     origin: the angles of the recordings at which their columns are 0 [rad], by default 0.
     """
     about = np.array(origin) if len(origin) else np.zeros(estimate.model.joints)
-    found = []
-    for each in _candidates(recordings, estimate, about):
-        fitted = _without_spring(recordings, estimate, each, about)
-        if fitted is not None:
-            found.append(_said(*fitted, estimate))
-    return tuple(found)
+    scale = _candidate(recordings, estimate, about)
+    fitted = None if scale is None else _without_spring(recordings, estimate, scale, about)
+    return () if fitted is None else (_said(*fitted, estimate),)
 
 
-def _candidates(recordings: Sequence[Recording], estimate: ShootingEstimate, about: Array) -> Iterator[_Scale]:
-    """Scales that would imitate the springs of the estimate."""
+def _candidate(recordings: Sequence[Recording], estimate: ShootingEstimate, about: Array) -> _Scale | None:
+    """The scale of the first joint that would imitate the spring of the estimate.
+
+    The scales of other joints change how they move the first one, which no spring imitates.
+    """
     value, names = estimate.parameters, list(estimate.names)
-    for joint in range(estimate.model.joints):
-        spring, weight = (f"{kind}_{joint + 1}" for kind in ("cable_stiffness", "gravity"))
-        if spring not in names or not value[weight] > 0.0:
-            continue
-        ratio = value[spring] / value[weight]
-        if abs(value[spring]) < CERTAIN * float(estimate.std[names.index(spring)]) or ratio <= -1.0:
-            continue
-        by_spring, hangs = math.sqrt(1.0 + ratio), -0.5 * math.pi - float(about[joint])
-        if joint == 0 and estimate.zeros.size and abs(hangs) > HANGS_AT:
-            factor = 1.0 - float(np.mean(estimate.zeros[:, joint])) / hangs
-            if abs(factor - by_spring) > CONSISTENT * abs(by_spring - 1.0):
-                continue
-            by_zero = True
-        elif _rests_hanging(recordings, estimate, joint):
-            factor, by_zero = by_spring, False
-        else:
-            continue
-        if abs(factor - 1.0) >= LEAST and FARTHEST[0] <= factor <= FARTHEST[1]:
-            yield _Scale(joint, factor, by_zero)
+    if SPRING not in names or not value["gravity_1"] > 0.0:
+        return None
+    ratio = value[SPRING] / value["gravity_1"]
+    if abs(value[SPRING]) < CERTAIN * float(estimate.std[names.index(SPRING)]) or ratio <= -1.0:
+        return None
+    by_spring, hangs = math.sqrt(1.0 + ratio), -0.5 * math.pi - float(about[0])
+    if estimate.zeros.size and abs(hangs) > HANGS_AT:
+        found = _Scale(1.0 - float(np.mean(estimate.zeros[:, 0])) / hangs, True)
+        if abs(found.factor - by_spring) > CONSISTENT * abs(by_spring - 1.0):
+            return None
+    elif abs(hangs) <= HANGS_AT and _rests_hanging(recordings, estimate):
+        found = _Scale(by_spring, False)
+    else:
+        return None
+    return found if abs(found.factor - 1.0) >= LEAST and FARTHEST[0] <= found.factor <= FARTHEST[1] else None
 
 
-def _rests_hanging(recordings: Sequence[Recording], estimate: ShootingEstimate, joint: int) -> bool:
+def _rests_hanging(recordings: Sequence[Recording], estimate: ShootingEstimate) -> bool:
     """Whether the spring is slack where the joint hangs, as far as the offset tells."""
     value = estimate.parameters
-    stiffness, offset = value[f"cable_stiffness_{joint + 1}"], value[f"offset_{joint + 1}"]
-    moved = max(float(np.ptp(each.filled()[joint])) for each in recordings)
-    return joint == 0 and abs(offset - 0.5 * math.pi * stiffness) < RESTS * abs(stiffness) * moved
+    stiffness, offset = value[SPRING], value["offset_1"]
+    moved = max(float(np.ptp(each.filled()[0])) for each in recordings)
+    return abs(offset - 0.5 * math.pi * stiffness) < RESTS * abs(stiffness) * moved
 
 
 def _without_spring(
@@ -94,14 +90,11 @@ def _without_spring(
 ) -> tuple[_Scale, ShootingEstimate] | None:
     """The fit in this scale without springs and with the zeros as given, if it explains the motion as well."""
     limit = AS_WELL * estimate.residual_over_noise
-    if (
-        not scale.by_zero
-    ):  # the spring's torque is not exactly linear in the angle: what is left of it corrects the scale
+    if not scale.by_zero:  # a scale is not exactly a spring: what is left of the spring corrects it
         refined = _fitted(recordings, estimate, scale, about, spring=True)
         if refined is None:
             return None
-        joint, value = scale.joint + 1, refined.parameters
-        left = value[f"cable_stiffness_{joint}"] / value[f"gravity_{joint}"]
+        left = refined.parameters[SPRING] / refined.parameters["gravity_1"]
         scale = replace(scale, factor=scale.factor * math.sqrt(max(1.0 + left, FARTHEST[0] ** 2)))
     found = _fitted(recordings, estimate, scale, about, spring=False)
     if found is None or np.any(found.residual_over_noise > limit):
@@ -112,7 +105,7 @@ def _without_spring(
 def _fitted(
     recordings: Sequence[Recording], estimate: ShootingEstimate, scale: _Scale, about: Array, *, spring: bool
 ) -> ShootingEstimate | None:
-    factor = np.where(np.arange(estimate.model.joints) == scale.joint, scale.factor, 1.0)
+    factor = np.where(np.arange(estimate.model.joints) == 0, scale.factor, 1.0)
     model = estimate.model if spring else estimate.model.without("cable")
     start = estimate.value[: len(model.base_names)]
     try:
@@ -135,19 +128,18 @@ def _scaled(recordings: Sequence[Recording], factor: Array, about: Array) -> lis
 
 
 def _said(scale: _Scale, found: ShootingEstimate, estimate: ShootingEstimate) -> str:
-    joint, weight = f"joint {scale.joint + 1}", f"gravity_{scale.joint + 1}"
     instead = (
         "the spring and the zero of the encoder that were fitted" if scale.by_zero else "the spring that was fitted"
     )
     cause = (
         ""
         if scale.by_zero
-        else f" Only a spring that is slack where {joint} hangs has the same effect: if there is one, this model is "
+        else " Only a spring that is slack where joint 1 hangs has the same effect: if there is one, this model is "
         "right."
     )
+    given, other = estimate.parameters["gravity_1"], found.parameters["gravity_1"]
     return (
-        f"The angle of {joint} seems to be {scale.factor:.4g} times the true one: divided by that, it is explained as "
-        f"well without {instead}, and {weight} is {found.parameters[weight]:.4g} instead of "
-        f"{estimate.parameters[weight]:.4g} N m. Check the unit, the ticks per turn and the belt or gear ratio between "
-        f"encoder and {joint}.{cause}"
+        f"The angle of joint 1 seems to be {scale.factor:.4g} times the true one: divided by that, it is explained as "
+        f"well without {instead}, and gravity_1 is {other:.4g} instead of {given:.4g} N m. Check the unit, the ticks "
+        f"per turn and the belt or gear ratio between encoder and joint 1.{cause}"
     )
