@@ -1,10 +1,13 @@
-"""numpy's linear algebra for the estimator: if it fails, it raises an error of the estimator.
+"""numpy's linear algebra and scipy's least squares for the estimator: if they fail, they raise an error of the
+estimator.
 
 Matrices that are not finite, because a simulated motion diverged or a parameter lost its effect, make decompositions
 fail with numpy's LinAlgError. Callers of an estimate do not handle it: a search over models would stop with a traceback
-instead of trying the next model. Therefore `hil.estimator` and `hil.estimation` take these functions from here.
+instead of trying the next model. `least_squares` fails on such residuals with a ValueError. Therefore `hil.estimator`
+and `hil.estimation` take these functions from here.
 """
 
+import re
 from collections.abc import Callable
 from functools import wraps
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
@@ -19,6 +22,7 @@ __all__ = [
     "eigh",
     "eigvalsh",
     "inv",
+    "least_squares",
     "lstsq",
     "matrix_rank",
     "pinv",
@@ -28,18 +32,23 @@ __all__ = [
     "svd",
 ]
 
+NOT_FINITE = re.compile(r"not finite|infs or NaNs")
+"""What scipy's ValueErrors about values that are not finite say; others are mistakes of the caller."""
+
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
 def _guarded(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return `function` with LinAlgError replaced by ConvergenceError."""
+    """Return `function` with errors about the values, not about the call, replaced by ConvergenceError."""
 
     @wraps(function)
     def guarded(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
         try:
             return function(*args, **kwargs)
-        except np.linalg.LinAlgError as error:
+        except (np.linalg.LinAlgError, ValueError) as error:
+            if not isinstance(error, np.linalg.LinAlgError) and not NOT_FINITE.search(str(error)):
+                raise
             raise ConvergenceError(
                 f"the equations of the fit cannot be solved ({error}): a simulated motion diverges, or the motion says "
                 "nothing about some parameter. Check the units and signs of torque and angle, and whether the arm was "
@@ -52,7 +61,15 @@ def _guarded(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
 if TYPE_CHECKING:
     from numpy.linalg import cholesky, cond, eigh, eigvalsh, inv, lstsq, matrix_rank, pinv, qr, solve, svd
     from numpy.polynomial.polynomial import polyfit
+    from scipy.optimize import least_squares
 else:
+
+    @_guarded
+    def least_squares(*args, **kwargs):
+        from scipy.optimize import least_squares  # slow to import, and few estimates need it
+
+        return least_squares(*args, **kwargs)
+
     cholesky, cond, eigh = _guarded(np.linalg.cholesky), _guarded(np.linalg.cond), _guarded(np.linalg.eigh)
     eigvalsh, inv, lstsq = _guarded(np.linalg.eigvalsh), _guarded(np.linalg.inv), _guarded(np.linalg.lstsq)
     matrix_rank, pinv, qr = _guarded(np.linalg.matrix_rank), _guarded(np.linalg.pinv), _guarded(np.linalg.qr)

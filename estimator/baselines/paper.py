@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
 
 from hil.estimator import linalg
 from hil.estimator.arrays import Array
@@ -180,7 +179,7 @@ def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm
         return np.concatenate((left.real, left.imag))
 
     start = np.array([known.mass_1, known.mass_2, known.viscous][: 1 + order])
-    found = least_squares(misfit, start, x_scale=np.maximum(start, 0.1), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    found = linalg.least_squares(misfit, start, x_scale=np.maximum(start, 0.1), xtol=1e-14, ftol=1e-14, gtol=1e-14)
     variance = 2.0 * found.cost / (found.fun.size - start.size)
     jacobian = np.asarray(found.jac, dtype=np.float64)
     std = np.sqrt(variance * np.diag(linalg.inv(jacobian.T @ jacobian)))
@@ -196,7 +195,7 @@ def _nearest_masses(found: Array, joint: int, known: PaperArm) -> Array:
         arm = replace(known, mass_1=abs(float(x[0])), mass_2=abs(float(x[1])))
         return np.asarray((_transfer(arm, joint) - found) / size)
 
-    return np.abs(least_squares(misfit, [0.8 * known.mass_1, 0.8 * known.mass_2]).x)
+    return np.abs(linalg.least_squares(misfit, [0.8 * known.mass_1, 0.8 * known.mass_2]).x)
 
 
 def _transfer(arm: PaperArm, joint: int) -> Array:

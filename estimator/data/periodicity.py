@@ -11,7 +11,12 @@ from hil.estimator.arrays import Array
 from hil.estimator.errors import ShapeError
 
 EVEN = 1.1  # maximum ratio of successive changes in a decreasing sequence
-SLOWLY = 0.4, 0.97  # mean ratio of successive changes of a slow drift; smaller for a transient, larger for others
+SLOWEST = 0.97  # largest mean ratio of successive changes that still counts as decreasing
+SLOWLY = 0.65  # least ratio of successive changes while friction warms up, which takes many periods
+ALIKE = (
+    0.8  # least correlation of successive changes while friction warms up, which always changes in the same direction
+)
+MOST_PERIODS = 100  # more are no advice
 
 
 @dataclass(frozen=True)
@@ -53,23 +58,58 @@ def settling_difference(former: Array, latest: Array) -> float:
     return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())
 
 
-def periods_of_drift(differences: Sequence[float], within: float) -> int | None:
-    """Return how many more periods a slow drift takes until successive periods differ by at most `within`.
+@dataclass(frozen=True)
+class Decay:
+    """A change from period to period that decreases by about the same factor each time.
 
-    As grease warms up, the change from period to period decreases slowly and steadily. None if the changes do not look
-    like that: backlash or a dragging cable make them irregular, and a transient dies out faster.
+    ratio: that factor. further: how many more periods it takes until successive periods differ little enough.
+    """
 
-    differences: relative differences of successive periods, in the order of time; the first may contain a transient.
+    ratio: float
+    further: int
+
+    def is_warming(self, correlation: float) -> bool:
+        """Whether it looks like friction that warms up instead of a transient that has not died out.
+
+        Friction decreases over many periods, and the motion always changes in the same direction. A transient
+        oscillates at the arm's own frequencies, or decays faster. correlation: see `correlation_of_changes`.
+        """
+        return self.ratio >= SLOWLY and correlation >= ALIKE
+
+
+def decay_of(differences: Sequence[float], within: float) -> Decay | None:
+    """Return how the relative differences of successive periods decrease, and how long until they are `within`.
+
+    None if they do not decrease steadily: a transient only dies out and friction only warms up, whereas backlash, a
+    dragging cable or bumps make the differences irregular.
+
+    differences: in the order of time; the first may contain the transient of the ramp, but is not exceeded later.
     """
     falling = list(differences[1:])
-    if len(falling) < 2 or not all(math.isfinite(each) and each > 0.0 for each in falling):
+    if len(falling) < 2 or not all(math.isfinite(each) and each > 0.0 for each in differences):
         return None
-    if any(later > EVEN * former for former, later in itertools.pairwise(falling)):
+    if any(later > EVEN * former for former, later in itertools.pairwise(differences)):
         return None
     ratio = (falling[-1] / falling[0]) ** (1.0 / (len(falling) - 1))
-    if not SLOWLY[0] <= ratio <= SLOWLY[1]:
+    if not ratio <= SLOWEST:
         return None
-    return max(1, math.ceil(math.log(within / falling[-1]) / math.log(ratio)))
+    further = max(1, math.ceil(math.log(within / falling[-1]) / math.log(ratio)))
+    return Decay(ratio, further) if len(differences) + further <= MOST_PERIODS else None
+
+
+def correlation_of_changes(position: Array) -> float:
+    """Return the correlation of a period's change with the one before; -1 for opposite changes.
+
+    position: the three latest periods (3, joints, samples) [rad]. The joint whose motion changes most, relative to the
+    motion, counts. As in `settling_difference`, only the second halves are compared. NaN if nothing can be compared.
+    """
+    half = position[:, :, position.shape[2] // 2 :]
+    changes = np.diff(half, axis=0)
+    joint = int(np.argmax(period_difference(half).relative[-1]))
+    former, latest = changes[0, joint], changes[1, joint]
+    seen = np.isfinite(former) & np.isfinite(latest)
+    size = math.sqrt(float(np.sum(former[seen] ** 2)) * float(np.sum(latest[seen] ** 2)))
+    return float(np.sum(former[seen] * latest[seen])) / size if size else math.nan
 
 
 def _rms(values: Array) -> Array:

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from hil.estimator import linalg
 from hil.estimator.arrays import Array
@@ -121,8 +120,8 @@ def physical_quantities(
 
     start = np.array([_guess(name, base, known, gravity) for name in unknown])
     unit = np.maximum(np.abs(start), 1e-9)
-    rough = least_squares(misfit, start, x_scale=unit, args=(False,), xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    fine = least_squares(misfit, rough.x, x_scale=unit, args=(True,), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    rough = linalg.least_squares(misfit, start, x_scale=unit, args=(False,), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    fine = linalg.least_squares(misfit, rough.x, x_scale=unit, args=(True,), xtol=1e-15, ftol=1e-15, gtol=1e-15)
     size = np.maximum(np.abs(fine.x), 1e-3 * unit)
     null = _null_space(_slope(lambda x: misfit(x, False), fine.x, size))
     spread = _spread(_slope(lambda x: misfit(x, True), fine.x, size)) * size

@@ -25,7 +25,7 @@ from hil.drivers.torque_off import TRIP_S
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
 from hil.estimator.chain.simulation.rollout import ChainArms
-from hil.estimator.data.periodicity import periods_of_drift
+from hil.estimator.data.periodicity import correlation_of_changes, decay_of
 from hil.experiment.apart import opposed
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
@@ -254,14 +254,27 @@ class Stream:
 
     def _advice(self, differences: Sequence[float], samples: int) -> str:
         """What to do about periods of `samples` samples that differ from each other by `differences`."""
-        further = periods_of_drift(differences, self._plan.settle_within)
-        if further is None:
+        decay = decay_of(differences, self._plan.settle_within)
+        if decay is None:
             return "Check for backlash, a dragging cable or a slipping joint, or raise max_settling_periods."
-        seconds = (self._plan.warm_up_periods + len(differences) + further) * samples * self._interval
+        listed = ", ".join(f"{each:.1%}" for each in differences)
+        played = len(differences) + decay.further
+        if decay.is_warming(self._correlation(samples)):
+            seconds = (self._plan.warm_up_periods + played) * samples * self._interval
+            return (
+                f"The change decreases slowly from period to period ({listed}), as happens while grease warms up: set "
+                f"experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
+            )
         return (
-            f"The change decreases slowly from period to period ({', '.join(f'{each:.1%}' for each in differences)}), "
-            f"as happens while grease warms up: set experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
+            f"The change decreases from period to period ({listed}), by a factor of {decay.ratio:.2g} each time: the "
+            "transient at the start has not died out yet. It needs more periods: set "
+            f"experiment.max_settling_periods = {played}."
         )
+
+    def _correlation(self, samples: int) -> float:
+        """Correlation of the latest period's change with the one before; each period has `samples` samples."""
+        latest = self._recorder.samples["position"][-3 * samples :]
+        return correlation_of_changes(latest.reshape(3, samples, -1).transpose(0, 2, 1))
 
     def _check_motion(self, moved: Sequence[float]) -> None:
         """Detect a joint held by friction or an obstacle after a period, before more time is wasted."""

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hil.estimator.data.fourier import cut_off, held_lines, lines_of, motion_of
-from hil.estimator.data.periodicity import period_difference, periods_of_drift
+from hil.estimator.data.periodicity import correlation_of_changes, decay_of, period_difference
 from hil.estimator.errors import ModelError, ShapeError
 from hil.estimator.fit.reparametrisation import Coordinates, Sizes, scales_of
 from hil.estimator.models.model import Model
@@ -162,10 +162,24 @@ def test_a_joint_that_never_answered_is_not_settled() -> None:
     assert period_difference(periods).relative.tolist() == [[0.0, np.inf]]
 
 
-def test_a_slow_drift_is_told_from_a_transient_and_from_play() -> None:
+def test_a_steady_decrease_is_told_from_play_and_tells_the_time_it_takes() -> None:
     slow = [0.2, *(0.05 * 0.8**n for n in range(5))]
-    further = periods_of_drift(slow, 0.01)
-    assert further is not None and slow[-1] * 0.8**further <= 0.01 < slow[-1] * 0.8 ** (further - 1)
-    transient, play, steady = [0.2, 0.02, 0.002, 0.0002], [0.2, 0.03, 0.05, 0.02, 0.04], [0.2, 0.05, 0.05, 0.05]
-    for others in (transient, play, steady, slow[:2], [0.2, np.inf, 0.05]):
-        assert periods_of_drift(others, 1e-5) is None
+    decay = decay_of(slow, 0.01)
+    assert decay is not None and decay.ratio == pytest.approx(0.8)
+    assert slow[-1] * 0.8**decay.further <= 0.01 < slow[-1] * 0.8 ** (decay.further - 1)
+    play, steady, bumps = [0.2, 0.03, 0.05, 0.02, 0.04], [0.2, 0.05, 0.05, 0.05], [0.291, 0.341, 0.133, 0.098, 0.08]
+    for others in (play, steady, bumps, slow[:2], [0.2, np.inf, 0.05], [0.9, 0.85, 0.8245]):
+        assert decay_of(others, 1e-5) is None
+
+
+@pytest.mark.parametrize(("ratio", "turned", "warms"), [(0.8, False, True), (0.8, True, False), (0.5, False, False)])
+def test_warming_friction_changes_the_motion_slowly_and_always_in_the_same_direction(
+    ratio: float, turned: bool, warms: bool
+) -> None:
+    wave = np.sin(np.linspace(0.0, 2.0 * np.pi, 101)[:-1])
+    sizes = np.cumsum([0.0, *(0.1 * (-ratio if turned else ratio) ** n for n in range(5))])
+    periods = (1.0 + sizes)[:, None, None] * np.stack([wave, 0.1 * wave])
+    periods[-2, 0, 77] = np.nan
+    decay = decay_of(period_difference(periods).relative[:, 0].tolist(), 1e-3)
+    assert decay is not None
+    assert decay.is_warming(correlation_of_changes(periods[-3:])) is warms

@@ -9,7 +9,6 @@ weakly regularised towards the description.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from hil.estimator import linalg
 from hil.estimator.arrays import Array
@@ -73,7 +72,7 @@ def nearest_links(base: BaseParameters, value: Array, std: Array, described: Arr
         return np.concatenate((base.grouping @ by_x / floor[:, None], np.diag(PULL / scale)))
 
     scale = np.concatenate((np.tile(_scales(), joints), np.ones(joints)))
-    found = least_squares(residual, start, slopes, x_scale=scale, max_nfev=200)
+    found = linalg.least_squares(residual, start, slopes, x_scale=scale, max_nfev=200)
     table = parameters(found.x)
     assert table.shape == (joints, TERMS)
     return PhysicalLinks(table[:, :-1], table[:, -1], float(np.abs(misfit(found.x)).max()))

@@ -18,6 +18,7 @@ from hil.estimation.result_checks import describe_segment_choice, describe_verdi
 from hil.estimation.slips.position_jumps import jump_warnings
 from hil.estimation.torque_constants import Source, contradictions, ratios_of, ratios_said
 from hil.estimation.unsettled.agreement import disagreement
+from hil.estimation.unsettled.angle_scale import angle_scale
 from hil.estimation.unsettled.causes import causes
 from hil.estimation.unsettled.plausibility import implausible, undetermined
 from hil.estimation.unsettled.warnings import doubts_of
@@ -63,7 +64,8 @@ class Given:
 
     torque_scale_std: see `hil.estimator.models.conflicts.conflicts`. zeros: whether a configuration defines the encoder
     zeros. names: names of the recordings. jumps: a sentence for each joint of a recording whose position jumped.
-    torque_source: where the torques come from.
+    torque_source: where the torques come from. origin: the angles [rad] at which the columns of positions are 0, by
+    default 0.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
@@ -71,6 +73,7 @@ class Given:
     names: tuple[str, ...] = ()
     jumps: tuple[str, ...] = ()
     torque_source: Source = "column"
+    origin: tuple[float, ...] = ()
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
@@ -125,7 +128,8 @@ def estimate_any(
     conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
     ratios = ratios_of(estimate.names, estimate.value, estimate.std)
     contradictory = contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
-    odd = (*apart, *why, *contradictory, *implausible(recordings, estimate, gravity), *undetermined(estimate))
+    scales = () if given.jumps or apart or why else angle_scale(recordings, estimate, given.origin)
+    odd = (*apart, *why, *scales, *contradictory, *implausible(recordings, estimate, gravity), *undetermined(estimate))
     if given.jumps:
         odd = (JUMPED, *odd)
     verdict = judge_segments(

@@ -58,7 +58,8 @@ def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder:
     zeros = (columns.zeros_unknown or config.model.zeros) and gravity > 0.0
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
     refuse_slips(read.recordings, ", ".join(map(str, paths)))
-    given = Given(names=read.names, jumps=jump_sentences(whole.recordings, whole.names, whole.stepped))
+    jumps = jump_sentences(whole.recordings, whole.names, whole.stepped)
+    given = Given(names=read.names, jumps=jumps, origin=tuple(columns.zero or ()))
     found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped, given)
     result = _named(found, read, gravity)
     if config.known is not None:

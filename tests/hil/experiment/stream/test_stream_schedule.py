@@ -309,12 +309,18 @@ def test_the_other_periods_follow_the_first_settled_one(make: Make, differences:
     assert settle(stream, differences) == list(range(last + 1))
 
 
-def test_what_never_settles_is_refused_with_the_time_that_warming_up_takes(make: Make) -> None:
+def test_what_never_settles_is_refused_with_the_time_that_it_takes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     stream, _, _ = make(max_settling_periods=5, warm_up_periods=2)
     with pytest.raises(NotSettled, match=r"After 5 periods of 0\.4 s .* Check for backlash") as stop:
         settle(stream, [0.5, 0.1, 0.4, 0.1, 0.2])
     assert stop.value.__notes__ == [str(list(range(6)))]
+    stream, _, _ = make(max_settling_periods=5, warm_up_periods=2)
+    monkeypatch.setattr(stream, "_correlation", lambda _: 0.95)
+    with pytest.raises(NotSettled, match=r"by a factor of 0\.5 each time: the transient .*periods = 8\.") as stop:
+        settle(stream, [0.8, 0.5, 0.25, 0.125, 0.0625])  # three more halve it to 0.8 %
+    assert "grease" not in str(stop.value)
     stream, _, _ = make(rate=0.5, max_settling_periods=5, warm_up_periods=2)
+    monkeypatch.setattr(stream, "_correlation", lambda _: 0.95)
     with pytest.raises(NotSettled, match=r"50\.0%, 20\.0%, 18\.0%, .*set experiment\.warm_up = 530\.") as stop:
         settle(stream, [0.5, 0.2, 0.18, 0.162, 0.1458])  # 26 more periods: (2 + 5 + 26) * 16 s = 528 s
 

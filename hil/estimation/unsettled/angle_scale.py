@@ -1,0 +1,145 @@
+"""Detection of angles in a wrong scale: an encoder's resolution, a belt or a gear ratio other than stated.
+
+A joint's equation is linear in its angle except for gravity, so only gravity reveals the scale. Near the angle at which
+the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, a weaker gravity and a spring: with a
+spring, an offset and an encoder zero, a fit explains angles in a wrong scale s down to the noise, with wrong values. So
+if a fit found a spring, the motion is also fitted in the scale that would imitate it, without the spring and with the
+encoder zeros as given.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.estimator.data.recording import Recording
+from hil.estimator.errors import EstimationError
+from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
+
+Array = NDArray[np.float64]
+
+SPRING = "cable_stiffness_1"
+CERTAIN = 4.0  # standard errors of a spring that is worth a closer look
+LEAST = 0.01  # deviation of a scale from 1
+FARTHEST = 0.5, 2.0
+AS_WELL = 1.02  # largest ratio of the residuals if the scale explains the motion as well as the spring
+HANGS_AT = 0.3  # rad: least angle from the columns' origin to where the joint hangs, for its zero to reveal the scale
+CONSISTENT = 0.4  # largest difference between the scales by zero and by spring, relative to their deviation from 1
+RESTS = 0.2  # largest torque of the spring where the joint would hang, relative to its range in the motion
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """Angles of joint 1 that seem to be `factor` times the true ones.
+
+    by_zero: whether the encoder zero says the same.
+    """
+
+    factor: float
+    by_zero: bool
+
+
+def angle_scale(
+    recordings: Sequence[Recording], estimate: ShootingEstimate, origin: Sequence[float] = ()
+) -> tuple[str, ...]:
+    """A sentence if the spring and the encoder zero of joint 1 may be a wrong scale of its angle.
+
+    origin: the angles of the recordings at which their columns are 0 [rad], by default 0.
+    """
+    about = np.array(origin) if len(origin) else np.zeros(estimate.model.joints)
+    scale = _candidate(recordings, estimate, about)
+    fitted = None if scale is None else _without_spring(recordings, estimate, scale, about)
+    return () if fitted is None else (_said(*fitted, estimate),)
+
+
+def _candidate(recordings: Sequence[Recording], estimate: ShootingEstimate, about: Array) -> _Scale | None:
+    """The scale of the first joint that would imitate the spring of the estimate.
+
+    The scales of other joints change how they move the first one, which no spring imitates.
+    """
+    value, names = estimate.parameters, list(estimate.names)
+    if SPRING not in names or not value["gravity_1"] > 0.0:
+        return None
+    ratio = value[SPRING] / value["gravity_1"]
+    if abs(value[SPRING]) < CERTAIN * float(estimate.std[names.index(SPRING)]) or ratio <= -1.0:
+        return None
+    by_spring, hangs = math.sqrt(1.0 + ratio), -0.5 * math.pi - float(about[0])
+    if estimate.zeros.size and abs(hangs) > HANGS_AT:
+        found = _Scale(1.0 - float(np.mean(estimate.zeros[:, 0])) / hangs, True)
+        if abs(found.factor - by_spring) > CONSISTENT * abs(by_spring - 1.0):
+            return None
+    elif abs(hangs) <= HANGS_AT and _rests_hanging(recordings, estimate):
+        found = _Scale(by_spring, False)
+    else:
+        return None
+    return found if abs(found.factor - 1.0) >= LEAST and FARTHEST[0] <= found.factor <= FARTHEST[1] else None
+
+
+def _rests_hanging(recordings: Sequence[Recording], estimate: ShootingEstimate) -> bool:
+    """Whether the spring is slack where the joint hangs, as far as the offset tells."""
+    value = estimate.parameters
+    stiffness, offset = value[SPRING], value["offset_1"]
+    moved = max(float(np.ptp(each.filled()[0])) for each in recordings)
+    return abs(offset - 0.5 * math.pi * stiffness) < RESTS * abs(stiffness) * moved
+
+
+def _without_spring(
+    recordings: Sequence[Recording], estimate: ShootingEstimate, scale: _Scale, about: Array
+) -> tuple[_Scale, ShootingEstimate] | None:
+    """The fit in this scale without springs and with the zeros as given, if it explains the motion as well."""
+    limit = AS_WELL * estimate.residual_over_noise
+    if not scale.by_zero:  # a scale is not exactly a spring: what is left of the spring corrects it
+        refined = _fitted(recordings, estimate, scale, about, spring=True)
+        if refined is None:
+            return None
+        left = refined.parameters[SPRING] / refined.parameters["gravity_1"]
+        scale = replace(scale, factor=scale.factor * math.sqrt(max(1.0 + left, FARTHEST[0] ** 2)))
+    found = _fitted(recordings, estimate, scale, about, spring=False)
+    if found is None or np.any(found.residual_over_noise > limit):
+        return None
+    return scale, found
+
+
+def _fitted(
+    recordings: Sequence[Recording], estimate: ShootingEstimate, scale: _Scale, about: Array, *, spring: bool
+) -> ShootingEstimate | None:
+    factor = np.where(np.arange(estimate.model.joints) == 0, scale.factor, 1.0)
+    model = estimate.model if spring else estimate.model.without("cable")
+    start = estimate.value[: len(model.base_names)]
+    try:
+        return estimate_by_shooting(_scaled(recordings, factor, about), model, start, length=estimate.segment_length)
+    except EstimationError:
+        return None
+
+
+def _scaled(recordings: Sequence[Recording], factor: Array, about: Array) -> list[Recording]:
+    """The recordings with angles divided by `factor` (joints,), except that those at `about` (joints,) [rad] stay."""
+    centre = about[:, None]
+    return [
+        replace(
+            each,
+            position=centre + (each.position - centre) / factor[:, None],
+            position_step=each.position_step / factor,
+        )
+        for each in recordings
+    ]
+
+
+def _said(scale: _Scale, found: ShootingEstimate, estimate: ShootingEstimate) -> str:
+    instead = (
+        "the spring and the zero of the encoder that were fitted" if scale.by_zero else "the spring that was fitted"
+    )
+    cause = (
+        ""
+        if scale.by_zero
+        else " Only a spring that is slack where joint 1 hangs has the same effect: if there is one, this model is "
+        "right."
+    )
+    given, other = estimate.parameters["gravity_1"], found.parameters["gravity_1"]
+    return (
+        f"The angle of joint 1 seems to be {scale.factor:.4g} times the true one: divided by that, it is explained as "
+        f"well without {instead}, and gravity_1 is {other:.4g} instead of {given:.4g} N m. Check the unit, the ticks "
+        f"per turn and the belt or gear ratio between encoder and joint 1.{cause}"
+    )
