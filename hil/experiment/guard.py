@@ -91,7 +91,7 @@ class Guard:
             joint.joint.servo if by_current else None for joint, by_current in zip(config.joints, currents, strict=True)
         ]
         # A pilot lowers the torque itself after such a stop.
-        is_lowering = lowers_since is not None
+        self._is_lowering = is_lowering = lowers_since is not None
         lower = (
             ""
             if config.experiment.pilot or is_lowering
@@ -177,13 +177,15 @@ class Guard:
     def _look_one_by_one(self, state: State, now: float, unsure: float) -> None:
         """Check an exchange in which replies are missing or report an error, or that follows a missing reply."""
         missing, error = state.missing, state.error
+        # Lowering ends before an exchange that might last too long.
+        silent = 2.0 * state.time_after_read - now if self._is_lowering else now
         for index in range(len(missing)):
             if error[index] & ALERT:
                 self._stop(
                     index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, then reboot it."
                 )
             if missing[index]:
-                self._count_missing(index, error[index], now, alone=not all(missing))
+                self._count_missing(index, error[index], silent, alone=not all(missing))
                 continue
             self._count_errors(index, error[index])
             fault = self._checks.look_at(index, state, unsure, self._missing[index])

@@ -1,9 +1,11 @@
 """Stop of an arm that cannot hang freely: brake, then lower it to its rest pose while its servos accept commands.
 
 The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the path
-home; where a joint stays off the path, further torque towards it grows. Lowering is monitored like the experiment: a
-missing reply, an alert, a current that does not follow its goal or a joint that leaves the path ends it, and torque is
-cut. The damper acts on velocities that the positions confirm.
+home; where a joint stays off the path, further torque towards it grows. Lowering is monitored like the experiment: an
+alert, a current that does not follow its goal, a joint that leaves the path or a motor that turns against its goals
+(`hil.plan.obedience`) ends it, and torque is cut. The damper acts on velocities that the positions confirm.
+
+Replies may be missing for a moment, also at the beginning: joints that are not heard get the feed-forward torque alone.
 """
 
 from collections import deque

@@ -34,6 +34,7 @@ class Silence:
         self._limit = missing_limit(config) if heard_at is None else bridged_limit(config)
         late = late_limit(config)
         self._blind: Limit = max(late, self._limit, key=lambda limit: limit.seconds)
+        self._already = heard_at is not None
         self._asked_at: float | None = None
         self._turn = 0.0
         self._last_heard: list[float | None] = [heard_at] * count
@@ -87,6 +88,7 @@ class Silence:
         listened = max(self._listened[joint], self.counts[joint] * self._interval)
         elapsed = max(now - last, listened)
         count = self.counts[joint] + refused
+        count += self._already  # replies may have been missing before the arm was lowered
         allowed = self._limit if alone or not self.is_busy else self._blind
         if is_missing_too_long(count, listened, allowed):
             return f"{_ms(elapsed)} ago{_delayed(elapsed - listened)}; {allowed.said} allows {_ms(allowed.seconds)}"

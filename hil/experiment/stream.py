@@ -51,6 +51,9 @@ _BY_OTHER_GOALS = {
 }
 """Causes of a stop that another program's goals may have."""
 
+_LATE_REPLIES_S = 0.008
+"""How much longer replies are awaited while the arm is lowered [s]."""
+
 _FORGETS = 0.98
 """Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
 
@@ -427,6 +430,8 @@ class Stream:
         """Follow the path home; return the last state. Raises SafetyStop, StopRequested, DriverError."""
         asked = max(1, self._stop.count)
         watch = self._model if isinstance(self._model, ChainWatch) else None
+        # Replies that are merely late are worth a missed deadline: without them, nothing corrects the way down.
+        self._exchange.wait_longer(_LATE_REPLIES_S)
         # The path begins with the latest state that is known, which may be a few exchanges old.
         passed = round((self._clock.now() - state.time_before_write) / self._interval) if self._is_blind else 0
         for index in range(passed, lowering.begin(state, self._goal, self._guard.recent, watch)):

@@ -22,10 +22,9 @@ ENOUGH = 0.45
 
 LONGEST_TEST_S = 0.06
 
-TURNED, TURNING = 1.3, 0.7
+TURNED, PUSHED = 1.1, 0.7
 """Share of a joint's torque that must vanish from the unexplained torque together with its goal: 2 for a turned motor,
-1 for one without torque, 0 for a push. The smaller share counts for a joint that the unexplained torque makes faster;
-one that is slowed down may have struck something, which also ends with its goal.
+less if it has only just turned round, 1 for one without torque, 0 for a push. Between the two, the joint is tested again.
 """
 
 MOVES_RAD_S = 0.1
@@ -86,12 +85,12 @@ class Obedience:
                 test.drives |= _drives(lacking, velocity[joint])
             elif abs(torque) <= ENOUGH * abs(test.torque) or now - test.since > LONGEST_TEST_S:
                 share = (test.lacking - lacking) / (test.torque - torque) if torque != test.torque else 0.0
-                if test.drives and share > TURNING:
+                # What slows a joint down may be an obstacle, whose force also ends with the goal.
+                if test.drives and share > TURNED:
                     return joint
                 self._tests[joint] = None
                 self._rests_until[joint] = now + PAUSE_S
-                # What slowed the joint may have been a stop, or a turned motor, which shows as soon as it brakes.
-                self._pushed[joint] = test.drives or share <= TURNED
+                self._pushed[joint] = share <= PUSHED
         self.suspect(found, velocity, now)
         return -1
 
