@@ -24,7 +24,7 @@ LONGEST_TEST_S = 0.06
 
 TURNED, PUSHED = 1.1, 0.7
 """Share of a joint's torque that must vanish from the unexplained torque together with its goal: 2 for a turned motor,
-less if it has only just turned round, 1 for one without torque, 0 for a push. Between the two, the joint is tested again.
+less if it has just turned round, 1 for one without torque, 0 for a push. Between the two, the joint is tested again.
 """
 
 MOVES_RAD_S = 0.1
