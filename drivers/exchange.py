@@ -168,6 +168,13 @@ class Exchange:
         """Longest time that a cycle waits for replies [s]."""
         return max(plan.timeout for plan in self._plans)
 
+    def wait_longer(self, seconds: float) -> None:
+        """Wait this much longer [s] for missing replies from now on: they may merely be late."""
+        is_usual = self._latest_plan is self._usual
+        self._plans = [plan._replace(timeout=plan.timeout + seconds) for plan in self._plans]
+        self._usual = self._plans[0]
+        self._latest_plan = self._usual if is_usual else self._latest_plan
+
     def read_status_next(self) -> None:
         """Read the status in the next cycle instead of when it is due."""
         if self._status_every < _NEVER:

@@ -83,9 +83,10 @@ class Cause(Enum):
         """Whether the servos still accept commands, so that an arm may be lowered under supervision.
 
         Without its watchdog a servo obeys as before; if the watchdog had tripped, the loss of torque would be detected
-        during lowering.
+        during lowering. Replies that are missing may return: the arm is driven on without them for a moment.
         """
         others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
+        others.add(Cause.MISSING)
         return self.allows_braking or self in others
 
 

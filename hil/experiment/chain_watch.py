@@ -24,6 +24,7 @@ from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.experiment.apart import causes_of_standstill
 from hil.experiment.consistency import check_standstill
 from hil.plan.chain_model import known_chain
+from hil.plan.obedience import Residual
 
 Array = NDArray[np.float64]
 
@@ -74,8 +75,20 @@ class ChainWatch:
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
+        joint = self._observe(state)
+        if joint >= 0:
+            self._raise(joint, state)
+
+    def residual(self, state: State | None = None) -> Residual:
+        """What the model does not explain, after processing a sample, if one is given, without raising anything."""
+        if state is not None:
+            self._observe(state)
+        return Residual(self._observer.lacking, self._observer.torque, self._observer.is_beyond)
+
+    def _observe(self, state: State) -> int:
+        """Process a sample; return the joint whose motion is inconsistent, -1 if there is none."""
         if any(state.missing):
-            return
+            return -1
         goal, self._goal = self._goal, state.goal_current
         seconds, self._seen_at = state.time_before_write - self._seen_at, state.time_before_write
         if goal is None:
@@ -90,9 +103,7 @@ class ChainWatch:
         torque = self._constants * goal
         support = self._support(is_away, velocity, torque) if is_free and not is_away.all() else None
         self._commanded.append((state, torque))
-        joint = self._observer.observe(position, velocity, torque, seconds, is_free, support)
-        if joint >= 0:
-            self._raise(joint, state)
+        return self._observer.observe(position, velocity, torque, seconds, is_free, support)
 
     def _support(self, is_away: NDArray[np.bool_], velocity: Array, torque: Array) -> Array:
         """The direction in which a stop may prevent motion of each joint (joints,): 1, -1, or 0.

@@ -1,6 +1,7 @@
 """Missed deadlines: how long the arm may go without a command, and what share of the deadlines may be missed."""
 
 from collections.abc import Callable
+from math import inf
 
 from hil.config.schema import Config
 from hil.errors import Cause, SafetyStop
@@ -21,14 +22,16 @@ _WHY_LATE = (
 class Deadlines:
     """Counts missed deadlines of the samples. Every method may raise SafetyStop.
 
-    heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did.
+    heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did. any_share:
+    whether any share of deadlines may be missed, as while an arm is lowered, where only the time without a command
+    matters.
     """
 
-    def __init__(self, config: Config, heard_instead: Callable[[], str] = str) -> None:
+    def __init__(self, config: Config, heard_instead: Callable[[], str] = str, *, any_share: bool = False) -> None:
         self._interval = 1.0 / config.experiment.rate
         self._watchdog = config.safety.watchdog
         self._limit = late_limit(config)
-        self._most_often = max(_OFTEN_LATE, 0.5 * self._limit.seconds / self._interval)
+        self._most_often = inf if any_share else max(_OFTEN_LATE, 0.5 * self._limit.seconds / self._interval)
         self._in_a_row = 0
         self._often = 0.0
         self._heard_instead = heard_instead

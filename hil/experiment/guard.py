@@ -66,6 +66,9 @@ class Guard:
     joint may have come to rest slightly beyond it: such a joint may move back in, but no farther out.
 
     recent: the exchanges so far, if another guard has checked them.
+
+    lowers_since: when this guard begins to watch an arm that is lowered: the time of the last exchange that all servos
+    answered [s]. Replies may then be missing longer, and no advice about the experiment's torque is given.
     """
 
     def __init__(
@@ -78,6 +81,7 @@ class Guard:
         heard_instead: Callable[[], str] = str,
         left_by_a_run: bool = False,
         recent: RecentMotion | None = None,
+        lowers_since: float | None = None,
     ) -> None:
         rate = config.experiment.rate
         safety = config.safety
@@ -91,17 +95,22 @@ class Guard:
             joint.joint.servo if by_current else None for joint, by_current in zip(config.joints, currents, strict=True)
         ]
         # A pilot lowers the torque itself after such a stop.
-        lower = "" if config.experiment.pilot else f" Lower experiment.peak_torque. {how_to_find_torque(config)}"
+        self._is_lowering = is_lowering = lowers_since is not None
+        lower = (
+            ""
+            if config.experiment.pilot or is_lowering
+            else f" Lower experiment.peak_torque. {how_to_find_torque(config)}"
+        )
         self._lower_torque = lower
         self._commands = CommandLimits(config)
         planned = planned or _planned(config)
         interval = 1.0 / rate if interval is None else interval
         self.recent = RecentMotion(config, interval) if recent is None else recent
         """The latest exchanges, those of a stop included."""
-        self._silence = Silence(config, interval, patience)
+        self._silence = Silence(config, interval, patience, lowers_since)
         self._patience = patience or float("inf")
         self._heard_instead = heard_instead
-        self._deadlines = Deadlines(config, heard_instead)
+        self._deadlines = Deadlines(config, heard_instead, any_share=is_lowering)
         self._joints = _joint_records(config, planned, left_by_a_run)
         self._checks = JointChecks(self._joints, interval)
         self._apart = Apart()
@@ -173,13 +182,15 @@ class Guard:
     def _look_one_by_one(self, state: State, now: float, unsure: float) -> None:
         """Check an exchange in which replies are missing or report an error, or that follows a missing reply."""
         missing, error = state.missing, state.error
+        # Lowering ends before an exchange that might last too long.
+        silent = 2.0 * state.time_after_read - now if self._is_lowering else now
         for index in range(len(missing)):
             if error[index] & ALERT:
                 self._stop(
                     index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, then reboot it."
                 )
             if missing[index]:
-                self._count_missing(index, error[index], now, alone=not all(missing))
+                self._count_missing(index, error[index], silent, alone=not all(missing))
                 continue
             self._count_errors(index, error[index])
             fault = self._checks.look_at(index, state, unsure, self._missing[index])

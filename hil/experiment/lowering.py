@@ -2,9 +2,14 @@
 
 The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the path
 home; if a joint stays off the path, an additional torque towards the path grows. Lowering is monitored like the
-experiment. It is aborted and torque is cut after a missing reply or an alert, if a current does not follow its goal, or
-if a joint leaves the path. The damper acts only on velocities that agree with the positions.
+experiment. It is aborted and torque is cut after an alert, if a current does not follow its goal, if a joint leaves the
+path, or if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities that agree with
+the positions.
+
+Replies may be missing for a moment, also at the beginning: joints that are not heard get the feed-forward torque alone.
 """
+
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +18,11 @@ from hil.config.joint import JointConfig
 from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.errors import Cause, ExperimentError, SafetyStop
+from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import SETTLE_IN, PathSegment
+from hil.plan.obedience import Obedience
 from hil.plan.plan import Plan
 from hil.plan.recent_motion import RecentMotion
 from hil.plan.way_home import PULL_PER_S, PULL_SHARE, WayHome
@@ -26,6 +33,12 @@ LEAVES_RAD = 0.35
 LYING_RAD = 0.06
 """An arm within this angle of its rest pose in every joint is already at rest."""
 
+RUNS_AWAY = 0.25
+"""Velocity beyond that of the path home, relative to the velocity limit, at which a joint that gets faster although its
+torque opposes it does not obey.
+"""
+
+_GROWS_S = 0.015
 _ROOM_RAD = 0.2  # beyond the position limits and the path home
 _FASTER = 1.3
 
@@ -56,6 +69,8 @@ class Lowering:
         self._constants = np.array([joint.torque_per_goal for joint in config.joints])
         self._growth = PULL_PER_S / plan.rate * self._stiffness
         self._most_pull = PULL_SHARE * torque_limits(config)
+        self._most_held = self._most_pull + np.array(self._planned) * self._constants
+        self._fastest = RUNS_AWAY * np.array([joint.velocity_limit for joint in config.joints])
         self._fade = max(1, round(SETTLE_IN * plan.rate))
         self._rest = np.array(config.arm.rest_pose)
         self._thought.of(self._way.path(self._rest, np.zeros_like(self._rest)))  # compile in advance
@@ -78,13 +93,14 @@ class Lowering:
         away: NDArray[np.float64] = np.array(state.position) - self._rest
         return away
 
-    def begin(self, state: State, goal: list[float], recent: RecentMotion) -> int:
-        """Start lowering from this sample; return the number of samples it takes.
+    def begin(self, state: State, goal: list[float], recent: RecentMotion, watch: ChainWatch | None = None) -> int:
+        """Start lowering from this sample, the latest that all servos answered; return the number of samples it takes.
 
-        goal: latest goals [A or V]. recent: the latest exchanges.
+        goal: latest goals [A or V]. recent: the latest exchanges. watch: the model's check, which has seen the motion
+        so far; without one, motors that turn against their goals are only found once their joints run away.
         """
-        self._recent = recent
-        position, velocity = np.array(state.position), np.array(recent.believed(state))
+        self._recent, self._watch = recent, watch
+        position, velocity = np.array(state.position), np.array(recent.until(state).believed(state))
         self._path = self._way.path(position, velocity)
         torque = self._thought.of(self._path)
         count = torque.shape[1]
@@ -92,8 +108,19 @@ class Lowering:
         self._feed = (self._share * torque).T
         self._pull = np.zeros_like(position)
         self._position, self._velocity = self._path.position.T.copy(), self._path.velocity.T.copy()
-        self._guard = _guard_of(self._config, self._planned, self._path.position, velocity, self._interval, recent)
+        self._guard = Guard(
+            _widened(self._config, self._path.position, velocity),
+            self._planned,
+            interval=self._interval,
+            recent=recent,
+            lowers_since=state.time_before_write,
+        )
         self._guard.holding(goal)
+        self._obedience = Obedience(len(position))
+        if watch is not None:
+            self._obedience.suspect(watch.residual(), velocity.tolist(), state.time_before_write)
+        self._excess = deque[tuple[float, NDArray[np.float64]]]()
+        self._against = np.zeros_like(position)
         return int(count)
 
     def goals(self, index: int, state: State) -> list[float]:
@@ -104,7 +131,11 @@ class Lowering:
         held = np.where(missing, 0.0, self._stiffness * ahead[0] + self._damping * ahead[1])
         more = np.where(missing, 0.0, self._growth * ahead[0])
         self._pull = np.clip(self._pull + more, -self._most_pull, self._most_pull)
-        torque = self._feed[index] + self._share[index] * self._pull + held
+        self._against = np.clip(self._share[index] * self._pull + held, -self._most_held, self._most_held)
+        torque = self._feed[index] + self._against
+        for joint in range(len(torque)):
+            if self._obedience.is_limp(joint):
+                torque[joint] = 0.0
         return self._guard.clamp((torque / self._constants).tolist())
 
     def look(self, index: int, state: State, gap: float, *, between: bool = False) -> None:
@@ -114,25 +145,45 @@ class Lowering:
         if np.nanmax(away, initial=0.0) > LEAVES_RAD:
             joint = self._config.joints[int(np.nanargmax(away))].joint
             raise SafetyStop(f"{joint.title} is {np.nanmax(away):.2f} rad off its lowering path.", Cause.UNEXPECTED)
+        if not any(state.missing):
+            self._look_at_obedience(index, state)
+
+    def _look_at_obedience(self, index: int, state: State) -> None:
+        """Raise SafetyStop for a joint whose motor turns against its goals, or that its torque does not slow down."""
+        velocity, now = np.array(self._recent.believed(state)), state.time_before_write
+        turned = -1
+        if self._watch is not None:
+            turned = self._obedience.look(self._watch.residual(state), velocity.tolist(), now)
+        if turned >= 0:
+            raise SafetyStop(
+                f"{self._config.joints[turned].joint.title} moves against its command: torque that its motion "
+                "contradicted vanished when its goal was taken away for a moment. Its motor turns the wrong way: check "
+                "its direction and its wiring, and whether another program has changed its Drive Mode.",
+                Cause.WRONG_SIGN,
+            )
+        excess = velocity - self._velocity[index]
+        while len(self._excess) > 1 and now - self._excess[1][0] >= _GROWS_S:
+            self._excess.popleft()
+        self._excess.append((now, excess))
+        begun, before = self._excess[0]
+        if now - begun < _GROWS_S:
+            return
+        runs = (np.abs(excess) > self._fastest) & (np.abs(excess) > np.abs(before)) & (self._against * excess < 0.0)
+        if runs.any():
+            joint = int(np.argmax(runs))
+            raise SafetyStop(
+                f"{self._config.joints[joint].joint.title} gets faster, {velocity[joint]:+.2f} rad/s, although its "
+                "torque opposes it: its motor turns the wrong way or has failed, or something drives the joint.",
+                Cause.WRONG_SIGN,
+            )
 
     def late(self, seconds: float) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
         self._guard.late(seconds)
 
 
-def _guard_of(
-    config: Config,
-    planned: list[float],
-    position: np.ndarray,
-    velocity: np.ndarray,
-    interval: float | None,
-    recent: RecentMotion,
-) -> Guard:
-    """A guard whose limits are widened just enough for the arm's position and velocity when it was stopped.
-
-    planned: largest goals of the experiment [A or V], so that currents must follow their goals as closely as before the
-    stop.
-    """
+def _widened(config: Config, position: np.ndarray, velocity: np.ndarray) -> Config:
+    """The limits of a lowering: widened just enough for the arm's position and velocity when it was stopped."""
     fastest = max(_FASTER * float(np.abs(velocity).max()), 2.0 * config.safety.lower_speed) + 0.5
     joints = [
         _allowing(joint, float(row.min()), float(row.max()), max(fastest, joint.velocity_limit))
@@ -140,8 +191,7 @@ def _guard_of(
     ]
     # A servo that has only lost its watchdog can still be lowered, which is better than dropping it.
     unwatched = config.safety.model_copy(update={"allow_no_watchdog": True})
-    widened = config.model_copy(update={"joints": joints, "safety": unwatched})
-    return Guard(widened, planned, interval=interval, recent=recent)
+    return config.model_copy(update={"joints": joints, "safety": unwatched})
 
 
 def _allowing(joint: JointConfig, low: float, high: float, velocity: float) -> JointConfig:

@@ -11,7 +11,7 @@ some servos are heard and one is not, that servo is silent.
 """
 
 from hil.config.schema import Config
-from hil.plan.silence import Limit, is_missing_too_long, late_limit, missing_limit
+from hil.plan.silence import Limit, bridged_limit, is_missing_too_long, late_limit, missing_limit
 
 LATE_WAKE_UP_S = 1e-3
 """Lateness of this program that indicates a busy computer [s]; an idle one stays below a third of it."""
@@ -24,18 +24,20 @@ class Silence:
     """Counts the missing replies of each joint.
 
     interval: time between two exchanges [s]. patience: how long an exchange waits for replies [s].
+    heard_at: when the arm began to be lowered, the time at which all servos had been heard last [s].
     """
 
-    def __init__(self, config: Config, interval: float, patience: float = 0.0) -> None:
+    def __init__(self, config: Config, interval: float, patience: float = 0.0, heard_at: float | None = None) -> None:
         count = len(config.joints)
         self._interval = interval
         self._longest_turn = max(interval, patience)
-        self._limit = missing_limit(config)
+        self._limit = missing_limit(config) if heard_at is None else bridged_limit(config)
         late = late_limit(config)
         self._blind: Limit = max(late, self._limit, key=lambda limit: limit.seconds)
+        self._already = heard_at is not None
         self._asked_at: float | None = None
         self._turn = 0.0
-        self._last_heard: list[float | None] = [None] * count
+        self._last_heard: list[float | None] = [heard_at] * count
         self._listened = [0.0] * count
         self._busy_until = float("-inf")
         self.counts = [0] * count
@@ -86,6 +88,7 @@ class Silence:
         listened = max(self._listened[joint], self.counts[joint] * self._interval)
         elapsed = max(now - last, listened)
         count = self.counts[joint] + refused
+        count += self._already  # replies may have been missing before the arm was lowered
         allowed = self._limit if alone or not self.is_busy else self._blind
         if is_missing_too_long(count, listened, allowed):
             return f"{_ms(elapsed)} ago{_delayed(elapsed - listened)}; {allowed.said} allows {_ms(allowed.seconds)}"

@@ -35,6 +35,7 @@ from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
 from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
+from hil.plan.silence import BRIDGED_S
 from hil.plan.stabiliser import Stabiliser, must_balance
 from hil.runs.recording import Phase, Recorder, missed
 from hil.setup.servo_session import has_moved
@@ -54,6 +55,9 @@ _BRAKING_WATCHDOG_S = 0.04
 """Bus Watchdog while the arm is braked [s]: should the cable be unplugged meanwhile, the current of a brake must not
 flow for as long as that of an experiment might, whose next command may be late.
 """
+
+_LATE_REPLIES_S = 0.008
+"""How much longer replies are awaited while the arm is lowered [s]."""
 
 _FORGETS = 0.98
 """Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
@@ -128,6 +132,8 @@ class Stream:
         self._goal = [0.0] * len(bus.joints)
         self._segment = 0
         self._state: State | None = None
+        self._whole: State | None = None
+        """The latest state with replies of all servos."""
         self._sampled: State | None = None
         self._deadline: float | None = None
         self._takes = 0.0
@@ -389,6 +395,8 @@ class Stream:
 
     def _look(self, state: State, phase: Phase, *, between: bool = False) -> None:
         former, self._state = self._state, state
+        if True not in state.missing:
+            self._whole = state
         gap = 0.0 if former is None else state.time_before_write - former.time_before_write
         self._guard.look(state, gap, between=between)
         if state.status is not None and self._guard.wants_status:
@@ -419,8 +427,10 @@ class Stream:
 
     def _lower(self, lowering: Lowering, error: ExperimentError) -> None:
         """Brake and lower the arm until it is at rest, a check fails, or a second signal arrives. Never raises."""
-        state = self._state
-        if state is None or any(state.missing) or any(state.error) or lowering.lies(state):
+        state = self._whole
+        if state is None or self._state is None or any(self._state.error) or lowering.lies(state):
+            return
+        if self._is_blind and self._clock.now() - state.time_before_write > BRIDGED_S:
             return
         since = 0.0 if self._sent_at is None else self._clock.now() - self._sent_at
         if self._bus.is_watched and since >= self._safety.watchdog + TRIP_S:
@@ -442,8 +452,13 @@ class Stream:
     def _way_down(self, lowering: Lowering, state: State) -> State:
         """Follow the path home; return the last state. Raises SafetyStop, StopRequested, DriverError."""
         asked = max(1, self._stop.count)
-        for index in range(lowering.begin(state, self._goal, self._guard.recent)):
-            for checked in self._between_samples() if index else ():
+        watch = self._model if isinstance(self._model, ChainWatch) else None
+        # Replies that are merely late are worth a missed deadline: without them, nothing corrects the way down.
+        self._exchange.wait_longer(_LATE_REPLIES_S)
+        # The path begins with the latest state that is known, which may be a few exchanges old.
+        passed = round((self._clock.now() - state.time_before_write) / self._interval) if self._is_blind else 0
+        for index in range(passed, lowering.begin(state, self._goal, self._guard.recent, watch)):
+            for checked in self._between_samples() if index > passed else ():
                 lowering.look(index - 1, checked, checked.time_before_write - state.time_before_write, between=True)
                 state = checked
             self._look_for_another_master(self._interval)
@@ -460,6 +475,11 @@ class Stream:
             self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, state)
             lowering.look(index, state, state.time_before_write - former)
         return state
+
+    @property
+    def _is_blind(self) -> bool:
+        """Whether replies were missing in the latest exchange."""
+        return self._state is not None and any(self._state.missing)
 
     def _told(self, error: ExperimentError, what: str) -> None:
         error.add_note(what)

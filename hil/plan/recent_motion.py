@@ -8,6 +8,7 @@ encoder's steps. Each range includes zero and never the direction opposite to a 
 """
 
 from collections import deque
+from copy import copy
 from math import ceil, isnan
 from typing import NamedTuple
 
@@ -62,6 +63,13 @@ class RecentMotion:
         """Store an exchange, unless it is already the latest one."""
         if not self._states or self._states[-1] is not state:
             self._states.append(state)
+
+    def until(self, state: State) -> "RecentMotion":
+        """What was known at the time of an earlier exchange."""
+        then = copy(self)
+        at = state.time_before_write
+        then._states = deque((each for each in self._states if each.time_before_write <= at), self._states.maxlen)
+        return then
 
     def believed(self, state: State) -> list[float]:
         """The reported velocities, confined to the range that the positions allow [rad/s]; 0 if no change of position

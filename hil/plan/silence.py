@@ -13,6 +13,12 @@ _FEWEST_MISSING = 2
 _ROUNDING_S = 1e-6
 
 
+BRIDGED_S = 0.06
+"""How long servos may fail to reply while an arm is lowered [s]: dropping it would be worse than driving it on along
+the path that it was following. Torque must be off 100 ms after the last reply; switching it off takes some time.
+"""
+
+
 class Limit(NamedTuple):
     """A time limit [s] and the setting it comes from, as text."""
 
@@ -28,6 +34,11 @@ def missing_limit(config: Config) -> Limit:
     else:
         chosen = Limit(safety.missing_time, f"safety.missing_time = {safety.missing_time:g} s")
     return _bounded(chosen, safety.watchdog)
+
+
+def bridged_limit(config: Config) -> Limit:
+    """How long a servo may fail to reply while a spatial arm is lowered."""
+    return _bounded(Limit(BRIDGED_S, "lowering the arm"), config.safety.watchdog)
 
 
 def late_limit(config: Config) -> Limit:

@@ -130,6 +130,16 @@ class ChainObserver:
         return [float(value) for value in self._memory[LACKING, : self._joints]]
 
     @property
+    def torque(self) -> list[float]:
+        """Commanded torque of each joint, filtered as `lacking` is (joints,) [N m]."""
+        return [float(value) for value in self._memory[TORQUE, : self._joints]]
+
+    @property
+    def is_beyond(self) -> list[bool]:
+        """Whether the latest residual of each joint exceeds what may be normal (joints,)."""
+        return [bool(value > 0.0) for value in self._memory[SAMPLES, : self._joints]]
+
+    @property
     def parameters(self) -> Array:
         """Current estimate of the parameters, in the order of `mean`."""
         return self._theta.copy()

@@ -129,6 +129,26 @@ def test_what_was_heard_instead_replaces_the_remedy_for_silence(arm: Arm, missin
     assert stop.value.cause is Cause.MISSING
 
 
+def test_an_arm_that_is_lowered_may_be_silent_longer(arm: Arm) -> None:
+    """Counted from the last exchange that all servos answered, which may be older than the lowering."""
+    silent = MISSING._replace(missing=(True, True))
+    heard = STILL.time_before_write
+    guard = Guard(arm(), lowers_since=heard)
+    with pytest.raises(SafetyStop, match="lowering the arm allows 60 ms") as stop:
+        for number in range(10, 40):
+            guard.look(at(number, silent))
+    assert stop.value.cause is Cause.MISSING and 20 < number < 26
+    for _ in range(100):
+        guard.late(0.01)  # no share of missed deadlines is too large
+        guard.look(at(41, STILL))
+
+
+def test_a_lowering_says_nothing_about_the_torque_of_the_experiment(arm: Arm) -> None:
+    with pytest.raises(SafetyStop, match="outside its position limit") as stop:
+        Guard(arm(), lowers_since=0.0).look(STILL._replace(position=(9.0, 0.0)))
+    assert "peak_torque" not in str(stop.value)
+
+
 def test_silence_on_a_computer_that_was_late_before_names_it_too(arm: Arm) -> None:
     guard = Guard(arm())
     guard.look(at(0, STILL))

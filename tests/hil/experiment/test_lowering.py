@@ -250,3 +250,54 @@ def test_cut_as_configured(tmp_path: Path) -> None:
     text = TEXT.replace("[experiment]", '[safety]\nstop = "cut"\n\n[experiment]', 1)
     _, samples = play(tmp_path, text, (AT_S,))
     assert not (samples["phase"] == Phase.LOWERING).any()
+
+
+@pytest.fixture(scope="module")
+def ready() -> Any:
+    from benchmarks.fault_campaign.campaign import prepare
+    from benchmarks.spatial.chain_faults import PERIOD_S, Setting, make_document
+
+    return prepare(Setting("fake_open_manipulator_x", 100), PERIOD_S, make_document)
+
+
+def driven(ready: Any, attacks: tuple[Any, ...] = (), faults: tuple[Any, ...] = ()) -> tuple[str, Any, float]:
+    """The words, the servos' own record, and the time of the last current [s] of a run with these faults."""
+    from benchmarks.fault_campaign.campaign import play as play_attacked
+    from benchmarks.fault_campaign.draw import Drawn
+
+    story, _, changed = play_attacked(ready, Drawn(attacks, faults), 1)
+    assert not changed
+    record = story.record
+    return " ".join(story.text.split()), record, float(record["time"][record["driven"].any(axis=1), 0][-1])
+
+
+def lost(at: float, seconds: float) -> tuple[Any, ...]:
+    from hil.fakes.bus.faults import Fault, FaultKind
+
+    return tuple(Fault(kind=FaultKind.LOST_REPLY, servo=each, at=at, duration=seconds) for each in (1, 2, 3, 4))
+
+
+@pytest.mark.parametrize(("joint", "at"), [(1, 3.61), (2, 5.3)])
+def test_a_turned_motor_does_not_brake_but_is_cut(ready: Any, joint: int, at: float) -> None:
+    from benchmarks.fault_campaign.attack import Attack, Kind
+
+    ids = [each.id for each in ready.config.joints]
+    text, record, last = driven(ready, (Attack(Kind.WEAK, at, 1e9, ids[joint], 1.0, -1.0),))
+    assert "lowered, so it fell" in text and "peak_torque" not in text
+    assert "turns the wrong way" in text
+    assert last < at + 0.15
+    after = record["time"][:, 0] > at
+    assert np.abs(np.gradient(record["position"][after & (record["time"][:, 0] < last), joint], 1e-3)).max() < 3.0
+    assert np.abs(record["current"][after, joint]).max() < 0.7 * ready.config.joints[joint].goal_limit
+
+
+def test_an_arm_that_cannot_be_heard_for_a_moment_is_lowered(ready: Any) -> None:
+    text, record, _ = driven(ready, faults=lost(5.0, 0.035))
+    assert "missed" in text and "lowered to its rest pose" in text
+    np.testing.assert_allclose(record["position"][-1], ready.config.arm.rest_pose, atol=0.1)
+
+
+def test_an_arm_that_cannot_be_heard_any_more_is_cut(ready: Any) -> None:
+    text, _, last = driven(ready, faults=lost(5.0, 10.0))
+    assert "missed 2 replies" in text
+    assert 5.03 < last < 5.1

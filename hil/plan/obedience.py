@@ -1,0 +1,100 @@
+"""Whether each joint obeys its motor while an arm is lowered: a motor that turns against its goals must not brake.
+
+A turned motor and something that pushes the joint look alike under one torque: the arm moves as if another torque
+acted on the joint. So the goal of such a joint is taken away for a moment, while the others are held. What the
+joint's own motor did wrong vanishes with its goal, in proportion; a push does not. The moment is short: a limp joint
+gains less speed by gravity than a motor of the wrong sign would give it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+__all__ = ["Obedience", "Residual"]
+
+SUSPECT = 0.5, 5.0
+"""Range of the unexplained torque, relative to the commanded one, that a motor of the wrong sign may cause: ideally 2;
+less right after it has turned round, more where its torque has just changed.
+"""
+
+ENOUGH = 0.45
+"""Remainder of the torque, relative to that at the beginning, at which a test is decided."""
+
+LONGEST_TEST_S = 0.06
+
+TURNED, PUSHED = 1.1, 0.7
+"""Share of a joint's torque that must vanish from the unexplained torque together with its goal: 2 for a turned motor,
+less if it has just turned round, 1 for one without torque, 0 for a push. Between the two, the joint is tested again.
+"""
+
+MOVES_RAD_S = 0.1
+PAUSE_S = 0.01
+
+
+class Residual(NamedTuple):
+    """What the model does not explain, by joint (joints,).
+
+    lacking: commanded torque minus that which explains the motion [N m]. torque: commanded [N m], both filtered alike.
+    suspected: whether `lacking` is larger than its uncertainty.
+    """
+
+    lacking: Sequence[float]
+    torque: Sequence[float]
+    suspected: Sequence[bool]
+
+
+@dataclass
+class _Test:
+    """A joint without goal. since: its beginning [s]. drives: whether the unexplained torque made the joint faster."""
+
+    since: float
+    drives: bool
+    lacking: float | None = None
+    torque: float = 0.0
+
+
+class Obedience:
+    """Tests joints whose motion looks as if their motors turned against their goals. joints: their number."""
+
+    def __init__(self, joints: int) -> None:
+        self._tests: list[_Test | None] = [None] * joints
+        self._rests_until = [float("-inf")] * joints
+        self._pushed = [False] * joints
+
+    def is_limp(self, joint: int) -> bool:
+        """Whether this joint must not get any torque now."""
+        return self._tests[joint] is not None
+
+    def suspect(self, found: Residual, velocity: Sequence[float], now: float) -> None:
+        """Begin the tests that the latest exchange calls for. velocity: believed ones [rad/s]. now: its time [s]."""
+        for joint, (lacking, torque) in enumerate(zip(found.lacking, found.torque, strict=True)):
+            if self._tests[joint] or self._pushed[joint] or now < self._rests_until[joint]:
+                continue
+            low, high = SUSPECT[0] * abs(torque), SUSPECT[1] * abs(torque)
+            if found.suspected[joint] and lacking * torque > 0.0 and low <= abs(lacking) <= high:
+                self._tests[joint] = _Test(now, _drives(lacking, velocity[joint]))
+
+    def look(self, found: Residual, velocity: Sequence[float], now: float) -> int:
+        """Process an exchange; return a joint whose motor turns against its goals, -1 if there is none."""
+        for joint, test in enumerate(self._tests):
+            if test is None:
+                continue
+            lacking, torque = found.lacking[joint], found.torque[joint]
+            if test.lacking is None:  # the goal was taken away with this exchange
+                test.lacking, test.torque = lacking, torque
+                test.drives |= _drives(lacking, velocity[joint])
+            elif abs(torque) <= ENOUGH * abs(test.torque) or now - test.since > LONGEST_TEST_S:
+                share = (test.lacking - lacking) / (test.torque - torque) if torque != test.torque else 0.0
+                # What slows a joint down may be an obstacle, whose force also ends with the goal.
+                if test.drives and share > TURNED:
+                    return joint
+                self._tests[joint] = None
+                self._rests_until[joint] = now + PAUSE_S
+                self._pushed[joint] = share <= PUSHED
+        self.suspect(found, velocity, now)
+        return -1
+
+
+def _drives(lacking: float, velocity: float) -> bool:
+    """Whether the unexplained torque, -lacking, makes the joint faster."""
+    return -lacking * velocity > 0.0 and abs(velocity) > MOVES_RAD_S
