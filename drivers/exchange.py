@@ -115,11 +115,11 @@ class Exchange:
         every = [*spans] if status is None else [*spans, status]
         self._kinds = len(every)
         every += _of_other_lengths(every, len(self.ids))
-        self._reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
-        self.heard = Heard(self.ids, self._reads)
+        reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
+        self.heard = Heard(self.ids, reads)
         self._slow_spans = len(spans) - 1
         least = max(patience, min(PATIENCE_SHARE * interval, MOST_PATIENCE_S))
-        self._wire_s = {read: port.wire_time(self._bytes(read)) for read in self._reads}
+        self._wire_s = {read: port.wire_time(self._bytes(read)) for read in reads}
         self._plans = [
             _Plan(
                 read,
@@ -128,7 +128,7 @@ class Exchange:
                 self._wire_s[read],
                 0.5 * self._wire_s[read],
             )
-            for span, read in enumerate(self._reads)
+            for span, read in enumerate(reads)
         ]
         self._doubts = _DOUBTS
         self._status_every = _NEVER if status is None else status_every
@@ -156,12 +156,12 @@ class Exchange:
 
         With two writes the adapter may add a pause, which is not included.
         """
-        return self._port.wire_time(len(self._reads[0].request))
+        return self._port.wire_time(len(self._plans[0].read.request))
 
     @property
     def longest(self) -> float:
         """Wire time of the longest exchange [s], without adapter and computer: a lower bound on the cycle time."""
-        return self._port.wire_time(max(self._bytes(read) for read in self._reads[: self._kinds]))
+        return self._port.wire_time(max(self._bytes(plan.read) for plan in self._plans[: self._kinds]))
 
     @property
     def patience(self) -> float:

@@ -69,11 +69,6 @@ class Port:
     cable, open a new port. `latency` is the longest time the adapter may hold back a reply [s].
     """
 
-    overheard: bytes = b""
-    """Bytes pending before a request, which `ask` keeps apart from its reply: late replies, or replies to another
-    master.
-    """
-
     def __init__(self, url: str, baud: int, opened: Any) -> None:
         self.url = url
         self.baud = baud
@@ -82,6 +77,10 @@ class Port:
         """Whether `latency` was measured, because replies arrive later than expected from this kind of adapter."""
         self.echoes = False
         """Whether the adapter echoes what it sends; detected during set-up."""
+        self.overheard = b""
+        """Bytes pending before a request, which `ask` keeps apart from its reply: late replies, or replies to another
+        master.
+        """
         self._serial = opened
         self._timeout: float | None = opened.timeout
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()

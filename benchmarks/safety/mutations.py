@@ -67,7 +67,7 @@ TESTS = {
 
 EQUIVALENT = {
     ("nogil=True", "True  ->  False"): "compiled code does not hold the interpreter's lock: only other threads notice",
-    ("len(self._reads[0].request)", "0  ->  1"): "exchange: the requests for all spans have the same length",
+    ("len(self._plans[0].read.request)", "0  ->  1"): "exchange: the requests for all spans have the same length",
     ("rest[_SEEN] = angle, 1.0", "1.0  ->  2.0"): "standstill: any positive number",
     ("up, down = (beyond", "distance > 0.0  ->  distance <= 0.0"): "standstill: the two sides swap their names",
     ("ARMS = 96", "96  ->  192"): "chain_watch: the size of the ensemble, of which only mean and covariance are used",

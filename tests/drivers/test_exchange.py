@@ -598,3 +598,8 @@ def test_servos_with_different_goal_registers_each_receive_their_own_goal() -> N
     assert sent == {(102, b"\1\x0a\0\3\x1e\0"), (100, b"\2\x14\0")}
     with pytest.raises(ValueError, match="2 goals for 3 servos"):
         Exchange(wire, (1, 2, 3), goals, spans(Mode.CURRENT, [XM430] * 3), 0.0).cycle([10, 20])
+
+
+def test_its_attributes_stay_inside_the_object() -> None:
+    """CPython keeps at most 29 there. With one more, each access goes through a dictionary, which a cold cache lacks."""
+    assert len(vars(read_back_of(Wire([])))) <= 29
