@@ -32,6 +32,7 @@ class Wire(Port):
         self.answers = list(answers)
         self.waiting = b""
         self.written: list[bytes] = []
+        self.overheard = b""
 
     def now(self) -> float:
         return self.time
@@ -601,5 +602,5 @@ def test_servos_with_different_goal_registers_each_receive_their_own_goal() -> N
 
 
 def test_its_attributes_stay_inside_the_object() -> None:
-    """CPython keeps at most 29 there. With one more, each access goes through a dictionary, which a cold cache lacks."""
+    """CPython keeps up to 29 there; with more, each access goes through a dictionary, which a cold cache lacks."""
     assert len(vars(read_back_of(Wire([])))) <= 29
