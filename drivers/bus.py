@@ -5,14 +5,14 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from hil.drivers.control_table import load_control_table, model_names
-from hil.drivers.errors import DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel, WrongReply
+from hil.drivers.errors import BusShared, DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel, WrongReply
 from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
 from hil.drivers.others.heard import MOST_MIXED_UP, MOST_STRANGERS
 from hil.drivers.packet import ALERT, HardwareError
 from hil.drivers.port import Port, open_port
 from hil.drivers.preparation.cadence import CHECK_S, cadence
-from hil.drivers.preparation.hold import let_sink, refuse_held
+from hil.drivers.preparation.hold import let_sink, refuse_held, switched_on
 from hil.drivers.preparation.prepare import (
     check_quiet,
     fault_text,
@@ -39,6 +39,9 @@ from hil.drivers.torque_off import (
 )
 
 __all__ = ["CHECK_S", "BusConfig", "ServoBus"]
+
+WATCH_S = 0.1
+"""Interval at which Torque Enable is read while the arm must be without torque [s]."""
 
 _PROBES = 3
 """Unanswered Fast Sync Reads after which Sync Read is used instead."""
@@ -201,6 +204,31 @@ class ServoBus:
         if self.config.take_over:
             let_sink(self._servos, self.port.clock)
         refuse_held(self._servos)
+
+    def refuse_switched_on(self) -> None:
+        """Check that torque is off, after this program has found or switched it off.
+
+        Otherwise another program has switched it on: torque is cut on all servos. Raises BusShared, or TorqueNotOff.
+        """
+        if not (found := switched_on(self._servos)):
+            return
+        try:
+            raise BusShared(
+                f"{found}: torque was off and has been switched on by another program, which drives the arm. End that "
+                "program, or unplug its controller, then start again."
+            )
+        finally:
+            report = self.torque_off()
+            if report.unconfirmed:
+                raise TorqueNotOff(str(report))
+
+    def wait_switched_off(self, until: float) -> None:
+        """Wait until `until` [s, on the port's clock] and check `refuse_switched_on` at least every WATCH_S."""
+        clock = self.port.clock
+        self.refuse_switched_on()
+        while (now := clock.now()) < until:
+            clock.wait_until(min(until, now + WATCH_S))
+            self.refuse_switched_on()
 
     def prepare(self) -> None:
         """Set every servo's mode with torque off, and prepare the exchange.
@@ -409,8 +437,10 @@ class ServoBus:
         """Switch torque on for the block and off afterwards, however the block is left.
 
         watchdog: time without packets after which a servo stops by itself [s] (in steps of 20 ms, at most 2.54 s).
-        Raises TorqueNotOff on exit if torque off could not be confirmed; `torque_off_report` lists the servos.
+        Raises BusShared if another program has switched torque on; TorqueNotOff on exit if torque off could not be
+        confirmed; `torque_off_report` lists the servos.
         """
+        self.refuse_switched_on()
         self.torque_off_report = None
         try:
             self._torque_on(watchdog)

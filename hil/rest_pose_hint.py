@@ -30,11 +30,12 @@ def rest_pose_hint(position: float, rest: float, tolerance: float, zero_ticks: i
         zero_ticks: the value that would make the present position the rest pose.
     """
     mirrored = (
-        "With the opposite direction it would be at rest: check direction first. "
+        "In a first run, check direction: with the opposite one it would be at rest. "
         if abs(-position - rest) <= tolerance
         else "If direction or id belong to another joint, correct them first. "
     )
     return (
-        "Move it there by hand: friction may hold it away from rest. "
+        "Move it there by hand: friction may hold it away from rest, or it has fallen since an earlier run. If this "
+        "configuration has run before, direction and zero_ticks were right then: leave them as they are. "
         f"{mirrored}Only if it is in its rest pose now, set zero_ticks = {zero_ticks}."
     )

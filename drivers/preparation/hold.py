@@ -43,6 +43,22 @@ def refuse_held(servos: Mapping[Joint, Servo]) -> None:
         )
 
 
+def switched_on(servos: Mapping[Joint, Servo]) -> str:
+    """Say which servos have torque on, and with which current; "" if none has. Same errors as `Servo.read`.
+
+    Each is read twice, because a reply does not tell which register it is about.
+    """
+    on = [servo for servo in servos.values() if servo.read("Torque Enable") and servo.read("Torque Enable")]
+    return " and ".join(f"{servo.title}{_current(joint, servo)}" for joint, servo in servos.items() if servo in on)
+
+
+def _current(joint: Joint, servo: Servo) -> str:
+    """The servo's present current in brackets; "" if it does not measure one."""
+    if joint.servo.current_unit is None:
+        return ""
+    return f" (Present Current {servo.read('Present Current') * joint.servo.current_unit:.3f} A)"
+
+
 def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
     """Reduce the output of held servos to zero step by step, wait until the joints no longer sink, then cut torque.
 

@@ -109,6 +109,12 @@ class Controller:
         self._integral = self._error_before = 0.0
         self._goal_before = None
 
+    def shift(self, ticks: int) -> None:
+        """Shift the setpoint of position control, and the goal it is going to, as Present Position was shifted."""
+        self.trajectory.position += ticks
+        if self._goal_before is not None:
+            self._goal_before += ticks
+
     def motor_current(self, model: EmulatedModel, supply_v: float, position_ticks: float, velocity: float) -> float:
         """Run one millisecond of control; return the motor current [A], limited by the supply voltage.
 

@@ -273,7 +273,7 @@ class EmulatedServo(Powered):
                 if not error:
                     self.reboot(now)
             case Instruction.CLEAR:
-                error = self.present.clear(body, moving, self._angle())
+                error = self._clear_turns(body, moving)
             case Instruction.CONTROL_TABLE_BACKUP if self.has_fast_reads:
                 error = self._backup.execute(self.memory, body)
                 self._derive()
@@ -343,6 +343,18 @@ class EmulatedServo(Powered):
             return StatusError.INSTRUCTION
         self.memory.set("Registered Instruction", 0)
         return self.write(body[0] | body[1] << 8, body[2:])
+
+    def _clear_turns(self, body: bytes, moving: bool) -> int:
+        """Execute the instruction Clear; Goal Position and the trajectory lose the same turns as Present Position."""
+        before = self.present.ticks(self._angle())
+        if error := self.present.clear(body, moving, self._angle()):
+            return error
+        turned = round(self.present.ticks(self._angle()) - before)
+        if turned:
+            self.memory.set("Goal Position", self.memory.get("Goal Position") + turned)
+            self.controller.shift(turned)
+            self._derive()
+        return StatusError.NONE
 
     # Consequences of a write
 

@@ -151,6 +151,7 @@ def _play(
     try:
         # In this order, because on_time takes longer than the watchdog's timeout.
         with on_time(bus.port.clock) as granted:
+            bus.refuse_switched_on()  # rather than blame the motion that this causes on a hand or a horn
             settings = _check_unchanged(bus)
             refuse_moved(lay, where_it_lies(bus))
             stream.begins_at(bus.read_positions())
@@ -166,7 +167,11 @@ def _play(
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):
             error.add_note(str(bus.torque_off_report))
-            if moved := _moved_without_torque(config, bus, recorder):
+            try:
+                moved = _moved_without_torque(config, bus, recorder)
+            except DriverError as driven:
+                moved = str(driven)
+            if moved:
                 error.add_note(moved)
         cause = error.__context__ if isinstance(error, TorqueNotOff) else error
         note(f"stopped: {cause or 'end of the run.'} {bus.torque_off_report}")
@@ -280,8 +285,10 @@ def _watched(clock: Clock, watch: Watch) -> Iterator[Watch]:
 def _wait_for_rest(config: Config, bus: ServoBus) -> Lies:
     """Wait until an arm that swings has come to rest; return where it lies then.
 
-    Raises ExperimentError if it has moved far since the start, or a spatial arm does not come to rest.
+    Raises ExperimentError if it has moved far since the start, or a spatial arm does not come to rest; BusShared if
+    another program switches torque on.
     """
+    bus.refuse_switched_on()
     lay, lies = lay_at_start(), where_it_lies(bus)
     try:
         refuse_moved(lay, lies)

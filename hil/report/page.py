@@ -1,5 +1,6 @@
 """The report page: all sections, rendered by one template into a single self-contained file."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -8,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from hil import __version__
 from hil.errors import RunFolderError
@@ -34,6 +35,7 @@ FILE_NAME = "report.html"
 MOST_POINTS = 70_000
 """Total number of points of all curves on a page, in the wide drawing; twice that of a planar arm's page."""
 FEWEST_POINTS = 600
+_CODE = re.compile("`([^`]+)`")
 SCRIPTS = ("page.js", "spatial.js")
 SECTIONS: tuple[Callable[[RunData], Section | None], ...] = (
     verdict,
@@ -76,9 +78,9 @@ def make_page(data: RunData) -> str:
 def render(title: str, started: str, shown: Sequence[Section], kind: str = "Identified arm") -> str:
     """The HTML document of these sections. started: ISO 8601. kind: what the page shows."""
     folder = files("hil.report")
-    template = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    ).from_string(folder.joinpath("page.html.j2").read_text(encoding="utf-8"))
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["prose"] = _prose
+    template = environment.from_string(folder.joinpath("page.html.j2").read_text(encoding="utf-8"))
     return template.render(
         title=title,
         kind=kind,
@@ -89,6 +91,11 @@ def render(title: str, started: str, shown: Sequence[Section], kind: str = "Iden
         script=Markup("".join(folder.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)),
         draw=partial(_draw, share=_share_of_points(shown)),
     )
+
+
+def _prose(text: str) -> Markup:
+    """Text as on a terminal, set for a page: what stands in backticks as code, and a plus-minus sign."""
+    return Markup(_CODE.sub(r"<code>\1</code>", str(escape(text)).replace("+-", "±")))
 
 
 def sections(data: RunData) -> list[Section]:

@@ -93,13 +93,22 @@ def _capsules(space: Space) -> list[dict[str, Any]]:
 
 
 def _extent(space: Space, angles: Array, upright: Array) -> tuple[Array, float]:
-    """Centre and radius [m] of a sphere around the arm in all its poses, in the upright frame."""
+    """Centre and radius [m] of a sphere around the arm in all its poses and the boxes, in the upright frame."""
     every = np.linspace(0, angles.shape[1] - 1, min(FEW_POSES, angles.shape[1])).astype(int)
     ends = np.concatenate([space.ends(angles[:, frame])[0].reshape(-1, 3) for frame in every] + [np.zeros((1, 3))])
-    points = ends @ upright.T
-    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     radius = max((each.radius for each in space.shapes.capsules), default=0.0)
-    return centre, float(np.linalg.norm(points - centre, axis=1).max()) + radius
+    arm, boxes = ends @ upright.T, _corners(space) @ upright.T
+    every_point = np.concatenate([arm, boxes])
+    centre = 0.5 * (every_point.min(axis=0) + every_point.max(axis=0))
+    farthest = float(np.linalg.norm(arm - centre, axis=1).max()) + radius
+    return centre, max(farthest, float(np.linalg.norm(boxes - centre, axis=1).max(initial=0.0)))
+
+
+def _corners(space: Space) -> Array:
+    """Corners of all boxes in the base frame (corners, 3) [m]."""
+    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+    corners = [box[3] + (signs * box[4]) @ box[:3].T for box in space.boxes]
+    return np.concatenate(corners) if corners else np.zeros((0, 3))
 
 
 def _rounded(*arrays: Array) -> list[float]:

@@ -10,7 +10,7 @@ from hil.report.chart import Figure
 class Table:
     """Rows of text with column headings.
 
-    left: number of left-aligned text columns; the others hold right-aligned numbers. aside: a column that is hidden on
+    left: number of left-aligned text columns; the others hold right-aligned numbers. aside: columns that are hidden on
     narrow screens.
     """
 
@@ -18,7 +18,7 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     left: int = 1
     caption: str = ""
-    aside: int | None = None
+    aside: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -134,6 +134,7 @@ for (const figure of document.querySelectorAll("figure.spatial")) {
   slider.addEventListener("input", () => { stop(); show(Number(slider.value)); });
   svg.addEventListener("pointerdown", (event) => {
     held = [event.clientX, event.clientY];
+    svg.classList.add("held"); // no focus frame for a pointer
     svg.setPointerCapture(event.pointerId);
   });
   svg.addEventListener("pointermove", (event) => {
@@ -147,6 +148,7 @@ for (const figure of document.querySelectorAll("figure.spatial")) {
     const turned = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
     if (!turned) return;
     event.preventDefault();
+    svg.classList.remove("held");
     turn(...turned);
   });
   draw();

@@ -9,7 +9,7 @@ import numpy as np
 
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError
+from hil.drivers.errors import BusShared, DriverError, TorqueNotOff
 from hil.drivers.torque_off import and_list
 from hil.rest_pose_hint import within_limits
 from hil.setup.servo_session import has_moved
@@ -37,12 +37,13 @@ def tolerance_now(config: Config) -> float:
 def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
     """Wait at most `longest` [s] for an arm that is still swinging or falling after an earlier run.
 
-    Returns a sentence about a joint that is still moving then, "" if none is.
+    Returns a sentence about a joint that is still moving then, "" if none is. Raises BusShared if another program
+    switches torque on meanwhile.
     """
     clock = bus.port.clock
     former, end = bus.read_positions(), clock.now() + longest
     while True:
-        clock.wait_until(clock.now() + _REST_EVERY_S)
+        bus.wait_switched_off(clock.now() + _REST_EVERY_S)
         latest = bus.read_positions()
         away = [abs(now - before) for now, before in zip(latest, former, strict=True)]
         if max(away) < _REST_WITHIN_RAD:
@@ -57,13 +58,16 @@ def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
 
 def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float]) -> str:
     """Say how far a spatial arm that was in its rest pose (joints,) [rad] has moved since torque was cut, and which
-    rest pose to configure; "" if it stayed, was elsewhere, or its servos do not answer.
+    rest pose to configure; "" if it stayed, was elsewhere, or its servos do not answer. Raises BusShared if another
+    program switches torque on meanwhile.
     """
     at, rest = np.array(before), np.array(config.arm.rest_pose)
     if not config.is_chain or not np.abs(at - rest).max() < FROM_REST_RAD:
         return ""
     try:
         moving, after = wait_for_rest(bus, _LONGEST_SAG_S), np.array(bus.read_positions())
+    except (BusShared, TorqueNotOff):
+        raise
     except DriverError:
         return ""
     moved = [

@@ -14,6 +14,7 @@ from hil.drivers.errors import BusShared, DriverError, NoReply, PortLost, PortNo
 from hil.drivers.joint import Joint
 from hil.drivers.latency import FACTORY_MS, WANTED_MS, command_to_set, latency_timer, read_latency_ms
 from hil.drivers.packet import MAX_ID, HardwareError
+from hil.drivers.preparation.hold import switched_on
 from hil.drivers.preparation.prepare import TIME_BASED_PROFILE, check_quiet, shuts_down
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself
 from hil.drivers.servo import Servo, describe_error
@@ -82,6 +83,7 @@ def check_arm(config: Config) -> Iterator[Finding]:
         yield from goals
         if all(finding.level is not Level.STOP for finding in goals):
             yield from _rate(config, bus)
+            yield from _still_off(bus)
 
 
 def _torque_of_pilot(config: Config) -> Iterator[Finding]:
@@ -199,6 +201,21 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
             yield Finding(Level.STOP, where, "registers", "cannot be read", fix)
             return
         yield Finding(level, where, what, found, fix)
+
+
+def _still_off(bus: ServoBus) -> Iterator[Finding]:
+    """Report torque that has come on since the servos were checked: nothing here switches it on, or off."""
+    try:
+        on = switched_on(bus.drives)
+    except DriverError as error:
+        yield Finding(Level.STOP, "bus", "torque", "not read again", str(error))
+        return
+    if on:
+        fix = (
+            f"{on}: it was off when this check began. Another program has switched it on and drives the arm: stop that "
+            "program first; or cut the supply."
+        )
+        yield Finding(Level.STOP, "bus", "torque", "switched on during this check", fix)
 
 
 def _left_behind(config: Config, joint: Joint, servo: Servo) -> Iterator[Finding]:

@@ -45,6 +45,7 @@ __all__ = [
 Say = Callable[[str], None]
 
 _DELAY = "Return Delay Time"
+_OFFSET, _DRIVE_MODE = "Homing Offset", "Drive Mode"
 _PWM_LIMIT, _GOAL_PWM = "PWM Limit", "Goal PWM"
 _NEXT = "The next hil identify, record, check or setup on this port restores them from"
 
@@ -178,8 +179,7 @@ class ServoSession:
             f"THE ARM MOVES AGAIN IN {COUNT_DOWN_S:.0f} s: the previous run was stopped, but this command continues. "
             f"Keep clear of the arm; Ctrl-C ends it now."
         )
-        clock = self.bus.port.clock
-        clock.wait_until(clock.now() + COUNT_DOWN_S)
+        self.bus.wait_switched_off(self.bus.port.clock.now() + COUNT_DOWN_S)
 
     def end(self) -> list[str]:
         """Restore every servo's settings; return one message per reason for which some could not be restored.
@@ -239,6 +239,7 @@ class ServoSession:
             *self._not_reached(),
             *self._changed_delays(failed),
             *self._lowered_limits(failed),
+            *self._changed_meaning(failed),
             *(
                 f"The settings of {and_list(map(str, joints))} could not be restored. {why} {_NEXT} "
                 f"{_where([self._kept[joint].path for joint in joints])}."
@@ -307,6 +308,23 @@ class ServoSession:
                     f"To change it back, use DYNAMIXEL Wizard 2.0{later}."
                 )
 
+    def _changed_meaning(self, silent: Collection[Joint]) -> Iterator[str]:
+        """Say which settings were changed meanwhile that give angles or goals another meaning: the next start takes
+        them as they are.
+        """
+        for joint, servo in self.bus.drives.items():
+            for name in (_OFFSET, _DRIVE_MODE):
+                before = self.settings.get((joint, name))
+                if before is None or joint in silent:
+                    continue
+                with suppress(DriverError):
+                    if (now := servo.read(name)) != before and servo.read(name) == now:
+                        yield (
+                            f"{joint.title}: {name} was changed meanwhile from {before} to {now}, by another program "
+                            f"or a factory reset, and is left as it is. Set it back to {before} with DYNAMIXEL Wizard "
+                            "2.0 before the next start."
+                        )
+
     def _put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
         """Restore the settings of these joints; return the error of each joint that failed."""
         failed: dict[Joint, DriverError] = {}
@@ -351,6 +369,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
     if outer is not None and outer.bus.port.is_open and outer.bus.config.is_same_arm(config.bus):
         outer.bus.config = config.bus
         outer.shared += 1
+        outer.bus.refuse_switched_on()
         outer.warn()
         outer.bus.prepare()
         try:
@@ -366,6 +385,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
         stopped: BaseException | None = None
         try:
             session.begin(config, folder)
+            bus.release_held()  # saving the settings has taken time
             bus.prepare()
             yield bus
         except BaseException as error:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from hil.drivers.bus import BusConfig, ServoBus
-from hil.drivers.errors import ServoRefused, TorqueNotOff
+from hil.drivers.errors import BusShared, ServoRefused, TorqueNotOff
 from hil.drivers.preparation.settings import put_back, read_settings
 from hil.fakes.bus.faults import Fault, FaultKind
 
@@ -265,3 +265,34 @@ def test_watchdogs_are_shortened_in_one_packet_and_never_prolonged(
         for servo_id, each in zip((1, 2), seen, strict=True):
             assert (WATCHDOG, 2) in [(address, value) for address, value, _ in each]
             assert servos(bus)[servo_id].value("Bus Watchdog") == 2
+
+
+SWITCHED_ON = r"'elbow'.* A\): torque was off and has been switched on by another program"
+
+
+def test_torque_that_another_program_has_switched_on_is_cut_and_named(fake_config: Make) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        servos(bus)[2].write(TORQUE, b"\1")
+        with pytest.raises(BusShared, match=SWITCHED_ON), bus.torque(watchdog=0.1):
+            pytest.fail("torque came on")
+        assert not any(servo.torque_enabled for servo in servos(bus).values())
+        assert str(bus.torque_off_report) == "Torque is off on both servos, confirmed by reading it back."
+
+
+def test_torque_that_comes_on_while_waiting_is_cut_at_once(fake_config: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    with ServoBus.open(fake_config()) as bus:
+        clock, on_at = bus.port.clock, bus.port.clock.now() + 1.0
+        wait = clock.wait_until
+        times: list[float] = []
+
+        def waiting(until: float) -> None:
+            wait(until)
+            if clock.now() >= on_at and not times:
+                times.append(clock.now())
+                servos(bus)[2].write(TORQUE, b"\1")
+
+        monkeypatch.setattr(clock, "wait_until", waiting)
+        with pytest.raises(BusShared, match=SWITCHED_ON):
+            bus.wait_switched_off(clock.now() + 10.0)
+        assert clock.now() < on_at + 0.5
+        assert not any(servo.torque_enabled for servo in servos(bus).values())

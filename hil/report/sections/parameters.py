@@ -14,6 +14,7 @@ from hil.results.parts import Quantity
 from hil.results.result import Result
 
 TWO_SIDED_95 = 1.96
+_MOST_DECIMALS = 9
 
 
 def parameters(data: RunData) -> Section:
@@ -42,12 +43,13 @@ def _table(
 ) -> Table:
     """Build a table; groups: composition of a spatial arm's base parameters, by name."""
     head = ("parameter", "meaning", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
-    return Table(head, tuple(_row(name, entry, truth, groups) for name, entry in entries.items()), 3, caption, 1)
+    rows = tuple(_row(name, entry, truth, groups) for name, entry in entries.items())
+    return Table(head, rows, 3, caption, (1, 5) if truth else (1,))
 
 
 def _row(name: str, entry: Quantity, truth: Mapping[str, float], groups: Mapping[str, str]) -> tuple[str, ...]:
     value, std = entry.value, entry.std
-    known = (number(truth[name]) if name in truth else "",) if truth else ()
+    known = (_as_precise(truth[name], std) if name in truth else "",) if truth else ()
     unit = "" if entry.unit == "1" else entry.unit.replace("^2", "²")
     meaning = groups.get(name) or MEANINGS.get(name) or LATE.get(kind_of(name)) or term_of(name).meaning
     if not math.isfinite(std):
@@ -61,7 +63,22 @@ def _interval(value: float, std: float) -> tuple[str, str]:
     width = TWO_SIDED_95 * std
     if width <= 0:
         return number(value), "exact"
-    decimals = max(0, 1 - math.floor(math.log10(width)))
-    if decimals > 9:
+    decimals = _decimals(std)
+    if decimals is None:
         return number(value), f"± {width:.1e}".replace("-", "\u2212")
-    return f"{value:.{decimals}f}".replace("-", "\u2212"), f"± {width:.{decimals}f}"
+    return _as_precise(value, std), f"± {width:.{decimals}f}"
+
+
+def _as_precise(value: float, std: float) -> str:
+    """A value with the decimals that a quantity with this standard deviation is shown with."""
+    decimals = _decimals(std)
+    return number(value) if decimals is None else f"{value:.{decimals}f}".replace("-", "\u2212")
+
+
+def _decimals(std: float) -> int | None:
+    """Decimals that show two significant digits of the interval's half-width; None if it is too small or unknown."""
+    width = TWO_SIDED_95 * std
+    if not (width > 0 and math.isfinite(width)):
+        return None
+    decimals = max(0, 1 - math.floor(math.log10(width)))
+    return decimals if decimals <= _MOST_DECIMALS else None

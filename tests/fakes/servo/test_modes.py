@@ -87,6 +87,21 @@ def test_position_move_arrives_and_stays() -> None:
     assert rig.read("Moving Status") & 1
 
 
+def test_a_motor_that_holds_a_load_stays_when_its_turns_are_cleared() -> None:
+    rig = Rig(4)
+    rig.write("Torque Enable", 1)
+    rig.shaft.load = 0.3
+    rig.write("Goal Position", 2348 + 2 * 4096)
+    rig.run(4.0)
+    held, before = rig.shaft.position[0], rig.read("Present Position")
+    rig.bus.write(encode(1, 16, b"\x01DXL\x22"))
+    assert rig.bus.read(11, 0.01)[8] == 0
+    assert rig.read("Goal Position") == 2348
+    assert rig.read("Present Position") == before % 4096 != 2348, "it sags"
+    rig.run(2.0)
+    assert rig.shaft.position[0] == pytest.approx(held, abs=0.003)
+
+
 def test_a_higher_gain_gives_way_less() -> None:
     sag = []
     for gain in (400, 1600):

@@ -12,11 +12,14 @@ import numpy as np
 import pytest
 
 from hil.errors import ResultError, RunFolderError
-from hil.report.page import make_page, sections, write_report
+from hil.report.page import make_page, render, sections, write_report
 from hil.report.pictures import figures, save_pictures
 from hil.report.png import save_png
 from hil.report.run_data import RunData
+from hil.report.section import Section
+from hil.report.sections.parameters import _row
 from hil.report.sections.verdict import verdict
+from hil.results.parts import Quantity
 
 MOST_BYTES = 3_000_000
 MOST_SECONDS = 5.0
@@ -170,3 +173,19 @@ def test_runs_that_are_not_whole_are_named(identified: Path, tmp_path: Path) -> 
     spoil("events.jsonl", "no json\n{}\n")
     with pytest.raises(ResultError, match="nowhere cannot be read"):
         RunData.load(tmp_path / "nowhere")
+
+
+def test_text_of_the_terminal_is_set_for_a_page() -> None:
+    page = render("arm", "2026-01-01T00:00:00", [Section("words", "Words", ("see `hil pose` <b>: 1 +- 0.2 m",))])
+    assert "see <code>hil pose</code> &lt;b&gt;: 1 ± 0.2 m" in page
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "truth", "shown"),
+    [(-3.3e-05, 2e-06, -2.2407e-05, ("\u22120.0000330", "\u22120.0000224")), (1.5, 0.0, 1.4999, ("1.5", "1.4999"))],
+)
+def test_a_true_value_is_written_as_the_value_beside_it(
+    value: float, std: float, truth: float, shown: tuple[str, str]
+) -> None:
+    row = _row("viscous_1", Quantity(value, std, "N m s/rad"), {"viscous_1": truth}, {})
+    assert (row[3], row[-1]) == shown

@@ -16,6 +16,7 @@ from hil.clearance.kept import keep_shapes, known_shapes
 from hil.clearance.shapes import shapes_of
 from hil.clearance.space import Space
 from hil.config.chain import described_arm
+from hil.config.clearance import BoxConfig
 from hil.config.schema import Config, load_config
 from hil.report.page import render
 from hil.report.scene import spatial_motion
@@ -118,6 +119,16 @@ def test_every_capsule_lies_within_the_picture(config: Config, position: np.ndar
         ends, radius = space.ends(pose)
         away = np.linalg.norm(ends - np.array(moving.scene["centre"]), axis=2).max(axis=1) + radius
         assert away.max() <= moving.scene["reach"] + 1e-3
+
+
+def test_a_box_far_from_the_arm_lies_within_the_picture(config: Config, position: np.ndarray) -> None:
+    box = BoxConfig(name="wall", size=[0.1, 1.6, 0.9], centre=[0.9, 0.0, 0.45], turned=[0.0, 0.0, 0.4])
+    walled = config.model_copy(update={"clearance": config.clearance.model_copy(update={"boxes": [box]})})
+    scene = spatial_motion(walled, position, RATE, "The arm.").scene
+    turn, at, half = np.split(np.array(scene["boxes"][0]), [9, 12])
+    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    corners = (at + (signs * half) @ turn.reshape(3, 3).T) @ np.array(scene["upright"]).reshape(3, 3).T
+    assert np.linalg.norm(corners - scene["centre"], axis=1).max() <= scene["reach"] + 1e-3
 
 
 def test_a_long_motion_stays_small(config: Config) -> None:

@@ -5,7 +5,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +17,7 @@ import serial
 from hil.cli.errors import message
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongSetting
+from hil.drivers.errors import BusShared, DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongSetting
 from hil.errors import Cause, ExperimentError, HilError, SafetyStop, StopRequested
 from hil.experiment.run import run_experiment
 from hil.fakes.bus.faults import Fault
@@ -131,6 +131,43 @@ def test_a_return_delay_that_another_program_changed_is_named(arm: Arm, bench: B
     said = str(stop.value)
     assert "'elbow'" in said and "changed meanwhile from 0 to 500 us" in said and "--return-delay-us 0" in said
     assert "'shoulder'" not in said
+
+
+@pytest.mark.parametrize(("name", "value"), [("Homing Offset", -400), ("Drive Mode", 1)])
+def test_a_setting_that_gives_angles_another_meaning_is_named_with_the_value_to_restore(
+    arm: Arm, bench: Bench, name: str, value: int
+) -> None:
+    with pytest.raises(ExperimentError) as stop, servo_session(arm(SHORT)):
+        servo = bench.servos[2]
+        servo.memory.store(servo.model.registers[name], value)
+    said = str(stop.value)
+    assert f"{name} was changed meanwhile from 0 to {value}" in said and "Set it back to 0 with DYNAMIXEL" in said
+    assert "'elbow'" in said and "'shoulder'" not in said
+
+
+def test_torque_that_another_program_switches_on_between_two_runs_is_cut_and_named(arm: Arm, bench: Bench) -> None:
+    config = arm(SHORT)
+    with pytest.raises(BusShared, match=r"'elbow'.*switched on by another program") as stop, servo_session(config):
+        with servo_session(config):
+            pass
+        bench.servos[2].write(64, b"\1")
+        with servo_session(config):
+            pytest.fail("the next run began")
+    assert not any(servo.torque_enabled for servo in bench.servos.values())
+    assert "Torque is off on both servos, read back." in stop.value.__notes__
+
+
+def test_a_check_reports_torque_that_came_on_meanwhile_and_leaves_it(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def rate(*_: object) -> Iterator[Finding]:
+        bench.servos[2].write(64, b"\1")
+        yield Finding(Level.OK, "bus", "rate", "enough")
+
+    monkeypatch.setattr("hil.setup.preflight._rate", rate)
+    last = list(check_arm(arm(SHORT)))[-1]
+    assert (last.level, last.found) == (Level.STOP, "switched on during this check") and "'elbow'" in last.fix
+    assert bench.servos[2].torque_enabled
 
 
 @pytest.mark.parametrize(("limit", "is_undone"), [(400, True), (60, False)])
