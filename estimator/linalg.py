@@ -1,8 +1,9 @@
-"""numpy's linear algebra for the estimator: if it fails, it raises an error of the estimator.
+"""numpy's linear algebra, with its failures raised as errors of the estimator.
 
 Matrices that are not finite, because a simulated motion diverged or a parameter lost its effect, make decompositions
-fail with numpy's LinAlgError. Callers of an estimate do not handle it: a search over models would stop with a traceback
-instead of trying the next model. Therefore `hil.estimator` and `hil.estimation` take these functions from here.
+fail with numpy's LinAlgError. The estimator's callers do not handle that error: a search over models would stop with a
+traceback instead of trying the next model. Therefore `hil.estimator` and `hil.estimation` take these functions from
+here.
 """
 
 from collections.abc import Callable

@@ -214,7 +214,7 @@ class ShootingOptions:
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """Options of the joint likelihood of two periods, without and with a known mass."""
+    """Options of the combined likelihood of two periods, without and with a known mass."""
 
     ftol: float = 1e-6
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)
@@ -251,11 +251,13 @@ class SelectionOptions:
     explained_residual: float = 1.02
     """RMS residual in units of the noise below which no further term is tried."""
     near_residual: float = 5.0
-    """If the RMS residual, in units of the noise, is below this, a richer model's minimum is sought near the simpler
-    one's.
+    """If the RMS residual, in units of the noise, is below this, a richer model's minimum is searched for near the
+    simpler one's.
     """
     steady_residual: float = 5.0
-    """RMS residual in units of the noise below which a change of friction is sought: worse models may mimic one."""
+    """RMS residual in units of the noise below which a change of friction is searched for: worse models may mimic
+    one.
+    """
     presliding_residual: float = 1.2
     """RMS residual in units of the noise above which a fit with presliding is tried; such fits are slow."""
     initial_widths: tuple[float, ...] = (5e-4, 2e-2)

@@ -72,7 +72,7 @@ class Excitation:
 
 
 def own_lines() -> Excitation:
-    """Return Table 2 on joint 1, and the same amplitudes one harmonic higher on joint 2.
+    """Return the lines of Table 2 for joint 1, and the same amplitudes one harmonic higher for joint 2.
 
     As printed in (19), both joints have the same torque on the same lines, so only sums of the two columns of the
     transfer function can be observed and A1 of (33) is singular. A shift by one harmonic is the smallest change that
@@ -85,7 +85,7 @@ def own_lines() -> Excitation:
 
 
 def printed_lines() -> Excitation:
-    """Return Table 2 on both joints at once, as printed."""
+    """Return the lines of Table 2 for both joints at once, as printed."""
     return Excitation(np.array(LINES), np.array([AMPLITUDES, AMPLITUDES]))
 
 

@@ -2,7 +2,7 @@
 pose.
 
 This is its corrected form, second order with damping: (s^2 D + s F + K) q = tau on every line, with D and K of the arm
-linearised at (-pi/2, 0). It is valid for small swings without dry friction; for others it shows the error of
+linearised at (-pi/2, 0). It is valid for small swings without dry friction; for other motions it shows the error of
 linearisation. Zhu et al., Machines 10 (2022) 392, equations (13), (48), (52) to (69); docs/paper.md.
 """
 
@@ -25,7 +25,7 @@ class LinearisedEstimate:
     """Base parameters by name [SI]; the friction is purely viscous."""
     std: dict[str, float]
     remark: str
-    """States how large the swings were, compared with the linear range."""
+    """States how far each joint swings about the hanging pose."""
 
 
 def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) -> LinearisedEstimate:

@@ -162,8 +162,8 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
 
 
 def torque_error(recordings: Sequence[Recording], found: RecordedChain) -> Array:
-    """Return the RMS error of the torque computed with the parameters for recordings, relative to the torque's RMS
-    (joints,).
+    """Return the RMS error of the torque that the parameters `found` predict for `recordings`, relative to the torque's
+    RMS (joints,).
     """
     value = np.array([found.parameters[name] for name in found.model.linear_names])
     return _torque_residual(recordings, found.model, value, found.cutoff)

@@ -54,7 +54,7 @@ def settling_difference(former: Array, latest: Array) -> float:
 
 
 def periods_of_drift(differences: Sequence[float], within: float) -> int | None:
-    """Return how many more periods a slow drift takes until successive periods differ by at most `within`.
+    """Return how many more periods of slow drift it takes until successive periods differ by at most `within`.
 
     As grease warms up, the change from period to period decreases slowly and steadily. None if the changes do not look
     like that: backlash or a dragging cable make them irregular, and a transient dies out faster.

@@ -116,9 +116,9 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
 
     Two distances of a reading are computed: from the median of itself and two neighbours on either side, and from a
     cubic through its neighbours. It is an outlier if both exceed SPIKE encoder steps and SPIKE times the typical
-    distance from the median. The median alone would take every fast reversal at a low rate for an outlier, since most
-    readings of a steadily moving joint are the median themselves. If the fraction of such readings exceeds MOST_SPIKES,
-    they are not outliers: the joint moves fast compared with the sample rate.
+    distance from the median. At a low sampling rate, the median alone would take every fast reversal for an outlier,
+    since most readings of a steadily moving joint are the median themselves. If the fraction of such readings exceeds
+    MOST_SPIKES, they are not outliers: the joint moves fast compared with the sample rate.
     """
     from scipy.ndimage import median_filter
 

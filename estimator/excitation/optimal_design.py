@@ -101,7 +101,9 @@ class DesignProblem:
         return deviations
 
     def scale(self) -> Array:
-        """Return the scale of each standard error: the parameter; for an offset, the joint's Coulomb friction."""
+        """Return what each standard error is relative to: the parameter or, for an offset, the joint's Coulomb
+        friction.
+        """
         known = dict(zip(CONSTANTS, self.physics.vector.tolist(), strict=True))
         against = [name.replace("offset", "coulomb") if name.startswith("offset") else name for name in self.names]
         return np.maximum(np.abs([known[name] for name in against]), 1e-9)

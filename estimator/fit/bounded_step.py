@@ -13,7 +13,7 @@ from hil.estimator.arrays import Array, Mask
 
 ITERATIONS_PER_COORDINATE = 6
 TOLERANCE = 1e-9
-"""Slope at a bound, relative to the largest one, that counts as zero."""
+"""A slope at a bound counts as zero if it is below this fraction of the largest slope."""
 
 
 def bounded_step(matrix: Array, slope: Array, least: Array, most: Array) -> Array:

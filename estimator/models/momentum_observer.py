@@ -15,12 +15,13 @@ A joint's residual torque is the part that the motion does not account for. An a
 thresholds for `HOLD_S` (a shorter time if it exceeds them by far): `TIMES` standard deviations of the uncertainty due
 to parameters and noise, the torque that friction can hold while the joint stands still, and a fraction of the largest
 planned torque. The noise is estimated as well: effects that the model lacks (Stribeck friction, backlash, flexibility)
-widen the admissible range. A deviation that may become an alarm enters that estimate only once it has ended without
-one; otherwise a joint that is held for long would widen the range until nothing exceeds it. While a joint stands still
-its noise is lower, since most of the noise only arises in motion.
+widen the admissible range. A deviation that may become an alarm enters that estimate only after it has ended without an
+alarm; otherwise a joint that is held for a long time would widen the range until nothing exceeded it. While a joint
+stands still, its noise is lower, since most of the noise only arises in motion.
 
 What friction can hold includes the viscous friction at the speeds of the usual motion: over a small motion, in which
-the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once it stands.
+the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once the joint has
+stopped.
 
 Errors of the model last longer than the interval between two updates, and so does the rounding of a velocity that stays
 below one tick: they are not new information each time. Therefore each update counts only as a fraction of one.
@@ -91,8 +92,8 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: multiple of dry friction, as far as it is known, to which `largest` is raised if it is smaller: near
-    standstill, friction behaves differently from the model.
+    frictions: `largest` is raised to at least this multiple of dry friction, as far as that is known: near standstill,
+    friction behaves differently from the model.
     """
 
     def __init__(

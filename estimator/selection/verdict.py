@@ -76,7 +76,7 @@ class Evidence:
     doubts: tuple[str, ...] = field(default=())
     """Implausible or contradictory values, as sentences."""
     notes: tuple[str, ...] = field(default=())
-    """Other findings, as sentences that cast no doubt on the values."""
+    """Other findings that cast no doubt on the values, as sentences."""
     tried_all: bool = False
     """Whether the model was selected from all available terms."""
     torque_limit: str = ""

@@ -28,7 +28,7 @@ class HeldZeros:
 def held_zeros(problem: ChainProblem, x: Array, unfinished: float) -> HeldZeros:
     """Estimate the zeros that `problem` holds at 0, from its minimum `x`.
 
-    unfinished: expected decrease of the sum of squares without fitting the zeros.
+    unfinished: decrease of the sum of squares that one more step without fitting the zeros is expected to bring.
     """
     model = replace(problem.model, zeros=True)
     names, size = model.names, len(model.names)

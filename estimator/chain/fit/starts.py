@@ -89,7 +89,8 @@ def repeated(period: SettledPeriod) -> Array:
 
 
 def started(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
-    """Return the problem with friction near standstill resolved, its rough minimum, and the number of simulations.
+    """Return the optimisation problem refined so that it resolves friction near standstill, its approximate minimum,
+    and the number of simulations used.
 
     x: stage 1's result. Raises ConvergenceError if the stiffest observer does not follow the motion.
     """
@@ -122,8 +123,8 @@ def _softened_later(coarse: ChainProblem, x: Array, options: ChainOptions) -> tu
 
 
 def resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
-    """Return the problem with the shape of friction free and motion near standstill resolved, its minimum from `soft`,
-    and the number of simulations.
+    """Return the problem refined so that it fits the shape of friction and resolves motion near standstill, its minimum
+    reached from `soft`, and the number of simulations used.
     """
     narrowest = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
     # An early fit may be far off: where it makes a joint much too light, the friction step must not stay wide.
@@ -157,7 +158,8 @@ def narrowed(problem: ChainProblem, value: Array, starts: Sequence[Array], optio
 
 
 def softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Array, float, int]:
-    """Return the minimum with the softest observer that follows the motion, its softness and the number of simulations.
+    """Return the minimum with the softest observer that follows the motion, the softness of that observer, and the
+    number of simulations used.
 
     Raises ConvergenceError if even the stiffest does not.
     """

@@ -130,7 +130,7 @@ def _carry(link: Any, f: Any, b: Any) -> None:
 
 
 def move(link: Any, armature: Any, v: Any, room: Any) -> None:
-    """Compute velocities, bodies, composites and the mass matrix; requires `place`.
+    """Compute velocities, bodies, composites and the mass matrix; call `place` first.
 
     link: (joints, 10). armature: (joints,). v: joint velocities (joints,).
     """
@@ -169,7 +169,7 @@ def move(link: Any, armature: Any, v: Any, room: Any) -> None:
 
 
 def accelerate(armature: Any, gravity: Any, v: Any, a: Any, room: Any) -> None:
-    """Compute the torques required for the accelerations a (joints,); requires `move`."""
+    """Compute the torques required for the accelerations a (joints,); call `move` first."""
     _, motion, body, _, _, torque, _, _, _ = room
     n = a.size
     for i in range(n):
@@ -302,7 +302,7 @@ def regress(column: Any, a: Any, room: Any, Y: Any) -> None:
 def pull(gravity: Any, room: Any, column: int, out: Any) -> None:
     """Set a column of `out` (joints, columns) to the torques that hold all links still under this gravity alone.
 
-    Requires `move`. It is linear in gravity, so a change of gravity gives the change of the torques.
+    Call `move` first. The torques are linear in gravity, so a change of gravity gives the change of the torques.
     """
     motion, body = room[1], room[2]
     x, y, z = -gravity[0], -gravity[1], -gravity[2]
