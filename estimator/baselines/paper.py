@@ -160,11 +160,11 @@ class MassEstimate:
     std: tuple[float, float]
     """Standard errors from the residual [kg]."""
     viscous: float
-    """Viscous friction estimated along with the masses, only for the second order [N m s/rad]."""
+    """Viscous friction estimated along with the masses, only for the second-order plant [N m s/rad]."""
 
 
 def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm, order: Order) -> MassEstimate:
-    """Return the masses (and for the second order the friction) that maximise the likelihood of the coefficients.
+    """Return the masses (and the friction of the second-order plant) that maximise the likelihood of the coefficients.
 
     The noise of a Fourier coefficient is normal with the same variance on all lines, whatever its distribution in time,
     so maximising the likelihood means minimising the sum of squared differences between measured and predicted

@@ -44,7 +44,7 @@ def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) 
     s = 1j * period.fundamental * np.arange(1, count)
     swing = np.degrees(np.ptp(period.filled(), axis=1))
     remark = (
-        f"linearised about the hanging pose; the joints swing {', '.join(f'{angle:.0f}' for angle in swing)} degrees"
+        f"linearised about the hanging pose; the joints swing by {', '.join(f'{angle:.0f}' for angle in swing)} degrees"
     )
     if period.joints == 1:
         A = np.stack((s * s * Q[0], s * Q[0], Q[0]), axis=1)

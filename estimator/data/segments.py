@@ -96,7 +96,7 @@ def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[Re
         )
     if not segments:
         raise RecordingError(
-            f"no piece of {length:g} s holds {FEWEST} samples: record faster, or choose longer segments"
+            f"no piece of {length:g} s holds {FEWEST} samples: raise the sample rate, or choose longer segments"
         )
     return segments
 

@@ -1,9 +1,9 @@
 """Multisines: sums of cosines on chosen harmonics of one period, with phases that keep the peaks low.
 
 The crest factor is lowered by minimising the L2p norm with increasing p: Guillaume, Schoukens, Pintelon, Kollar,
-"Crest-factor minimization using nonlinear Chebyshev approximation methods", IEEE Trans. IM 40 (1991) 982. They use
-Gauss-Newton steps, whose cost is lines^2 x samples. Here wave and gradient take one FFT each and the steps are L-BFGS,
-which also reaches lower peaks (1.40 instead of 1.44 for 25 lines) and takes a third of a second for 250 lines.
+"Crest-factor minimization using nonlinear Chebyshev approximation methods", IEEE Trans. IM 40 (1991) 982. The authors
+use Gauss-Newton steps, whose cost is lines^2 x samples. Here wave and gradient take one FFT each and the steps are
+L-BFGS, which also reaches lower peaks (1.40 instead of 1.44 for 25 lines) and takes a third of a second for 250 lines.
 """
 
 import math
@@ -173,7 +173,7 @@ def _check_lines(lines: Sequence[Sequence[int]], samples: int) -> None:
 
 def _check_peaks(peak_torque: Sequence[float], joints: int) -> None:
     if len(peak_torque) != joints:
-        raise ExcitationError(f"{len(peak_torque)} peak torques for {joints} joints: give one each")
+        raise ExcitationError(f"{len(peak_torque)} peak torques for {joints} joints: give one per joint")
     for joint, peak in enumerate(peak_torque, start=1):
         if not (peak > 0.0 and math.isfinite(peak)):
             raise ExcitationError(f"peak torque of joint {joint} is {peak:g} N m: it must be positive")

@@ -185,7 +185,7 @@ def minimise_segmented(
         if not np.isfinite(cost):
             raise ConvergenceError(
                 "the simulation diverges at the initial guess: too little motion was recorded, or torque or time "
-                "is in another unit"
+                "is in the wrong unit"
             )
         damping = options.initial_damping
         for iteration in range(1, options.max_iterations + 1):

@@ -3,8 +3,8 @@
 Dry friction holds a joint at rest while the torque on it stays within a band as wide as twice the static friction.
 Where the band lies depends on gravity and offsets, which may be poorly known; its width does not. Therefore the torque
 is compared with the largest and the smallest one since the joint came to rest: at an unchanged angle, gravity and
-offset cancel in their difference, and so do their errors. Only the changes due to the motion of other joints have to be
-modelled.
+offset cancel in these differences, and so do their errors. Only the changes due to the motion of other joints have to
+be modelled.
 
 A torque outside the band accelerates a free joint. The joint counts as blocked once a free joint would have gained
 enough momentum to show in the velocity register. Half of the excess may be on the other side of the band, since its

@@ -37,7 +37,7 @@ SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model with one term more than the estimate's, and its score test."""
+    """A model with one more term than the estimate's, and its score test."""
 
     model: Model
     part: str

@@ -1,4 +1,4 @@
-"""The verdict on an estimate from arbitrary motion, as `hil.estimator.selection.verdict` but based on segments."""
+"""The verdict on an estimate from arbitrary motion, as in `hil.estimator.selection.verdict` but based on segments."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -31,9 +31,9 @@ def wave_peaks(
     first.
 
     The part that the fitted parameters explain is removed first. The result is by parameter name. If the estimate's
-    model includes a wave that is sought, that wave is disabled first. If other terms have absorbed part of a wave, the
-    best number may be wrong. Therefore other numbers are returned as well if they explain at least the fraction
-    `COMPARABLE` of the sum of squares that the best one explains.
+    model includes a wave that is searched for, that wave is disabled first. If other terms have absorbed part of a
+    wave, the best number may be wrong. Therefore other numbers are returned as well if they explain at least the
+    fraction `COMPARABLE` of the sum of squares that the best one explains.
 
     only: joints, from 1, that are considered; by default all.
     """

@@ -61,7 +61,7 @@ class ChainCoordinates:
 
     names: tuple[str, ...]
     scales: Array
-    """Scales of the base parameters, at their indices; ignored for others (parameters,)."""
+    """Scales of the base parameters, at their indices; the other elements are ignored (parameters,)."""
     width_floor: Array
     """Minimum width of each joint's Coulomb step (joints,) [rad/s]."""
 
@@ -80,8 +80,9 @@ class ChainCoordinates:
         """Return the point reached by `step` from `x`; both may be followed by other coordinates.
 
         If a recording hardly determines the torque of some joints relative to that of the first, their torque scales
-        and all parameters of their links can change by a common factor. The scales are exponential. Unless the
-        parameters change exponentially with them, straight steps leave this curved valley, and only tiny ones succeed.
+        and all parameters of their links can change by a common factor. The scales are exponentials of their
+        coordinates. Unless the parameters change exponentially with them, straight steps leave this curved valley, and
+        only tiny ones succeed.
         """
         y = x + step
         if self.torque_scales.size:

@@ -22,7 +22,7 @@ class HeldZeros:
     shift: Array
     """Estimated true minus measured angle (joints - 1,) [rad]; close to 0 if gravity does not reveal it."""
     gain: float
-    """Expected decrease of the sum of squares if the zeros were fitted, in units of white noise."""
+    """Expected decrease of the sum of squares if the zeros were fitted, in units of the white noise's variance."""
 
 
 def held_zeros(problem: ChainProblem, x: Array, unfinished: float) -> HeldZeros:

@@ -4,10 +4,10 @@ The observer starts stiff, so that the simulation can follow the motion with sta
 the fit improves.
 
 If joints often stick, stage 1's estimate of friction can be far off. So can the link parameters and torque scales,
-which are correlated with friction. Softening the observer while the shape of friction is fixed then leads the fit into
-another minimum, in a curved valley where it stops short. So if the soft observer does not explain the motion, a second
-start is made from the prior's links, with the shape of friction free as soon as the stiffest observer follows the
-motion. The better of the two fits is continued.
+which are correlated with friction. Softening the observer while the shape of friction is fixed then leads the fit
+towards another minimum, in a curved valley, where it stops short. So if the soft observer does not explain the motion,
+a second start is made from the prior's links, with the shape of friction free as soon as the stiffest observer follows
+the motion. The better of the two fits is continued.
 """
 
 import math
@@ -62,7 +62,8 @@ def first_problem(
 def initial_lag(delay: float, options: ChainOptions) -> float:
     """Return the initial guess of the lag [s]: the geometric mean of stage 1's delay and the typical lag.
 
-    Stage 1's delay is too long by several milliseconds, since it makes up for the shape of friction near standstill.
+    Stage 1's delay is too long by several milliseconds, since it also compensates for the shape of friction near
+    standstill.
     """
     least = options.min_initial_lag
     return max(math.sqrt(max(delay, least) * SHAPES["lag"][0]), least)
