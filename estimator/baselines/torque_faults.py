@@ -28,7 +28,7 @@ class Clipped:
     """A joint whose torque seems limited to `level` [N m], although the column exceeds it in the fraction `beyond` of
     samples.
 
-    residual, residual_given: relative RMS of its torque's residual with the limit and as given.
+    residual, residual_given: relative RMS residual of its torque, with the limit and as given.
     """
 
     joint: int

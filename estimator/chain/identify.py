@@ -38,7 +38,7 @@ load-dependent friction of one joint raises it to 1.5 or more.
 
 SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005
 """Significance level for errors of fixed encoder zeros, and the smallest error that is reported [rad]: three encoder
-steps, finer than zeros are usually adjusted.
+steps, less than the usual error of an adjusted zero.
 """
 
 BELIEVED = 0.5  # standard errors under white noise above this fraction of the prior's: values come from the prior

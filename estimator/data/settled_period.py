@@ -47,14 +47,14 @@ class SettledPeriod:
     periods: int = 1
     """Number of settled periods that were averaged."""
     position_std: Array | None = None
-    """Standard deviation of the mean angles from the scatter between periods (joints,) [rad], if known."""
+    """Standard deviation of the mean angles, estimated from the scatter between periods (joints,) [rad], if known."""
     repeated_noise: Array | None = None
-    """Standard deviation of one sample's error from the difference between successive periods (joints,) [rad], if known
-    (`hil.estimator.data.repeated_noise`).
+    """Standard deviation of one sample's error, estimated from the difference between successive periods (joints,)
+    [rad], if known (`hil.estimator.data.repeated_noise`).
     """
     coloured_noise: Array | None = None
-    """Standard deviation of the part of that error that is not white (joints,) [rad], from the same difference, if
-    known.
+    """Standard deviation of the non-white part of one sample's error (joints,) [rad], estimated as for
+    `repeated_noise`, if known.
     """
     stabiliser: Stabilised | None = None
     """The software stabiliser, if one produced part of `torque`.

@@ -53,8 +53,8 @@ class Design:
 
 
 def smoothed(physics: Physics) -> Physics:
-    """Return the same arm with friction steps at least LEAST_WIDTH wide, which simulates faster and has nearly the same
-    optimum.
+    """Return the same arm with friction steps at least LEAST_WIDTH wide, which can be simulated faster and has nearly
+    the same optimum.
     """
     vector = physics.vector.copy()
     for joint in (1, 2):

@@ -19,7 +19,7 @@ TOLERANCE = 1e-9
 def bounded_step(matrix: Array, slope: Array, least: Array, most: Array) -> Array:
     """Return the s (coordinates,) within `least` and `most` that minimises s'Ms / 2 + g's.
 
-    Every iterate is feasible and no worse than 0, so that the result is a descent step even if it is not exact.
+    Every iterate is feasible and no worse than s = 0, so that the result is a descent step even if it is not exact.
 
     Args:
         matrix: M, positive definite (coordinates, coordinates).

@@ -146,7 +146,7 @@ def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: fl
     """Return the factor (coordinates,) by which each coordinate's variance exceeds that under independent errors.
 
     That is the ratio of the variances from the data alone, with and without what `robust_covariance` adds for
-    correlated errors and model errors. It takes the same arguments.
+    correlated errors and model errors. Arguments as in `robust_covariance`.
     """
     if is_unpredictable(at, samples):
         return np.ones(len(at.normal))

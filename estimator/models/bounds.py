@@ -55,8 +55,8 @@ def finite_std(std: Array, white: Array) -> Array:
     """Return the standard errors `std` (parameters,), with finite values in place of infinite ones, such as those at a
     bound.
 
-    white: standard errors for independent errors. They replace infinite ones, widened by as much as those of the other
-    parameters.
+    white: standard errors for independent errors. They replace infinite ones, widened by the same factor as those of
+    the other parameters.
     """
     known = np.isfinite(std) & (white > 0.0)
     wider = float(np.median(std[known] / white[known])) if known.any() else 1.0
@@ -65,8 +65,8 @@ def finite_std(std: Array, white: Array) -> Array:
 
 
 def matters(names: tuple[str, ...], beyond: Mask, step: Array, std: Array) -> bool:
-    """Return whether a base parameter, other than an offset, is at its bound (`beyond`) or would move by more than its
-    standard error `std`. `std` accounts for the misfit, which a parameter's own bound may have caused.
+    """Return whether a base parameter, other than an offset, is at its bound (`beyond`) or would move, without bounds,
+    by more than its standard error `std`, which includes the misfit that a parameter's own bound may have caused.
     """
     base = np.array([term_of(name).part == "base" and kind_of(name) != "offset" for name in names])
     return bool(beyond[base].any() or np.any(np.abs(step[base]) > MOVED * std[base]))

@@ -124,7 +124,7 @@ def worst_first(found: Sequence[Conflict | None]) -> tuple[Conflict, ...]:
 
 
 def contradicted(found: Sequence[Conflict], explained: bool) -> str:
-    """Return the best verdict that the contradictions allow: "no", "with care", or "" for any.
+    """Return the best verdict that the contradictions allow: "no", "with care", or "" if they allow any verdict.
 
     explained: whether the model explains the motion. If it does not, and a known value is far off, an effect missing
     from the model has distorted it, and presumably all others as well.

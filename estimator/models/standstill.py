@@ -45,7 +45,7 @@ def memory(joints: int, count: int) -> Array:
 
 
 def withstood(rest: Any) -> float:
-    """Return the largest torque, in either direction, that friction held before the joint moved again [N m]."""
+    """Return half of the widest torque range over which friction held the joint before it moved again [N m]."""
     return float(rest[_WITHSTOOD])
 
 

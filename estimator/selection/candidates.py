@@ -192,7 +192,8 @@ def ranked(
 
 
 def considered(period: SettledPeriod, estimate: Estimate) -> Array:
-    """Return the estimate's covariance (parameters, parameters) including omitted terms that cannot be ruled out.
+    """Return the estimate's covariance (parameters, parameters), including the effect of omitted terms that cannot be
+    ruled out.
 
     Each such parameter is described by its prior and the information from the motion, as if it were fitted as well.
     Since its value actually stays unchanged, the resulting shift of the other parameters is added.

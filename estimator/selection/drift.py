@@ -49,7 +49,9 @@ class Drift:
         return bool(np.any((np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > LEAST)))
 
     def after_correction(self) -> "Drift":
-        """Return the change that may remain after a correction: its error, and the part that is not linear in time."""
+        """Return the change that may remain after a correction: the error of the measured change, and its part that is
+        not linear in time.
+        """
         return replace(self, change=np.hypot(self.std, UNEVEN * self.change))
 
     def at_the_later(self, estimate: Estimate) -> Estimate:

@@ -30,7 +30,7 @@ def missing_terms(recordings: Sequence[Recording], estimate: ShootingEstimate) -
 
 
 def considered(recordings: Sequence[Recording], estimate: ShootingEstimate) -> ShootingEstimate:
-    """Return the estimate with standard errors that include omitted terms which cannot be ruled out."""
+    """Return the estimate with standard errors that account for omitted terms that cannot be ruled out."""
     left_out = [name for name in unruled(estimate.model) if term_of(name).part not in NOT_HERE]
     if not left_out:
         return estimate

@@ -19,7 +19,7 @@ class ChainOptions:
     softness explains.
     """
     first_step: float = 5.2e-3
-    """Integration step while the observer is stiff [s]; samples within it are skipped."""
+    """Integration step while the observer is stiff [s]; samples within such a step are skipped."""
     coarse_step: float = 2.6e-3
     """Integration step [s]."""
     fine_step: float = 1.3e-3

@@ -1,9 +1,10 @@
 """Compiled rigid-body dynamics of a serial chain: torque and its derivatives, mass matrix, regressor.
 
-Recursive Newton-Euler and composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms, 2008), with all spatial
-vectors expressed about the base's origin, so that no transformation between links is needed: motions are (angular,
-linear), forces (moment, force). The derivatives follow Singh, Russo and Wensing, IEEE Robotics and Automation Letters 7
-(2022) 1776. Of their Coriolis matrix B only the product with a motion w is needed; integrated over the mass it is
+The algorithms are recursive Newton-Euler and composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms,
+2008), with all spatial vectors expressed about the base's origin, so that no transformation between links is needed:
+motions are (angular, linear), forces (moment, force). The derivatives follow Singh, Russo and Wensing, IEEE Robotics
+and Automation Letters 7 (2022) 1776. Of their Coriolis matrix B only the product with a motion w is needed; integrated
+over the mass it is
 
     2 B w = (2 (tr G - G) w_angular, 2 w_angular x l)       G = sum of dm velocity position^T, l the momentum,
 
@@ -33,7 +34,7 @@ def room(joints: int) -> Any:
     frame    rotation by rows and origin of each link (joints, 12)
     motion   joint axis; velocity; acceleration, with gravity as an upward acceleration; time derivative of the axis;
              velocity of the previous link x axis; the corresponding term of its acceleration (joints, 6, 6)
-    body     see above; single links, then composites (2, joints, BODY)
+    body     columns MASS to FORCE; single links, then composites (2, joints, BODY)
     seized   composite inertia times axis (joints, 6)
     mass     mass matrix (joints, joints)
     torque   (joints,)

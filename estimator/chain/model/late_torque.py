@@ -81,7 +81,7 @@ def rotor(base: BaseParameters, joint: int) -> Array:
 
 Losses = list[tuple[Array, dict[int, float]]]
 """For each voltage-driven joint: its rotor (base parameters,), and by how much its inertia [kg m^2] decreases per unit
-of the parameters on which its lagging back-EMF depends, by their index.
+of each parameter on which its lagging back-EMF depends, by the index of that parameter.
 """
 
 

@@ -79,7 +79,8 @@ class Loop:
     limit: largest commanded torque (joints,) [N m].
     stops: side on which a joint lies on its own stop in the rest pose (joints,), -1, 1, or 0 if it does not; None if
     none does. A stop supports its joint instead of the surface, whatever the angles of the other joints. Nothing
-    supports a joint whose largest torque is 0. pull: added to the spring and damper; None if they act alone.
+    supports a joint whose largest torque is 0.
+    pull: added to the spring and damper; None if they act alone.
     """
 
     rate: float
