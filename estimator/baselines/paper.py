@@ -30,7 +30,7 @@ NOISE = 0.1  # rad: "white noise 0.1*rand()", uniformly distributed from 0 to th
 
 @dataclass(frozen=True)
 class PaperArm:
-    """The paper's arm; the defaults are its Table 1."""
+    """The paper's arm; the defaults are those of its Table 1."""
 
     mass_1: float = 5.0
     mass_2: float = 1.5

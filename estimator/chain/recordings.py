@@ -92,7 +92,7 @@ class RecordedChain:
     """See `ChainEstimate.systematic`; 1 for a regression."""
     at_bound: tuple[str, ...] = ()
     conflicts: tuple[Conflict, ...] = ()
-    """See `ChainEstimate`."""
+    """See `ChainEstimate.conflicts`."""
 
     @property
     def std(self) -> Array:

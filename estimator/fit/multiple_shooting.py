@@ -63,7 +63,7 @@ class ShootingEstimate:
     """Nominal length of a segment [s]."""
     iterations: int
     residual_over_noise: Array
-    """RMS in units of the noise (joints,)."""
+    """RMS residual in units of the noise (joints,)."""
     own: Array
     """Each segment's state at its start (segments, 2 joints), in units of `Shooting.state_scale`."""
     fitted: slice = field(default_factory=lambda: ALL)

@@ -64,7 +64,7 @@ class Segmented:
     shared: Array
     """Shared coordinates (shared,)."""
     own: Array
-    """Own coordinates (segments, own)."""
+    """The segments' own coordinates (segments, own)."""
     cost: float
     """Sum of squares."""
     information: Array
