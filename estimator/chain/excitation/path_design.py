@@ -89,8 +89,8 @@ class PathDesigner:
         self._count = int(np.floor(highest * period + 1e-9))
         if self._count < 2 or highest > rate / 8:
             raise ExcitationError(
-                f"a path of {period:g} s with harmonics up to {highest:g} Hz at {rate:g} samples/s: needs at least two "
-                "harmonics below an eighth of the rate"
+                f"a path of {period:g} s with harmonics up to {highest:g} Hz at {rate:g} samples/s: it needs at least "
+                "two harmonics below an eighth of the rate"
             )
         if (limits.low >= limits.high).any():
             raise ExcitationError("no position range is left for a path")
