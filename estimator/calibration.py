@@ -1,4 +1,4 @@
-"""Torque constants from a known mass: a joint likelihood of two settled periods, without and with the mass.
+"""Torque constants from a known mass: one likelihood of two settled periods, without and with the mass.
 
 Every parameter of a joint scales with its torque constant, so a single experiment cannot determine the constant. A mass
 M bolted to the last link at a known distance changes the arm's parameters by amounts that are known in kilograms and

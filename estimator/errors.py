@@ -2,7 +2,7 @@
 
 EstimationError
 ├── ExcitationError       the requested multisine cannot be built
-├── RecordingError        the samples are not a settled period of an experiment
+├── RecordingError        the samples cannot be used
 │   ├── ShapeError        arrays with incompatible shapes
 │   └── StandstillError   a joint never moved
 ├── ModelError            unsupported friction model, drive model or number of joints
@@ -33,7 +33,7 @@ class ExcitationError(EstimationError):
 
 
 class RecordingError(EstimationError):
-    """Not a settled period: too many samples are missing, values are not finite, or the period does not close."""
+    """The samples cannot be used: too many are missing, values are not finite, or a period does not close."""
 
 
 class ShapeError(RecordingError):

@@ -47,7 +47,7 @@ class Estimate(FittedParameters):
     correlation_time: float = 1.0
     """Number of samples over which the residual is correlated; 1 is white. `covariance` takes it into account."""
     at_bound: tuple[str, ...] = ()
-    """Parameters at a bound although the data favour values beyond it, if base parameters depend on them."""
+    """Parameters at a bound although the data favour values beyond it; empty unless this affects base parameters."""
 
 
 @one_blas_thread

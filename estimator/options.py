@@ -62,7 +62,9 @@ class CoordinateOptions:
     min_initial: float = 1e-3
     """Minimum initial value of a positive parameter, as a fraction of its scale."""
     max_initial_share: float = 0.95
-    """Maximum initial value of a parameter that is a share of two others, as a fraction of its bound."""
+    """Maximum initial value of a parameter that is a share of two others' geometric mean, as a fraction of its
+    bound.
+    """
     min_width: float = 1e-3
     """Minimum distance of a width from its lower bound, as a fraction of that bound, so that it can grow again."""
     max_relative_increase: float = 2.0
@@ -142,9 +144,13 @@ class LikelihoodOptions:
     An arm that swings past the upright pose amplifies parameter errors, so it is first held to the measured motion.
     """
     tracking_loss: float = 1.5
-    """The run's beginning is fitted before the whole if the free cost exceeds the tracking cost by this factor."""
+    """The run's beginning is fitted first if the cost of the free motion exceeds that of the tracking fit by this
+    factor.
+    """
     horizons: tuple[float, ...] = (0.125, 0.25, 0.5)
-    """Lengths of the beginnings that are fitted before the whole run, as fractions of it, in this order."""
+    """Lengths of the initial parts of a run that are fitted before the whole, as fractions of the run, in this
+    order.
+    """
     min_horizon_samples: int = 10
     """Minimum number of samples per unknown, over all joints; a shorter beginning is skipped."""
 
@@ -205,7 +211,7 @@ class ShootingOptions:
     initial_stribeck_velocities: tuple[float, ...] = (0.2, 2.0)
     """Initial Stribeck velocities [rad/s], all of which are tried."""
     short: float = 0.25
-    """Length of the short segments that are fitted first, as a fraction of the segments' length."""
+    """Length of the short segments that are fitted first, as a fraction of the full segment length."""
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""
     reweightings: int = 2
@@ -214,7 +220,7 @@ class ShootingOptions:
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """Options of the joint likelihood of two periods, without and with a known mass."""
+    """Options of the combined likelihood of two periods, without and with a known mass."""
 
     ftol: float = 1e-6
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)
@@ -251,11 +257,13 @@ class SelectionOptions:
     explained_residual: float = 1.02
     """RMS residual in units of the noise below which no further term is tried."""
     near_residual: float = 5.0
-    """If the RMS residual, in units of the noise, is below this, a richer model's minimum is sought near the simpler
-    one's.
+    """If the RMS residual, in units of the noise, is below this, a richer model's minimum is searched for near the
+    simpler one's.
     """
     steady_residual: float = 5.0
-    """RMS residual in units of the noise below which a change of friction is sought: worse models may mimic one."""
+    """RMS residual in units of the noise below which a change of friction is searched for: worse models may mimic
+    one.
+    """
     presliding_residual: float = 1.2
     """RMS residual in units of the noise above which a fit with presliding is tried; such fits are slow."""
     initial_widths: tuple[float, ...] = (5e-4, 2e-2)

@@ -1,9 +1,9 @@
 """Other methods on the same settled period, each tuned and timed, for comparison.
 
-All methods receive the same positions and commands. Their torque is the command, delayed by the delay that hil's stage
-1 has found, so that none of them has to estimate it. The settings of each method (cut-off, width of the smoothed
-Coulomb step, process noise) are searched, and those whose simulation is closest to the recording are kept; only the run
-time with these settings counts.
+All methods receive the same positions and commands. Their torque is the command, delayed by the delay found in hil's
+stage 1, so that none of them has to estimate it. The settings of each method (cut-off, width of the smoothed Coulomb
+step, process noise) are tuned by trying several and keeping those whose simulation is closest to the recording; only
+the run time with these settings counts.
 """
 
 import time
@@ -65,10 +65,10 @@ def joined(period: SettledPeriod, periods: int) -> Recording:
 
 
 def compare_peers(period: SettledPeriod, length: float | None, gravity: float) -> Iterator[Peer]:
-    """Yield the results of IDIM-LS, RLS, EKF, UKF and the paper's linearised method on one settled period.
+    """Yield the results of IDIM-LS, RLS, EKF, UKF and the linearised method of Zhu et al. on one settled period.
 
-    length: length of link 1 [m]; gravity: acceleration of gravity [m/s^2]. The paper's method needs both to separate
-    the inertias; if `length` is None, it is skipped on an arm of two joints.
+    length: length of link 1 [m]; gravity: acceleration of gravity [m/s^2]. The method of Zhu et al. needs both to
+    separate the inertias; if `length` is None, it is skipped on an arm of two joints.
     """
     recording = joined(period, 1)
     delay = fit_lines(period).delay

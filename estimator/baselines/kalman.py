@@ -1,13 +1,13 @@
 """Extended and unscented Kalman filters whose state includes the parameters: baselines that use positions only.
 
-State: angles, velocities, base parameters. Between samples the arm is integrated by Runge-Kutta steps under the mean
+State: angles, velocities, base parameters. Between samples the motion is integrated by Runge-Kutta steps under the mean
 motor torque; the parameters are constant except for a little process noise; each sample corrects the whole state. EKF:
 Gautier and Poignet, Control Engineering Practice 9 (2001) 1361, here with the Jacobian of the integrated step by finite
 differences. UKF: Julier and Uhlmann, Proc. IEEE 92 (2004) 401, symmetric sigma points.
 
 The filters get every fair advantage: the same dynamics as the likelihood, an initial guess from filtered least squares
 with a realistic spread, several passes over the recording, each starting from the last pass's result, and noise levels
-that a caller may search (as `hil.estimator.baselines.compare` does).
+that a caller may tune (as `hil.estimator.baselines.compare` does).
 """
 
 from collections.abc import Callable

@@ -29,7 +29,7 @@ NOISE = 0.1  # rad: "white noise 0.1*rand()", uniformly distributed from 0 to th
 
 @dataclass(frozen=True)
 class PaperArm:
-    """The paper's arm; the defaults are its Table 1."""
+    """The paper's arm; the defaults are those of its Table 1."""
 
     mass_1: float = 5.0
     mass_2: float = 1.5
@@ -71,7 +71,7 @@ class Excitation:
 
 
 def own_lines() -> Excitation:
-    """Return Table 2 on joint 1, and the same amplitudes one harmonic higher on joint 2.
+    """Return the lines of Table 2 for joint 1, and the same amplitudes one harmonic higher for joint 2.
 
     As printed in (19), both joints have the same torque on the same lines, so only sums of the two columns of the
     transfer function can be observed and A1 of (33) is singular. A shift by one harmonic is the smallest change that
@@ -84,7 +84,7 @@ def own_lines() -> Excitation:
 
 
 def printed_lines() -> Excitation:
-    """Return Table 2 on both joints at once, as printed."""
+    """Return the lines of Table 2 for both joints at once, as printed."""
     return Excitation(np.array(LINES), np.array([AMPLITUDES, AMPLITUDES]))
 
 
@@ -159,11 +159,11 @@ class MassEstimate:
     std: tuple[float, float]
     """Standard errors from the residual [kg]."""
     viscous: float
-    """Viscous friction estimated along with the masses, only for the second order [N m s/rad]."""
+    """Viscous friction estimated along with the masses, only for the second-order plant [N m s/rad]."""
 
 
 def fit_likelihood(coefficient: Complex, excitation: Excitation, known: PaperArm, order: Order) -> MassEstimate:
-    """Return the masses (and for the second order the friction) that maximise the likelihood of the coefficients.
+    """Return the masses (and the friction of the second-order plant) that maximise the likelihood of the coefficients.
 
     The noise of a Fourier coefficient is normal with the same variance on all lines, whatever its distribution in time,
     so maximising the likelihood means minimising the sum of squared differences between measured and predicted

@@ -2,7 +2,7 @@
 pose.
 
 This is its corrected form, second order with damping: (s^2 D + s F + K) q = tau on every line, with D and K of the arm
-linearised at (-pi/2, 0). It is valid for small swings without dry friction; for others it shows the error of
+linearised at (-pi/2, 0). It is valid for small swings without dry friction; for other motions it shows the error of
 linearisation. Zhu et al., Machines 10 (2022) 392, equations (13), (48), (52) to (69); docs/paper.md.
 """
 
@@ -25,7 +25,7 @@ class LinearisedEstimate:
     """Base parameters by name [SI]; the friction is purely viscous."""
     std: dict[str, float]
     remark: str
-    """States how large the swings were, compared with the linear range."""
+    """States how far each joint swings about the hanging pose."""
 
 
 def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) -> LinearisedEstimate:
@@ -44,7 +44,7 @@ def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) 
     s = 1j * period.fundamental * np.arange(1, count)
     swing = np.degrees(np.ptp(period.filled(), axis=1))
     remark = (
-        f"linearised about the hanging pose; the joints swing {', '.join(f'{angle:.0f}' for angle in swing)} degrees"
+        f"linearised about the hanging pose; the joints swing by {', '.join(f'{angle:.0f}' for angle in swing)} degrees"
     )
     if period.joints == 1:
         A = np.stack((s * s * Q[0], s * Q[0], Q[0]), axis=1)

@@ -103,8 +103,8 @@ def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | N
 def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | None:
     """Return evidence that the torques of two joints are swapped.
 
-    This is the relative RMS of the worst joint's torque residual, with the torques swapped and as given; None if that
-    does not explain the recordings much better.
+    This is the relative RMS of the worst joint's torque residual, with the torques swapped and as given; None if
+    swapping them does not explain the recordings much better.
     """
     if recordings[0].joints != 2:
         return None
@@ -114,7 +114,7 @@ def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | No
 def suspect_order(recordings: Sequence[Recording]) -> tuple[float, float] | None:
     """Return evidence that both the angles and the torques of two joints are in the opposite order.
 
-    The result is as for `suspect_swapped`. The zero of the outer joint's angle may be known only after the exchange of
+    See `suspect_swapped` for the result. The zero of the outer joint's angle may be known only after the exchange of
     columns.
     """
     if recordings[0].joints != 2:

@@ -28,7 +28,7 @@ class Clipped:
     """A joint whose torque seems limited to `level` [N m], although the column exceeds it in the fraction `beyond` of
     samples.
 
-    residual, residual_given: relative RMS of its torque's residual with the limit and as given.
+    residual, residual_given: relative RMS residual of its torque, with the limit and as given.
     """
 
     joint: int
@@ -49,7 +49,7 @@ class ClockDrift:
     start: float
     end: float
     relative: float
-    """Change of the delay per time, the difference of the clocks' rates."""
+    """Change of the delay per unit of time: the relative difference between the clocks' rates."""
     residual: float
     residual_given: float
 
@@ -78,7 +78,9 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
 
 
 def suspect_drift(recordings: Sequence[Recording]) -> ClockDrift | None:
-    """Return the drift of the torque's delay that explains the motion much better than a constant one; or None."""
+    """Return the drift of the torque's delay if it explains the motion much better than a constant delay, otherwise
+    None.
+    """
     from scipy.optimize import minimize
 
     if sum(each.time.size for each in recordings) > MOST_SAMPLES:

@@ -1,6 +1,6 @@
 """Torque constants of a spatial arm from a known mass: one likelihood of two settled periods, without and with it.
 
-A single recording determines the ratios of the torque constants only. A known mass on a link changes the base
+A single recording only determines the ratios of the torque constants. A known mass on a link changes the base
 parameters by amounts known in kilograms and metres. In units of the first joint's assumed torque constant, this change
 appears multiplied by the ratio of assumed to true constant, which is a parameter of the fit (`ADDED_MASS`).
 """
@@ -21,7 +21,9 @@ from hil.estimator.errors import ModelError
 
 @dataclass(frozen=True)
 class MassOnLink:
-    """A mass bolted to a link, small enough for its inertia about its own centre to be the same in all directions."""
+    """A mass bolted to a link, compact enough that its inertia about its own centre can be taken as equal in all
+    directions.
+    """
 
     mass: float
     """Mass [kg]."""

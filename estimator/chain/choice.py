@@ -34,7 +34,7 @@ class ChainTrial:
 
     model: ChainModel
     estimate: ChainEstimate | None
-    """None if the fit did not converge."""
+    """Result of the fit; None if it did not converge."""
     seconds: float
     """Duration of the fit [s]."""
 

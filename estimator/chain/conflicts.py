@@ -9,7 +9,7 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.models.conflicts import Conflict, Source, conflict, worst_first
 
 DRIVES = ("back_emf", "lag_ratio")
-"""Drive terms that are known beforehand; the other terms of `SHAPES` may well be zero."""
+"""Drive terms whose typical values are known beforehand; the other terms of `SHAPES` may well be zero."""
 
 
 def chain_conflicts(names: tuple[str, ...], value: Array, std: Array, prior: Prior) -> tuple[Conflict, ...]:

@@ -31,14 +31,14 @@ SYSTEMATIC = 1.1
 """The residual contains a model error rather than noise if a base parameter's standard error is more than this multiple
 of that under white noise.
 
-It is 0.6 to 0.9 for encoder rounding and noise. Torque ripple of 0.2 %, or load-dependent friction of 0.3 % of the
-torque, raises it to 2 or 3, while the residual still exceeds the noise by less than a tenth. With a noisy encoder,
+The ratio is 0.6 to 0.9 for encoder rounding and noise. Torque ripple of 0.2 %, or load-dependent friction of 0.3 % of
+the torque, raises it to 2 or 3, while the residual still exceeds the noise by less than a tenth. With a noisy encoder,
 load-dependent friction of one joint raises it to 1.5 or more.
 """
 
 SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005
 """Significance level for errors of fixed encoder zeros, and the smallest error that is reported [rad]: three encoder
-steps, finer than zeros are usually adjusted.
+steps, less than the usual error of an adjusted zero.
 """
 
 BELIEVED = 0.5  # standard errors under white noise above this fraction of the prior's: values come from the prior
@@ -81,7 +81,7 @@ class ChainEstimate(FittedParameters):
     """Noise of one sample of each angle, encoder rounding included (joints,) [encoder steps]; rounding alone is 0.2887.
     """
     at_bound: tuple[str, ...] = ()
-    """Parameters at a bound although the data favour values beyond it, if base parameters depend on them."""
+    """Parameters at a bound although the data favour values beyond it; empty unless this affects base parameters."""
     conflicts: tuple[Conflict, ...] = ()
     """Values far from what was known beforehand, the largest contradiction first."""
 
@@ -169,7 +169,7 @@ def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int
 
 
 def largest_ratio(one: Array, other: Array) -> float:
-    """Return the largest ratio of two vectors of standard errors, over the finite ones; infinite if there are none.
+    """Return the largest ratio of two vectors of standard errors, element by element; infinite if no element is finite.
 
     The largest ratio is used, not the median, because an effect that the model lacks may act in one joint alone.
     """

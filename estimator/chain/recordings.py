@@ -2,7 +2,7 @@
 
 Stage 1 is filtered inverse dynamics. Stage 2 is the same likelihood as for settled periods: its observer needs no
 periodic motion, only torque that was commanded. A measured torque already responds to the motion, so a simulation
-driven by it gains nothing (docs/theory.md); in that case the regression's result is returned, and marked as such.
+driven by it adds no information (docs/theory.md); in that case the regression's result is returned, and marked as such.
 """
 
 from collections.abc import Sequence
@@ -92,7 +92,7 @@ class RecordedChain:
     """See `ChainEstimate.systematic`; 1 for a regression."""
     at_bound: tuple[str, ...] = ()
     conflicts: tuple[Conflict, ...] = ()
-    """See `ChainEstimate`."""
+    """See `ChainEstimate.conflicts`."""
 
     @property
     def std(self) -> Array:
@@ -162,8 +162,8 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
 
 
 def torque_error(recordings: Sequence[Recording], found: RecordedChain) -> Array:
-    """Return the RMS error of the torque computed with the parameters for recordings, relative to the torque's RMS
-    (joints,).
+    """Return the RMS error of the torque that the parameters `found` predict for `recordings`, relative to the torque's
+    RMS (joints,).
     """
     value = np.array([found.parameters[name] for name in found.model.linear_names])
     return _torque_residual(recordings, found.model, value, found.cutoff)

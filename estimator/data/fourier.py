@@ -49,8 +49,9 @@ def noise_power(lines: Lines) -> Array:
 def white_noise(position: Array, valid: Mask | None = None) -> Array:
     """Return the standard deviation of the white noise in one period of angles (joints, samples), per joint.
 
-    It is estimated from the upper quarter of the lines, far above any motion. A linear trend is removed first: if the
-    arm drifts, the two ends of a period do not match, and the jump between them would spread over all lines.
+    It is estimated from the upper quarter of the lines, far above the frequencies of any motion. A linear trend is
+    removed first: if the arm drifts, the two ends of a period do not match, and the jump between them would spread over
+    all lines.
 
     valid: samples that were received (joints, samples); the others are interpolated linearly, which reduces noise at
     high frequencies. White noise interpolated in the same way shows by how much.

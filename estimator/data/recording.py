@@ -68,8 +68,8 @@ class Recording:
 
     @cached_property
     def noise(self) -> Array:
-        """Standard deviation of one position (joints,) [rad]: the measured white noise, but at least that of
-        rounding.
+        """Standard deviation of one position sample's error (joints,) [rad]: the measured white noise, but at least
+        that of rounding.
         """
         rounding = self.position_step / np.sqrt(12.0)
         white = np.array([_white_noise(self.time, row) for row in self.position])
@@ -206,7 +206,7 @@ def _check_motion(recording: Recording) -> None:
         if swing <= least:
             raise StandstillError(
                 f"joint {joint + 1} moved by {swing:.2g} rad; at least {least:.2g} rad are needed: check the column "
-                "and its unit, or drive it harder"
+                "and its unit, or drive the joint harder"
             )
         speed = float(np.abs(np.diff(row) / np.diff(recording.time)).max())
         if swing > MOST_ANGLE:

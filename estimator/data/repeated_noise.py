@@ -47,7 +47,7 @@ _MOST_NOISE = 1.0  # exponent of the correction for noise in the drift; above it
 
 
 def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> Array | None:
-    """Return the standard deviation of one mean sample's error (joints,) [rad], rounding included.
+    """Return the standard deviation of the error of one averaged sample (joints,) [rad], rounding included.
 
     Args:
         passes: angles (joints, samples) [rad] of successive passes of the same motion; NaN where a sample is missing.
@@ -71,12 +71,12 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
 
 
 def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> Array | None:
-    """Return the standard deviation of one mean sample's noise in excess of white noise (joints,) [rad].
+    """Return the standard deviation of the noise of one averaged sample in excess of white noise (joints,) [rad].
 
     It is 0 unless significant. On the lines on which the motion may have changed from pass to pass, the noise is
-    extrapolated: it is assumed to rise from the octave above by as much as it rises from the next octave to that one.
-    Noise with a long correlation is underestimated. Takes the arguments of `repeated_noise`, and returns None in the
-    same cases.
+    extrapolated: it is assumed to rise as much from the octave above to these lines as from the next higher octave to
+    that one. Noise with a long correlation is underestimated. Takes the arguments of `repeated_noise`, and returns None
+    in the same cases.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None

@@ -96,7 +96,7 @@ def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[Re
         )
     if not segments:
         raise RecordingError(
-            f"no piece of {length:g} s holds {FEWEST} samples: record faster, or choose longer segments"
+            f"no piece of {length:g} s holds {FEWEST} samples: raise the sample rate, or choose longer segments"
         )
     return segments
 
@@ -107,7 +107,9 @@ def _slice(inside: Mask) -> slice:
 
 
 def grid_torque(recording: Recording, grid: Grid, delay: float, lag: float) -> Array:
-    """Return the mean motor torque over each grid step (joints, steps) [N m], with `delay` [s] and `lag` [s]."""
+    """Return the mean motor torque over each grid step (joints, steps) [N m], delayed by `delay` [s] and with the lag
+    `lag` [s].
+    """
     torque = recording.mean_torque(grid.edges, delay)
     if lag <= 0.0:
         return torque

@@ -47,14 +47,14 @@ class SettledPeriod:
     periods: int = 1
     """Number of settled periods that were averaged."""
     position_std: Array | None = None
-    """Standard deviation of the mean angles from the scatter between periods (joints,) [rad], if known."""
+    """Standard deviation of the mean angles, estimated from the scatter between periods (joints,) [rad], if known."""
     repeated_noise: Array | None = None
-    """Standard deviation of one sample's error from the difference between successive periods (joints,) [rad], if known
-    (`hil.estimator.data.repeated_noise`).
+    """Standard deviation of one sample's error, estimated from the difference between successive periods (joints,)
+    [rad], if known (`hil.estimator.data.repeated_noise`).
     """
     coloured_noise: Array | None = None
-    """Standard deviation of the part of that error that is not white (joints,) [rad], from the same difference, if
-    known.
+    """Standard deviation of the non-white part of one sample's error (joints,) [rad], estimated as for
+    `repeated_noise`, if known.
     """
     stabiliser: Stabilised | None = None
     """The software stabiliser, if one produced part of `torque`.
@@ -116,9 +116,9 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
 
     Two distances of a reading are computed: from the median of itself and two neighbours on either side, and from a
     cubic through its neighbours. It is an outlier if both exceed SPIKE encoder steps and SPIKE times the typical
-    distance from the median. The median alone would take every fast reversal at a low rate for an outlier, since most
-    readings of a steadily moving joint are the median themselves. If the fraction of such readings exceeds MOST_SPIKES,
-    they are not outliers: the joint moves fast compared with the sample rate.
+    distance from the median. At a low sampling rate, the median alone would take every fast reversal for an outlier,
+    since most readings of a steadily moving joint are the median themselves. If the fraction of such readings exceeds
+    MOST_SPIKES, they are not outliers: the joint moves fast compared with the sample rate.
     """
     from scipy.ndimage import median_filter
 

@@ -1,9 +1,9 @@
 """Multisines: sums of cosines on chosen harmonics of one period, with phases that keep the peaks low.
 
 The crest factor is lowered by minimising the L2p norm with increasing p: Guillaume, Schoukens, Pintelon, Kollar,
-"Crest-factor minimization using nonlinear Chebyshev approximation methods", IEEE Trans. IM 40 (1991) 982. They use
-Gauss-Newton steps, whose cost is lines^2 x samples. Here wave and gradient take one FFT each and the steps are L-BFGS,
-which also reaches lower peaks (1.40 instead of 1.44 for 25 lines) and takes a third of a second for 250 lines.
+"Crest-factor minimization using nonlinear Chebyshev approximation methods", IEEE Trans. IM 40 (1991) 982. The authors
+use Gauss-Newton steps, whose cost is lines^2 x samples. Here wave and gradient take one FFT each and the steps are
+L-BFGS, which also reaches lower peaks (1.40 instead of 1.44 for 25 lines) and takes a third of a second for 250 lines.
 """
 
 import math
@@ -85,7 +85,8 @@ def zippered_lines(period: float, band: tuple[float, float], joints: int) -> tup
 
 
 def detecting_lines(period: float, band: tuple[float, float], joints: int, seed: int) -> tuple[tuple[int, ...], ...]:
-    """Assign odd harmonics to the joints in turn, leaving one of every DETECTION unexcited, at random (`seed`).
+    """Assign odd harmonics to the joints in turn, leaving one in DETECTION of them, chosen at random (`seed`),
+    unexcited.
 
     On the unexcited lines, odd or even, the arm's nonlinear distortion becomes visible: see
     `hil.estimator.selection.distortion`. Raises ExcitationError if fewer lines than joints are left.
@@ -172,7 +173,7 @@ def _check_lines(lines: Sequence[Sequence[int]], samples: int) -> None:
 
 def _check_peaks(peak_torque: Sequence[float], joints: int) -> None:
     if len(peak_torque) != joints:
-        raise ExcitationError(f"{len(peak_torque)} peak torques for {joints} joints: give one each")
+        raise ExcitationError(f"{len(peak_torque)} peak torques for {joints} joints: give one per joint")
     for joint, peak in enumerate(peak_torque, start=1):
         if not (peak > 0.0 and math.isfinite(peak)):
             raise ExcitationError(f"peak torque of joint {joint} is {peak:g} N m: it must be positive")

@@ -53,8 +53,8 @@ class Design:
 
 
 def smoothed(physics: Physics) -> Physics:
-    """Return the same arm with friction steps at least LEAST_WIDTH wide, which simulates faster and has nearly the same
-    optimum.
+    """Return the same arm with friction steps at least LEAST_WIDTH wide, which can be simulated faster and has nearly
+    the same optimum.
     """
     vector = physics.vector.copy()
     for joint in (1, 2):
@@ -101,7 +101,9 @@ class DesignProblem:
         return deviations
 
     def scale(self) -> Array:
-        """Return the scale of each standard error: the parameter; for an offset, the joint's Coulomb friction."""
+        """Return what each standard error is relative to: the parameter or, for an offset, the joint's Coulomb
+        friction.
+        """
         known = dict(zip(CONSTANTS, self.physics.vector.tolist(), strict=True))
         against = [name.replace("offset", "coulomb") if name.startswith("offset") else name for name in self.names]
         return np.maximum(np.abs([known[name] for name in against]), 1e-9)

@@ -13,13 +13,13 @@ from hil.estimator.arrays import Array, Mask
 
 ITERATIONS_PER_COORDINATE = 6
 TOLERANCE = 1e-9
-"""Slope at a bound, relative to the largest one, that counts as zero."""
+"""A slope at a bound counts as zero if it is below this fraction of the largest slope."""
 
 
 def bounded_step(matrix: Array, slope: Array, least: Array, most: Array) -> Array:
     """Return the s (coordinates,) within `least` and `most` that minimises s'Ms / 2 + g's.
 
-    Every iterate is feasible and no worse than 0, so that the result is a descent step even if it is not exact.
+    Every iterate is feasible and no worse than s = 0, so that the result is a descent step even if it is not exact.
 
     Args:
         matrix: M, positive definite (coordinates, coordinates).

@@ -73,7 +73,8 @@ def structured_share(residual: Array) -> Array:
     """Return the fraction (joints,) of the power of each residual (joints, samples) that is not white.
 
     White noise has the same power in every Fourier line; its level is estimated from the upper half of the lines, far
-    above the motion. The fraction is 0 if the residual does not differ significantly from white noise.
+    above the frequencies of the motion. The fraction is 0 if the residual does not differ significantly from white
+    noise.
     """
     samples = residual.shape[1]
     power = np.abs(np.fft.rfft(residual, axis=1)) ** 2 / samples**2
@@ -112,8 +113,8 @@ def robust_covariance(
         samples: number of samples.
         count: number of coordinates to return.
         structured: part of the sum of squares that is due to model errors.
-        expected: what a prior has added to the normal equations (coordinates, coordinates); it is not inflated when the
-            measurement errors are larger than independent ones.
+        expected: what a prior has added to the normal equations (coordinates, coordinates); it keeps its weight where
+            the data's variance is inflated.
     """
     if is_unpredictable(at, samples):
         return np.full((count, count), np.inf)
@@ -145,7 +146,7 @@ def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: fl
     """Return the factor (coordinates,) by which each coordinate's variance exceeds that under independent errors.
 
     That is the ratio of the variances from the data alone, with and without what `robust_covariance` adds for
-    correlated errors and model errors. It takes the same arguments.
+    correlated errors and model errors. Arguments as in `robust_covariance`.
     """
     if is_unpredictable(at, samples):
         return np.ones(len(at.normal))

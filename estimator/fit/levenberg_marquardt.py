@@ -88,7 +88,7 @@ def minimise(
     if not np.isfinite(here.cost):
         raise ConvergenceError(
             "the simulation diverges at the initial guess: too little motion was recorded, or torque or time "
-            "is in another unit"
+            "is in the wrong unit"
         )
     damping = options.initial_damping if damping is None else damping
     evaluations = int(at is None)

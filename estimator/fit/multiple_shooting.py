@@ -1,7 +1,7 @@
 """Multiple shooting: maximum likelihood on any recording, cut into segments with unknown initial states.
 
 Open-loop simulation accumulates errors: on a long recording, model errors or the chaos of a tumbling arm mask the
-parameters' influence. On a segment of a second they do not. Bock, "Recent advances in parameter identification
+parameters' influence. On a segment of a second they do not. Source: Bock, "Recent advances in parameter identification
 techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical Treatment of Inverse Problems (1983). The segments are
 not joined, since effects that a rigid arm does not have, such as backlash and flexing, may change the state between
 them.
@@ -9,8 +9,8 @@ them.
 Short segments are fitted first, since they converge even from a poor initial guess; a subset of them suffices to get
 close to the minimum. Longer segments then refine the result, first with coarse integration steps. A segment whose
 residual is larger than usual is downweighted accordingly. An example is a segment in which a joint stuck, which no
-smooth friction reproduces. With equal weights, the segments that the model explains worst would dominate. The typical
-size of small terms (`Term.spread`) serves as a prior, weighted relative to the residual.
+smooth friction law reproduces. With equal weights, the segments that the model explains worst would dominate. The
+typical size of small terms (`Term.spread`) serves as a prior, weighted relative to the residual.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -63,7 +63,7 @@ class ShootingEstimate:
     """Nominal length of a segment [s]."""
     iterations: int
     residual_over_noise: Array
-    """RMS in units of the noise (joints,)."""
+    """RMS residual in units of the noise (joints,)."""
     own: Array
     """Each segment's state at its start (segments, 2 joints), in units of `Shooting.state_scale`."""
     fitted: slice = field(default_factory=lambda: ALL)

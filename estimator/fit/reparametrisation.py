@@ -33,7 +33,9 @@ class Coordinates:
     """Scale of each parameter (parameters,) [its unit], from `scales_of`."""
     options: CoordinateOptions
     resolved: Array | None = None
-    """Lower bound of each width, elsewhere 0 (parameters,) [rad/s]: the larger of this and `width_floor` counts."""
+    """Lower bound of each width, 0 for other parameters (parameters,) [rad/s]: the larger of this and `width_floor`
+    counts.
+    """
 
     def values(self, x: Array) -> Array:
         """Return the parameters (parameters,) at the coordinates `x` (parameters,)."""
@@ -91,7 +93,7 @@ class Coordinates:
     def ranges(self, value: Array) -> tuple[Array, Array]:
         """Return the lower and upper bounds (parameters,) of the parameters `value` (parameters,).
 
-        Widths have no bounds: a Coulomb step narrower than its lower limit is as good as a sharp one.
+        Widths have no bounds: a Coulomb step narrower than its lower limit has the same effect as a sharp one.
         """
         positive = np.array([term_of(name).range == "positive" for name in self.names])
         lower, upper = np.where(positive, 0.0, -np.inf), np.full(value.size, np.inf)

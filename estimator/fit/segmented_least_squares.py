@@ -64,7 +64,7 @@ class Segmented:
     shared: Array
     """Shared coordinates (shared,)."""
     own: Array
-    """Own coordinates (segments, own)."""
+    """The segments' own coordinates (segments, own)."""
     cost: float
     """Sum of squares."""
     information: Array
@@ -79,9 +79,9 @@ class Segmented:
         """Return the sandwich covariance of the shared coordinates (shared, shared), taking segments as independent.
 
         It is valid if residuals within a segment are correlated, as model errors are: Liang and Zeger, "Longitudinal
-        data analysis using generalized linear models", Biometrika 73 (1986) 13. With fewer than MIN_SEGMENTS times as
-        many segments as coordinates, correlations cannot be estimated; then a single factor scales the covariance for
-        white noise. Infinite for coordinates that can change, alone or together, without affecting the residual.
+        data analysis using generalized linear models", Biometrika 73 (1986) 13. With fewer segments than MIN_SEGMENTS
+        times the number of coordinates, correlations cannot be estimated; then a single factor scales the covariance
+        for white noise. Infinite for coordinates that can change, alone or together, without affecting the residual.
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.
@@ -185,7 +185,7 @@ def minimise_segmented(
         if not np.isfinite(cost):
             raise ConvergenceError(
                 "the simulation diverges at the initial guess: too little motion was recorded, or torque or time "
-                "is in another unit"
+                "is in the wrong unit"
             )
         damping = options.initial_damping
         for iteration in range(1, options.max_iterations + 1):

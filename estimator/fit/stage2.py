@@ -59,7 +59,7 @@ class Fit:
     iterations: int
     """Number of simulations with derivatives."""
     at_bound: tuple[str, ...] = ()
-    """Parameters at a bound although the data favour values beyond it, if base parameters depend on them."""
+    """Parameters at a bound although the data favour values beyond it; empty unless this affects base parameters."""
 
 
 @dataclass(frozen=True)

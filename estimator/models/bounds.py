@@ -26,7 +26,7 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
 
     The standard errors are those of independent errors with variance 1. normal, gradient: normal matrix and gradient of
     the sum of squares in coordinates (coordinates, coordinates) and (coordinates,). slopes: derivatives of the
-    parameters, which are first among them, with respect to their coordinates (parameters, parameters).
+    parameters with respect to their coordinates, which come first (parameters, parameters).
     """
     # Each coordinate by its own scale: that of a parameter that has run to zero is many orders of magnitude smaller.
     scale = np.sqrt(np.diag(normal))
@@ -42,8 +42,8 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
 def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Array) -> Mask:
     """Return which parameters (parameters,) lie at a bound, `lower` or `upper`, and are driven beyond it by the data.
 
-    std: standard errors for independent errors. Standard errors that account for the misfit would hide this if the
-    bound itself causes the misfit.
+    std: standard errors for independent errors. Standard errors widened for the misfit would hide such a parameter if
+    its bound itself causes the misfit.
     """
     best, near = value + step, NEAR * np.abs(step)
     below: Mask = (best < lower - SURE * std) & (value - lower <= near)
@@ -55,8 +55,8 @@ def finite_std(std: Array, white: Array) -> Array:
     """Return the standard errors `std` (parameters,), with finite values in place of infinite ones, such as those at a
     bound.
 
-    white: standard errors for independent errors. They replace infinite ones, widened by as much as those of the other
-    parameters.
+    white: standard errors for independent errors. They replace infinite ones, widened by the same factor as those of
+    the other parameters.
     """
     known = np.isfinite(std) & (white > 0.0)
     wider = float(np.median(std[known] / white[known])) if known.any() else 1.0
@@ -65,8 +65,8 @@ def finite_std(std: Array, white: Array) -> Array:
 
 
 def matters(names: tuple[str, ...], beyond: Mask, step: Array, std: Array) -> bool:
-    """Return whether a base parameter, other than an offset, is at its bound (`beyond`) or would move by more than its
-    standard error `std`. The latter accounts for the misfit, which a parameter's own bound may have caused.
+    """Return whether a base parameter, other than an offset, is at its bound (`beyond`) or would move, without bounds,
+    by more than its standard error `std`, which includes the misfit that a parameter's own bound may have caused.
     """
     base = np.array([term_of(name).part == "base" and kind_of(name) != "offset" for name in names])
     return bool(beyond[base].any() or np.any(np.abs(step[base]) > MOVED * std[base]))

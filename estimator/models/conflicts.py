@@ -15,8 +15,8 @@ from hil.estimator.models.terms import kind_of, term_of
 
 FAR = 4.0  # standard deviations
 LARGE_RATIO, LARGE_ANGLE = 0.35, 0.3
-"""Smallest relative and absolute deviation [1, rad] from a value in the file that is too large to be due to a magnet's
-temperature, a tolerance, or one tooth of a horn.
+"""Relative and absolute deviation [1, rad] from a configured value that is too large to be due to a magnet's
+temperature, a tolerance, or a horn fitted one tooth off.
 """
 LARGE_SPREAD = 0.3  # standard deviation of a logarithm that is printed as a factor
 Trust = Literal["yes", "with care", "no"]
@@ -103,8 +103,8 @@ def conflicts(
 ) -> tuple[Conflict, ...]:
     """Return the contradictions among the parameters of a planar arm, the largest first.
 
-    torque_scale_std: relative standard deviation of the ratio of torque constants, by parameter, if the file gives it;
-    otherwise, that of `hil.estimator.models.terms`.
+    torque_scale_std: relative standard deviation of the ratio of torque constants, by parameter, if the configuration
+    gives it; otherwise, that of `hil.estimator.models.terms`.
     """
     found = []
     for name, each, error in zip(names, value.tolist(), std.tolist(), strict=True):
@@ -124,7 +124,7 @@ def worst_first(found: Sequence[Conflict | None]) -> tuple[Conflict, ...]:
 
 
 def contradicted(found: Sequence[Conflict], explained: bool) -> str:
-    """Return the best verdict that the contradictions allow: "no", "with care", or "" for any.
+    """Return the best verdict that the contradictions allow: "no", "with care", or "" if they allow any verdict.
 
     explained: whether the model explains the motion. If it does not, and a known value is far off, an effect missing
     from the model has distorted it, and presumably all others as well.

@@ -15,12 +15,13 @@ A joint's residual torque is the part that the motion does not account for. An a
 thresholds for `HOLD_S` (a shorter time if it exceeds them by far): `TIMES` standard deviations of the uncertainty due
 to parameters and noise, the torque that friction can hold while the joint stands still, and a fraction of the largest
 planned torque. The noise is estimated as well: effects that the model lacks (Stribeck friction, backlash, flexibility)
-widen the admissible range. A deviation that may become an alarm enters that estimate only once it has ended without
-one; otherwise a joint that is held for long would widen the range until nothing exceeds it. While a joint stands still
-its noise is lower, since most of the noise only arises in motion.
+widen the admissible range. A deviation that may become an alarm enters that estimate only after it has ended without an
+alarm; otherwise a joint that is held for a long time would widen the range until nothing exceeded it. While a joint
+stands still, its noise is lower, since most of the noise only arises in motion.
 
 What friction can hold includes the viscous friction at the speeds of the usual motion: over a small motion, in which
-the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once it stands.
+the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once the joint has
+stopped.
 
 While little is known about an arm, the model follows a disturbance as if it were the arm. Then the mean torque over the
 last tenths of a second is also compared with the model from before (`earlier_model`).
@@ -95,8 +96,8 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: multiple of dry friction, as far as it is known, to which `largest` is raised if it is smaller: near
-    standstill, friction behaves differently from the model.
+    frictions: `largest` is raised to at least this multiple of dry friction, as far as that is known: near standstill,
+    friction behaves differently from the model.
     hardly_known: whether only the torque is known beforehand; then means are compared with the earlier model, too.
     """
 

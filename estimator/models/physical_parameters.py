@@ -52,7 +52,7 @@ class Quantities:
     std: dict[str, float]
     """Standard errors of `value` by name [SI]."""
     groups: tuple[tuple[str, ...], ...]
-    """Quantities that cannot be separated; at least one more of each group must be known."""
+    """Groups of quantities that cannot be separated; at least one more quantity of each group must be known."""
     doubts: tuple[str, ...]
     """Warnings as text: known quantities that contradict the data, and physically impossible quantities."""
 

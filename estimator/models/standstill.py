@@ -1,15 +1,15 @@
-"""Detects a joint that is blocked, by the range of torque that it withstands without moving.
+"""Detects a blocked joint by the range of torque that acts on it without moving it.
 
 Dry friction holds a joint at rest while the torque on it stays within a band as wide as twice the static friction.
 Where the band lies depends on gravity and offsets, which may be poorly known; its width does not. Therefore the torque
 is compared with the largest and the smallest one since the joint came to rest: at an unchanged angle, gravity and
-offset cancel in their difference, and so do their errors. Only the changes due to the motion of other joints have to be
-modelled.
+offset cancel in these differences, and so do their errors. Only the changes due to the motion of other joints have to
+be modelled.
 
 A torque outside the band accelerates a free joint. The joint counts as blocked once a free joint would have gained
 enough momentum to show in the velocity register. Half of the excess may be on the other side of the band, since its
-position is unknown. If a joint does move again, it had been held by friction: a torque that it withstood before never
-raises an alarm again.
+position is unknown. If a joint does move again, friction had been holding it: a torque that did not move it before
+never raises an alarm again.
 
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """
@@ -22,7 +22,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 
 WITHIN_RAD = 0.004
-"""Largest change of the angle of a joint that is at rest [rad]: noise of the encoder and the play of a gear."""
+"""Largest change of the angle of a joint that is at rest [rad]; covers encoder noise and gear play."""
 
 AT_REST = 0.95
 """Filtered indicator of standstill above which a joint counts as at rest; by then, its deceleration has decayed in the
@@ -40,12 +40,12 @@ _ANGLE, _SEEN, _WITHSTOOD, _LEAST, _MOST, _RANGE, _UP, _DOWN, _LASTS = range(_SI
 
 
 def memory(joints: int, count: int) -> Array:
-    """Memory of `joints` joints with `count` parameters: nothing is known yet."""
+    """Return an empty memory for `joints` joints with `count` parameters."""
     return np.zeros((joints, _SINGLES + 2 * count))
 
 
 def withstood(rest: Any) -> float:
-    """Return the torque that friction has held, to either side, before the joint moved again [N m]."""
+    """Return half of the widest torque range over which friction held the joint before it moved again [N m]."""
     return float(rest[_WITHSTOOD])
 
 
@@ -116,10 +116,10 @@ def blocked(
 ) -> bool:
     """Return whether something other than friction holds the joint.
 
-    distance: result of `look` [N m]. held: torque that certainly acts on the joint now, to one side. friction: what dry
-    friction may hold to one side [N m]. tolerance: tolerance of the distance [N m]. momentum: momentum of the joint at
-    the smallest visible velocity [N m s]. filter_s: time constant of the equation's filter [s]. dt: time since the
-    previous sample [s].
+    distance: result of `look` [N m]. held: torque that certainly acts on the joint now, in one direction. friction:
+    largest torque in one direction that dry friction may hold [N m]. tolerance: tolerance of the distance [N m].
+    momentum: momentum of the joint at the smallest visible velocity [N m s]. filter_s: time constant of the equation's
+    filter [s]. dt: time since the previous sample [s].
     """
     width = abs(distance)
     rest[_RANGE] = max(rest[_RANGE], max(width, 2.0 * held) - momentum / filter_s)

@@ -1,11 +1,11 @@
 """Missing model terms, judged without fitting them: score tests, and the effect of omission on standard errors.
 
-Near an estimate the motion is linear in small changes of any parameter, including those of terms that the model lacks.
-One simulation with the derivatives with respect to all of them yields the decrease of the sum of squares if a term were
-added (C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the fitted
-parameters. Terms that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the standard
-errors even if the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control Systems 3
-(1966) 293), with their typical size as the prior, to which the information from the motion is added.
+Near an estimate the motion is linear in small changes of any parameter, including the parameters of terms that the
+model lacks. One simulation with the derivatives with respect to all of them yields the decrease of the sum of squares
+if a term were added (C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the
+fitted parameters. Terms that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the
+standard errors even if the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control
+Systems 3 (1966) 293), with their typical size as the prior, to which the information from the motion is added.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,7 +37,7 @@ SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model with one term more than the estimate's, and its score test."""
+    """A model with one more term than the estimate's, and its score test."""
 
     model: Model
     part: str
@@ -192,7 +192,8 @@ def ranked(
 
 
 def considered(period: SettledPeriod, estimate: Estimate) -> Array:
-    """Return the estimate's covariance (parameters, parameters) including omitted terms that cannot be ruled out.
+    """Return the estimate's covariance (parameters, parameters), including the effect of omitted terms that cannot be
+    ruled out.
 
     Each such parameter is described by its prior and the information from the motion, as if it were fitted as well.
     Since its value actually stays unchanged, the resulting shift of the other parameters is added.

@@ -1,11 +1,12 @@
 """Noise, nonlinear distortion and model error, separated by the lines on which they appear.
 
-Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. If an arm is excited on odd lines only, it
-responds on these and, because it is nonlinear, also on others. Effects that change sign with the motion (friction,
-gravity about a hanging pose) produce odd lines; others (an offset, direction-dependent friction, any other pose)
-produce even lines. Some odd lines, the detection lines, are left unexcited to observe the effects of the first kind. If
-even lines are excited too, odd distortion appears on all lines, so the unexcited lines cannot be separated into odd and
-even and form a single group. The residual of a fit on each group, beyond the noise, is the model error of that group.
+The method is that of Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. If an arm is excited on
+odd lines only, it responds on these and, because it is nonlinear, also on others. Effects that change sign with the
+motion (friction, gravity about a hanging pose) produce odd lines; others (an offset, direction-dependent friction, any
+other pose) produce even lines. Some odd lines, the detection lines, are left unexcited to observe the effects of the
+first kind. If even lines are excited too, odd distortion appears on all lines, so the unexcited lines cannot be
+separated into odd and even and form a single group. The residual of a fit on each group, beyond the noise, is the model
+error of that group.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,9 @@
 """Changes of friction while the arm moved: as grease warms up, friction falls by a few percent within minutes.
 
 A fit of one period, or of the mean of several, is valid for the middle of their time span. Other periods then show
-whether friction was larger or smaller: the difference is nearly linear in one factor per joint, for viscous and dry
-friction, and in the period's initial state. The difference may also be due to a constant torque that acts in only one
-of the periods; the cause that explains more is reported.
+whether friction was larger or smaller: the difference in motion is nearly linear in one factor per joint, for viscous
+and dry friction, and in the period's initial state. It may also be due to a constant torque that acts in only one of
+the periods; the cause that explains more is reported.
 """
 
 from collections.abc import Sequence
@@ -49,7 +49,9 @@ class Drift:
         return bool(np.any((np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > LEAST)))
 
     def after_correction(self) -> "Drift":
-        """Return the change that may remain after a correction: its error, and the part that is not linear in time."""
+        """Return the change that may remain after a correction: the error of the measured change, and its part that is
+        not linear in time.
+        """
         return replace(self, change=np.hypot(self.std, UNEVEN * self.change))
 
     def at_the_later(self, estimate: Estimate) -> Estimate:
@@ -67,8 +69,8 @@ def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
     """Return the covariance (parameters, parameters) including the effect of friction that changed during `period`.
 
     The fit assumes constant friction. If friction changes at the rate of `drift`, other parameters absorb part of this
-    slow change of torque. This concerns above all parameters whose effect is also slow, such as gravity on an arm that
-    it hardly affects. The motion is assumed to follow the instantaneous friction, which holds if transients decay
+    slow change of torque. This mainly affects parameters whose effect also varies slowly, such as gravity on an arm
+    that it hardly affects. The motion is assumed to follow the instantaneous friction, which holds if transients decay
     within a small part of the period.
     """
     about = linearised(period, estimate, (), {})

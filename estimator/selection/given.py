@@ -1,7 +1,7 @@
-"""Fit of a model whose terms are given, with the periods of its ripple and cogging searched twice.
+"""Fit of a model whose terms are given, with the periods of its ripple and cogging searched for twice.
 
-The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period if the regression explains the rest
-of the motion. Encoder errors, cables and narrow Stribeck friction are not linear in its lines. If they matter, the
+The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period if it explains the rest of the
+motion. The linear regression cannot represent encoder errors, cables and narrow Stribeck friction. If they matter, the
 search may end at a wrong period, and no fit started there finds the right one. The second search starts from a fit of
 all other terms.
 """

@@ -1,4 +1,4 @@
-"""The verdict on an estimate from arbitrary motion, as `hil.estimator.selection.verdict` but based on segments."""
+"""The verdict on an estimate from arbitrary motion, as in `hil.estimator.selection.verdict` but based on segments."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -50,15 +50,15 @@ class SegmentEvidence:
     conflicts: tuple[Conflict, ...] = ()
     """Values far from those known beforehand."""
     spoiled: bool = False
-    """Whether the recordings themselves are at fault, so that neither terms nor other motion would help."""
+    """Whether the recordings themselves are at fault, so that neither more terms nor other motion would help."""
     notes: tuple[str, ...] = ()
-    """Findings, as sentences that cast no doubt on the values."""
+    """Findings that cast no doubt on the values, as sentences."""
 
 
 def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate) -> dict[str, float]:
     """Return the relative standard error of each base parameter except offsets.
 
-    If gravity is negligible, its error is relative to LITTLE_TORQUE of the RMS torque.
+    If gravity is negligible, its error is relative to the fraction LITTLE_TORQUE of the RMS torque.
     """
     torque = LITTLE_TORQUE * np.sqrt(np.mean([np.mean(each.torque**2, axis=1) for each in recordings], axis=0))
     relative = {}

@@ -30,7 +30,7 @@ def missing_terms(recordings: Sequence[Recording], estimate: ShootingEstimate) -
 
 
 def considered(recordings: Sequence[Recording], estimate: ShootingEstimate) -> ShootingEstimate:
-    """Return the estimate with standard errors that include omitted terms which cannot be ruled out."""
+    """Return the estimate with standard errors that account for omitted terms that cannot be ruled out."""
     left_out = [name for name in unruled(estimate.model) if term_of(name).part not in NOT_HERE]
     if not left_out:
         return estimate
@@ -85,7 +85,7 @@ def held_out_errors(
 
     The initial state of a segment is estimated from its first third; the rest is predicted from the torque alone. The
     median is taken over segments, since the error of a segment in which the arm tumbles can be arbitrarily large. A
-    prediction that diverges is wrong by half a turn.
+    prediction that diverges counts as wrong by half a turn.
     """
     problem = _posed(recordings, estimate, of)
     values, joints = estimate.parameters, estimate.model.joints

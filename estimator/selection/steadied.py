@@ -37,7 +37,7 @@ def steadied(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Settled
     """Return `period` with the torque that its motion would have needed if friction had stayed at its mid-period
     value.
 
-    estimate: fitted to this period, or to one under the same friction. drift: change of friction over `drift.seconds`.
+    estimate: fitted to this period, or to one with the same friction. drift: change of friction over `drift.seconds`.
     """
     seconds = np.arange(period.samples) / period.rate
     since = (seconds - seconds.mean()) / drift.seconds

@@ -34,9 +34,9 @@ IMPROVEMENT = {
     "inertia": "faster motion: raise the upper edge of experiment.band or {torque}",
     "coupling": "faster motion of both joints together: raise {torque}",
     "armature": "faster motion of joint 2: raise {own_torque} or the upper edge of experiment.band",
-    "gravity": "a wider swing: raise {torque}, or lower the lower edge of experiment.band",
+    "gravity": "a wider swing: raise {torque}, or reduce the lower edge of experiment.band",
     "viscous": "higher speeds: raise {torque}",
-    "coulomb": "more slow reversals: lower the lower edge of experiment.band, or lengthen the period",
+    "coulomb": "more slow reversals: reduce the lower edge of experiment.band, or lengthen the period",
 }
 ODD_HINT = "Its residual on odd lines indicates friction or ripple that the model lacks."
 EVEN_HINT = "Its residual on even lines indicates an effect that depends on direction, or an offset in torque or angle."
@@ -76,7 +76,7 @@ class Evidence:
     doubts: tuple[str, ...] = field(default=())
     """Implausible or contradictory values, as sentences."""
     notes: tuple[str, ...] = field(default=())
-    """Other findings, as sentences that cast no doubt on the values."""
+    """Other findings that cast no doubt on the values, as sentences."""
     tried_all: bool = False
     """Whether the model was selected from all available terms."""
     torque_limit: str = ""
@@ -261,7 +261,7 @@ def _reason(change: float, seconds: float) -> str:
         return f", as is typical while grease warms up: {holds}. {warm}"
     return (
         f", which warming up does not explain: {holds}. Look for a cable or part that began to rub, a loose screw, "
-        "a horn that slipped, or a hot motor or falling supply, which give less torque. Then record again."
+        "a horn that slipped, or a hot motor or falling supply, which reduces the torque. Then record again."
     )
 
 

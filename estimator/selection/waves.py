@@ -27,13 +27,13 @@ def wave_peaks(
     waves: Sequence[Wave] = WAVES,
     only: Sequence[int] = (),
 ) -> dict[str, tuple[float, ...]]:
-    """Return the numbers of `cycles` per turn with which a wave explains more than with neighbouring numbers, best
-    first.
+    """Return the numbers of `cycles` per turn with which a wave explains more of the residual than with neighbouring
+    numbers, best first.
 
-    The part that the fitted parameters explain is removed first. The result is by parameter name. If the estimate's
-    model includes a wave that is sought, that wave is disabled first. If other terms have absorbed part of a wave, the
-    best number may be wrong. Therefore other numbers are returned as well if they explain at least the fraction
-    `COMPARABLE` of the sum of squares that the best one explains.
+    Whatever the fitted parameters can explain is removed from residual and waves first. The result is by parameter
+    name. If the estimate's model includes a wave that is searched for, that wave is disabled first. If other terms have
+    absorbed part of a wave, the best number may be wrong. Therefore other numbers are returned as well if they explain
+    at least the fraction `COMPARABLE` of the sum of squares that the best one explains.
 
     only: joints, from 1, that are considered; by default all.
     """

@@ -1,8 +1,8 @@
 """Back-EMF of joints driven by voltage: a part of the motor's torque, subject to the same lag as the voltage.
 
-A voltage u drives the current i through the winding, lag i' = (u - k v) / R - i, so the back-EMF passes the same lag as
-the command. The fraction `back_emf` of viscous friction is due to it, b = k^2 / R. The equivalent motor, with a lagging
-voltage and a brake b without lag, is
+A voltage u drives the current i through the winding, lag i' = (u - k v) / R - i, so the back-EMF passes through the
+same lag as the command. The fraction `back_emf` of viscous friction is due to it, b = k^2 / R. The equivalent motor,
+with a lagging voltage and a brake b without lag, is
 
     1 / (lag J s^2 + J s + b) = 1 / ((lag' s + 1) ((J - b lag') s + b)),    lag' (J - b lag') = lag J
 

@@ -1,8 +1,9 @@
 """The arm's motion under commands that depend on its state: a software spring and damper, a brake.
 
 The equations, including the torque scale, and the default integration step are those of `hil.estimator.simulation.arm`.
-A command is computed once per sample from the state at the previous sample, as on the bus, limited, and held; the motor
-follows it with a first-order lag. A pure delay of the drive is added to that lag, which is equivalent to first order.
+A command is computed once per sample from the state at the previous sample, as on the real bus, then limited and held;
+the motor follows it with a first-order lag. A pure delay of the drive is added to that lag; to first order, the two are
+equivalent.
 """
 
 import math

@@ -76,8 +76,8 @@ class ManyArms:
         """Return the extreme values of every arm, and when it settled.
 
         The values (arms, 5, joints) are lowest and highest angle [rad], speed [rad/s], assumed torque [N m], and
-        assumed torque times speed [W]. The second array (arms,) is the number of periods of the first multisine until
-        the arm had settled. It is 0 if the arm never settled; its experiment then ends.
+        assumed torque times speed [W]. The second array (arms,) is the number of periods of the first multisine that
+        the arm took to settle. It is 0 if the arm never settled; its experiment then ends.
         """
         count = len(self.physics)
         values, settled = np.empty((count, 5, 2)), np.zeros(count, dtype=np.int64)

@@ -2,7 +2,7 @@
 
 The derivative is that of the discrete scheme of `hil.estimator.simulation.arm`, step by step, so it is the exact
 gradient of the objective. With W = M + gamma h S (M mass matrix, S slopes of friction) and primes for quantities at the
-end predicted by stage 1, a step is
+end of the step as predicted by its first stage, a step is
 
     W k = f        M' a = f'        W l = M (a - 2 k)        v += h (3 k + l) / 2        q += h v + h^2 k / 2
 

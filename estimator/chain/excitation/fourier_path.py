@@ -1,9 +1,10 @@
 """Excitation of a chain by paths that are finite Fourier series of the joint angles.
 
-The arm is driven with the torque that an approximate model requires for the path, plus a software spring and damper.
-The series is optimised for the purpose of the result: to predict the torque of other motions in the same range, for the
-worst joint. The criterion includes all unknowns of the regression, friction and offsets too. If a joint moves little,
-its gravity torque cannot be distinguished from an offset; a criterion on inertial parameters alone would miss this.
+The arm is driven with the torque that an approximate model requires for the path, plus that of a software spring and
+damper. The series is optimised for what the result is used for: predicting the torque of other motions in the same
+range. The worst joint counts. The criterion includes all unknowns of the regression, friction and offsets too. If a
+joint moves little, its gravity torque cannot be distinguished from an offset; a criterion on inertial parameters alone
+would miss this.
 
 This designer is for a box of angles and speeds that the user has chosen ([joint_path]); nothing else limits the path.
 If the box itself is to be found, within limits of torque and clearance, `path_design` chooses it.
@@ -97,14 +98,14 @@ def design_path(
     """Design a path with harmonics up to `highest` [Hz], in which each joint stays within limits.
 
     The joints stay within `swing` (joints,) [rad] of `centre` (joints,) [rad] and below `speed` (joints,) [rad/s].
-    rate: samples per second; period [s]; prior: rough parameters, whose uncertainty weights the information. Raises
-    ExcitationError.
+    rate: samples per second; period [s]; prior: rough parameters, whose uncertainty determines which information
+    counts. Raises ExcitationError.
     """
     count = int(np.floor(highest * period + 1e-9))
     if count < 2 or highest > rate / 8 or min(swing.min(), speed.min()) <= 0.0:
         raise ExcitationError(
             f"a path of {period:g} s with harmonics up to {highest:g} Hz at {rate:g} samples/s, swing {swing.min():g} "
-            f"rad, speed {speed.min():g} rad/s: needs at least two harmonics below an eighth of the rate, and a "
+            f"rad, speed {speed.min():g} rad/s: it needs at least two harmonics below an eighth of the rate, and a "
             "positive swing and speed"
         )
     rng = np.random.default_rng(seed)
@@ -134,7 +135,7 @@ class Goal:
     """Number of samples of the recording."""
 
     def error(self, lines: NDArray[np.complex128]) -> float:
-        """Return the RMS error expected of the rigid-body torque in other motions, relative to that torque's RMS, for
+        """Return the expected RMS error of the rigid-body torque in other motions, relative to that torque's RMS, for
         the worst joint.
         """
         rows = self._seen(self._columns(self.box.path(lines, self._samples))) * self._lengths

@@ -1,16 +1,16 @@
 """Paths whose amplitudes, phases and centre make the least certain base parameter as certain as possible.
 
-An evolution strategy (a mean that moves towards the better half of random variations, N. Hansen and A. Ostermeier,
-Evolutionary Computation 9 (2001) 159, with one step size for all) on the finite Fourier series of
-`hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation is scaled to the
-limits of position and speed and then shrunk until `allowed` accepts it.
+The search is an evolution strategy (a mean that moves towards the better half of random variations, N. Hansen and A.
+Ostermeier, Evolutionary Computation 9 (2001) 159, with one step size for all) over the coefficients of the finite
+Fourier series of `hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation
+is scaled to the limits of position and speed and then shrunk until `allowed` accepts it.
 
-Friction is treated as unknown too, with a model no better than that of the links. If it were known, slow, creeping
-motion would seem to identify a light joint, whose torque is mostly friction.
+Friction is treated as unknown too, with a model no more accurate than that of the links. If it were taken as known,
+slow, creeping motion would seem to identify a light joint, whose torque is mostly friction.
 
-This designer is for the pilot, which knows only limits: it also chooses the centre and the width of the motion. For a
-box that the user has chosen, `fourier_path.design_path` is simpler; its criterion, the prediction of other motions in
-that box, needs the box to be given.
+This designer is for the pilot experiment, for which only limits are known: it also chooses the centre and the width of
+the motion. For a box that the user has chosen, `fourier_path.design_path` is simpler; its criterion, the prediction of
+other motions in that box, needs the box to be given.
 """
 
 from collections.abc import Callable
@@ -59,7 +59,8 @@ class Design:
 
     centre: centre of the path (joints,) [rad]. lines: complex Fourier coefficients (joints, harmonics), before scaling
     to the limits.
-    worst, median: standard errors of the base parameters after the path, relative to the prior's standard deviation.
+    worst, median: largest and median standard error of the base parameters after the path, each relative to its prior's
+    standard deviation.
     """
 
     centre: Array
@@ -88,8 +89,8 @@ class PathDesigner:
         self._count = int(np.floor(highest * period + 1e-9))
         if self._count < 2 or highest > rate / 8:
             raise ExcitationError(
-                f"a path of {period:g} s with harmonics up to {highest:g} Hz at {rate:g} samples/s: needs at least two "
-                "harmonics below an eighth of the rate"
+                f"a path of {period:g} s with harmonics up to {highest:g} Hz at {rate:g} samples/s: it needs at least "
+                "two harmonics below an eighth of the rate"
             )
         if (limits.low >= limits.high).any():
             raise ExcitationError("no position range is left for a path")

@@ -61,7 +61,7 @@ class ChainCoordinates:
 
     names: tuple[str, ...]
     scales: Array
-    """Scales of the base parameters, at their indices; ignored for others (parameters,)."""
+    """Scales of the base parameters, at their indices; the other elements are ignored (parameters,)."""
     width_floor: Array
     """Minimum width of each joint's Coulomb step (joints,) [rad/s]."""
 
@@ -80,8 +80,9 @@ class ChainCoordinates:
         """Return the point reached by `step` from `x`; both may be followed by other coordinates.
 
         If a recording hardly determines the torque of some joints relative to that of the first, their torque scales
-        and all parameters of their links change by a common factor. The scales are exponential. Unless the
-        parameters change exponentially with them, straight steps leave this curved valley, and only tiny ones succeed.
+        and all parameters of their links can change by a common factor. The scales are exponentials of their
+        coordinates. Unless the parameters change exponentially with them, straight steps leave this curved valley, and
+        only tiny ones succeed.
         """
         y = x + step
         if self.torque_scales.size:
@@ -112,7 +113,7 @@ class ChainCoordinates:
         return slope
 
     def limit(self, x: Array, reach: float, least: Array, most: Array) -> None:
-        """Set the smallest and largest change of each coordinate in one step from `x`, in place.
+        """Set the bounds `least` and `most` on the change of each coordinate in one step from `x`, in place.
 
         Friction-shape parameters may change by the fraction `reach` of their maximum. No width falls below its floor.
         """
@@ -125,8 +126,8 @@ class ChainCoordinates:
 
     @cached_property
     def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices of the parameters with their own prior (friction shapes, drives, small angles), their prior means and
-        standard deviations.
+        """Indices, prior means and prior standard deviations of the parameters that have a prior of their own (friction
+        shapes, drives, small angles).
         """
         found = [
             (i, np.log(SHAPES[kind][0]), SHAPES[kind][1]) if kind in SHAPES else (i, 0.0, ANGLES[kind] / SMALL[kind])

@@ -22,13 +22,13 @@ class HeldZeros:
     shift: Array
     """Estimated true minus measured angle (joints - 1,) [rad]; close to 0 if gravity does not reveal it."""
     gain: float
-    """Expected decrease of the sum of squares if the zeros were fitted, in units of white noise."""
+    """Expected decrease of the sum of squares if the zeros were fitted, in units of the white noise's variance."""
 
 
 def held_zeros(problem: ChainProblem, x: Array, unfinished: float) -> HeldZeros:
     """Estimate the zeros that `problem` holds at 0, from its minimum `x`.
 
-    unfinished: expected decrease of the sum of squares without fitting the zeros.
+    unfinished: decrease of the sum of squares that one more step without fitting the zeros is expected to bring.
     """
     model = replace(problem.model, zeros=True)
     names, size = model.names, len(model.names)

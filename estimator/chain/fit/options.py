@@ -15,13 +15,13 @@ class ChainOptions:
     A softer observer extracts more information; one that is too soft no longer follows the motion.
     """
     lost: float = 1.5
-    """The previous observer is kept if the cost increases by more than this ratio in addition to the increase that the
+    """The previous observer is kept if the cost grows by more than this factor times the growth that the greater
     softness explains.
     """
     first_step: float = 5.2e-3
-    """Integration step while the observer is stiff [s]; samples within it are skipped."""
+    """Integration step while the observer is stiff [s]; samples within such a step are skipped."""
     coarse_step: float = 2.6e-3
-    """Integration step [s]."""
+    """Integration step of the iterations in between [s]."""
     fine_step: float = 1.3e-3
     """Integration step of the last iterations [s]."""
     finer: int = 16
@@ -30,7 +30,7 @@ class ChainOptions:
     """Number of smaller steps that replace one step near standstill in the last iterations."""
     widths_per_substep: float = CoordinateOptions.widths_per_substep
     width_floor: float = 3e-4
-    """Minimum width of every Coulomb step [rad/s]: hardly distinguishable from friction that truly sticks."""
+    """Minimum width of every Coulomb step [rad/s]; its effect is hardly distinguishable from true sticking."""
     initial_width: float = 0.03
     """Initial width of the smoothed Coulomb step [rad/s]."""
     other_initial_widths: tuple[float, ...] = (0.005, 0.001)
@@ -54,7 +54,8 @@ class ChainOptions:
     """Initial guesses as fractions of the way from the prior to stage 1; the first that can be simulated is used."""
     unfinished: float = 1.0
     """If one more step is expected to decrease the sum of squares by more than this, the minimum has not been reached,
-    and the fit continues with shorter integration steps. 1 is a distance of one standard error.
+    and the fit continues with shorter integration steps. A decrease of 1 corresponds to a distance of one standard
+    error.
     """
     angle_scale: float = 0.1
     """Scale of the initial angles [rad]."""

@@ -36,7 +36,7 @@ def resolved_widths(problem: ChainProblem, x: Array, shortest_step: float, width
 def free_inertias(problem: ChainProblem, parameters: Mapping[str, float]) -> Array:
     """Return each joint's inertia about its own axis while all others move freely (joints,) [kg m^2].
 
-    It is the smallest one over the poses of the recordings.
+    The result is the minimum over the poses of the recordings.
     """
     model = problem.model
     every = model.base.as_all(np.array([parameters[name] for name in model.base.names]))

@@ -40,8 +40,8 @@ MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 NEARER, LAST = MinimiserOptions(max_damping=0.1), MinimiserOptions(max_damping=1.0)
 """Options of the last iterations with coarse steps, and of those with fine steps that follow.
 
-If a joint is on the verge of sticking, the sum of squares is slightly discontinuous. A decrease that is only
-achieved with heavy damping is such a discontinuity and is not pursued.
+If a joint is on the verge of sticking, the sum of squares is slightly discontinuous. A decrease that is only achieved
+with heavy damping is due to such a discontinuity and is not pursued.
 """
 
 
@@ -74,7 +74,7 @@ class ChainFit:
     neglected: Array
     """Covariance due to the effects that the model of voltage-driven joints neglects (parameters, parameters) [SI]."""
     at_bound: tuple[str, ...] = ()
-    """Parameters at a bound although the data favour values beyond it, if base parameters depend on them."""
+    """Parameters at a bound although the data favour values beyond it; empty unless this affects base parameters."""
     held_zeros: HeldZeros | None = None
     """Result of the test of the encoder zeros that the model holds fixed; None if it fits them, has one joint, or no
     test was requested.

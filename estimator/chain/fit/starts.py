@@ -4,10 +4,10 @@ The observer starts stiff, so that the simulation can follow the motion with sta
 the fit improves.
 
 If joints often stick, stage 1's estimate of friction can be far off. So can the link parameters and torque scales,
-which are correlated with friction. Softening the observer while the shape of friction is fixed then leads the fit into
-another minimum, in a curved valley where it stops short. So if the soft observer does not explain the motion, a second
-start is made from the prior's links, with the shape of friction free as soon as the stiffest observer follows the
-motion. The better of the two fits is continued.
+which are correlated with friction. Softening the observer while the shape of friction is fixed then leads the fit
+towards another minimum, in a curved valley, where it stops short. So if the soft observer does not explain the motion,
+a second start is made from the prior's links, with the shape of friction free as soon as the stiffest observer follows
+the motion. The better of the two fits is continued.
 """
 
 import math
@@ -62,7 +62,8 @@ def first_problem(
 def initial_lag(delay: float, options: ChainOptions) -> float:
     """Return the initial guess of the lag [s]: the geometric mean of stage 1's delay and the typical lag.
 
-    Stage 1's delay is too long by several milliseconds, since it makes up for the shape of friction near standstill.
+    Stage 1's delay is too long by several milliseconds, since it also compensates for the shape of friction near
+    standstill.
     """
     least = options.min_initial_lag
     return max(math.sqrt(max(delay, least) * SHAPES["lag"][0]), least)
@@ -89,7 +90,8 @@ def repeated(period: SettledPeriod) -> Array:
 
 
 def started(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
-    """Return the problem with friction near standstill resolved, its rough minimum, and the number of simulations.
+    """Return the optimisation problem refined so that it resolves friction near standstill, its approximate minimum,
+    and the number of simulations used.
 
     x: stage 1's result. Raises ConvergenceError if the stiffest observer does not follow the motion.
     """
@@ -122,8 +124,8 @@ def _softened_later(coarse: ChainProblem, x: Array, options: ChainOptions) -> tu
 
 
 def resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
-    """Return the problem with the shape of friction free and motion near standstill resolved, its minimum from `soft`,
-    and the number of simulations.
+    """Return the problem refined so that it fits the shape of friction and resolves motion near standstill, its minimum
+    reached from `soft`, and the number of simulations used.
     """
     narrowest = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
     # An early fit may be far off: where it makes a joint much too light, the friction step must not stay wide.
@@ -157,7 +159,8 @@ def narrowed(problem: ChainProblem, value: Array, starts: Sequence[Array], optio
 
 
 def softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Array, float, int]:
-    """Return the minimum with the softest observer that follows the motion, its softness and the number of simulations.
+    """Return the minimum with the softest observer that follows the motion, the softness of that observer, and the
+    number of simulations used.
 
     Raises ConvergenceError if even the stiffest does not.
     """

@@ -5,10 +5,10 @@ of the motion, which determine the parameters. The noise that remains there is e
 f the fit absorbs the fraction h(f) of the noise, the leverage of its Jacobian, so the power of the residual is that of
 the noise times 1 - h. The noise level of a joint is the mean over frequencies weighted by leverage; for model errors,
 which are slow, it is far above that of white noise. Since short recordings have few degrees of freedom, each level is
-shrunk towards the mean level of all joints, and that towards white noise. The level is also used for frequencies at
-which the fit absorbs nearly all noise and the residual reveals none: the observer suppresses the slow part of the
-rounding errors, so their power there is no larger than at higher frequencies. The covariance is the sandwich N^-1 S
-N^-1, where S sums the information of each frequency times the noise there.
+shrunk towards the mean level of all joints, and this mean towards the level of white noise. The level is also used for
+frequencies at which the fit absorbs nearly all noise and the residual reveals none: the observer suppresses the slow
+part of the rounding errors, so their power there is no larger than at higher frequencies. The covariance is the
+sandwich N^-1 S N^-1, where S sums the information of each frequency times the noise there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -48,8 +48,8 @@ def neglected_covariance(problem: ChainProblem, x: Array) -> Array:
     """Return the covariance (parameters, parameters) [SI] due to the effects that the description of late back-EMF
     neglects.
 
-    The effect of friction on the motor's current is delayed by the difference of both lags. This makes a joint's
-    inertia wrong by the square of the lost inertia, divided by the inertia
+    The effect of friction on the motor's current is delayed by the difference between the fitted lag and the winding's.
+    This makes a joint's inertia wrong by the square of its apparent loss of inertia, divided by the inertia
     (`hil.estimator.simulation.back_emf.neglected`).
     """
     base, parameters = problem.model.base, problem.parameters(x)

@@ -30,7 +30,7 @@ CLEARLY_INDEPENDENT = 0.1
 The norm is relative to the largest column of the same link and kind.
 """
 INDEPENDENT = 2e-3
-"""A column is kept in the end if the norm of that part, on the same scale, is above this value.
+"""A column is kept in the end if its unexplained part, as in CLEARLY_INDEPENDENT, has a norm above this value.
 
 Rounded angles such as 1.57 or 1.5708 in a description make every parameter slightly independent. They change no torque
 by more than this fraction of the parameter's contribution, so no recording would determine such a parameter.

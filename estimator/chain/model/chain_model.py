@@ -50,7 +50,7 @@ class ChainModel:
         if self.drive not in DRIVE:
             raise ModelError(f"drive model {self.drive!r}: choose one of {', '.join(DRIVE)}")
         if self.torque_scale and self.joints == 1:
-            raise ModelError("torque_scale compares joints' torque constants: it needs two joints")
+            raise ModelError("torque_scale compares joints' torque constants: it needs at least two joints")
 
     @property
     def joints(self) -> int:

@@ -1,9 +1,10 @@
 """Compiled rigid-body dynamics of a serial chain: torque and its derivatives, mass matrix, regressor.
 
-Recursive Newton-Euler and composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms, 2008), with all spatial
-vectors expressed about the base's origin, so that no transformation between links is needed: motions are (angular,
-linear), forces (moment, force). The derivatives follow Singh, Russo and Wensing, IEEE Robotics and Automation Letters 7
-(2022) 1776. Of their Coriolis matrix B only the product with a motion w is needed; integrated over the mass it is
+The algorithms are recursive Newton-Euler and composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms,
+2008), with all spatial vectors expressed about the base's origin, so that no transformation between links is needed:
+motions are (angular, linear), forces (moment, force). The derivatives follow Singh, Russo and Wensing, IEEE Robotics
+and Automation Letters 7 (2022) 1776. Of their Coriolis matrix B only the product with a motion w is needed; integrated
+over the mass it is
 
     2 B w = (2 (tr G - G) w_angular, 2 w_angular x l)       G = sum of dm velocity position^T, l the momentum,
 
@@ -33,7 +34,7 @@ def room(joints: int) -> Any:
     frame    rotation by rows and origin of each link (joints, 12)
     motion   joint axis; velocity; acceleration, with gravity as an upward acceleration; time derivative of the axis;
              velocity of the previous link x axis; the corresponding term of its acceleration (joints, 6, 6)
-    body     see above; single links, then composites (2, joints, BODY)
+    body     columns MASS to FORCE; single links, then composites (2, joints, BODY)
     seized   composite inertia times axis (joints, 6)
     mass     mass matrix (joints, joints)
     torque   (joints,)
@@ -130,7 +131,7 @@ def _carry(link: Any, f: Any, b: Any) -> None:
 
 
 def move(link: Any, armature: Any, v: Any, room: Any) -> None:
-    """Compute velocities, bodies, composites and the mass matrix; requires `place`.
+    """Compute velocities, bodies, composites and the mass matrix; call `place` first.
 
     link: (joints, 10). armature: (joints,). v: joint velocities (joints,).
     """
@@ -169,7 +170,7 @@ def move(link: Any, armature: Any, v: Any, room: Any) -> None:
 
 
 def accelerate(armature: Any, gravity: Any, v: Any, a: Any, room: Any) -> None:
-    """Compute the torques required for the accelerations a (joints,); requires `move`."""
+    """Compute the torques required for the accelerations a (joints,); call `move` first."""
     _, motion, body, _, _, torque, _, _, _ = room
     n = a.size
     for i in range(n):
@@ -302,7 +303,7 @@ def regress(column: Any, a: Any, room: Any, Y: Any) -> None:
 def pull(gravity: Any, room: Any, column: int, out: Any) -> None:
     """Set a column of `out` (joints, columns) to the torques that hold all links still under this gravity alone.
 
-    Requires `move`. It is linear in gravity, so a change of gravity gives the change of the torques.
+    Call `move` first. The torques are linear in gravity, so a change of gravity gives the change of the torques.
     """
     motion, body = room[1], room[2]
     x, y, z = -gravity[0], -gravity[1], -gravity[2]

@@ -1,9 +1,10 @@
 """What delays the torque of a chain's drives: each joint's own lag, and the back-EMF of voltage-driven joints.
 
-The back-EMF passes the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the product of
-its back-EMF and its lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due to
-it. The lag of a winding makes a joint lighter by at most half of its inertia, where the poles of the equivalent motor
-meet. Parameters that imply more, far from the minimum of a fit, are limited to that.
+The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
+product of its back-EMF and its lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous
+friction is due to it. The lag of a winding makes a joint lighter by at most half of its inertia, where the poles of the
+equivalent motor meet. Far from the minimum of a fit, parameters may imply a greater loss, which is then limited to this
+one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,7 @@ from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
 """Meanings of the kinds of parameters that only chains have."""
 PART = 0.1
-"""A joint is named if its share in the motion that loses inertia is at least this large."""
+"""`limited` names a joint only if its part in the motion that loses the most inertia exceeds this fraction."""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
 _ARMATURE = 10  # of a link's parameters
@@ -80,7 +81,7 @@ def rotor(base: BaseParameters, joint: int) -> Array:
 
 Losses = list[tuple[Array, dict[int, float]]]
 """For each voltage-driven joint: its rotor (base parameters,), and by how much its inertia [kg m^2] decreases per unit
-of the parameters on which its lagging back-EMF depends, by their index.
+of each parameter on which its lagging back-EMF depends, by the index of that parameter.
 """
 
 
@@ -109,9 +110,9 @@ def losses(base: BaseParameters, parameters: Mapping[str, float], names: tuple[s
 
 
 def complete(lost: Losses, derivative: Array) -> None:
-    """Convert derivatives of positions (samples, joints, parameters) in place: they are given with respect to the
-    parameters of the arm of `as_moving`, and are needed with respect to those of the actual arm. lost: the result of
-    `losses`.
+    """Convert derivatives of positions (samples, joints, parameters) in place: from those with respect to the
+    parameters of the equivalent arm (`as_moving`) to those with respect to the parameters of the actual arm. lost: the
+    result of `losses`.
     """
     for rotor_, changes in lost:
         by_rotor = derivative[:, :, : rotor_.size] @ rotor_

@@ -1,9 +1,9 @@
 """Physically consistent links that have the identified base parameters and are close to those of a description.
 
 Each link is described by ten log-Cholesky coordinates (Rucker and Wensing, IEEE Robotics and Automation Letters 7
-(2022) 8250): its pseudo-inertia is U U' with U upper triangular with positive diagonal, so that every point corresponds
-to a possible mass distribution. Base parameters only determine sums of the links' parameters; what they leave open is
-weakly regularised towards the description.
+(2022) 8250): its pseudo-inertia is U U', where U is upper triangular with a positive diagonal, so that every point
+corresponds to a possible mass distribution. Base parameters only determine sums of the links' parameters; what they
+leave open is weakly regularised towards the description.
 """
 
 from dataclasses import dataclass

@@ -32,7 +32,9 @@ def tilt_axes(gravity: Array) -> Array:
 
 
 def tilted(gravity: Array, x: float, y: float) -> Array:
-    """Return gravity in the frame of a base that is tilted by these angles; `gravity`: that of the nominal base."""
+    """Return gravity in the frame of a base that is tilted by these angles; `gravity`: gravity in the frame of the
+    nominal base.
+    """
     size = float(np.linalg.norm(gravity))
     if size == 0.0 or (x == 0.0 and y == 0.0):
         return np.array(gravity)

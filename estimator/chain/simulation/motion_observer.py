@@ -1,9 +1,9 @@
 """Checks at every sample whether the motion of a spatial arm is consistent with what is known about it.
 
-Angles, velocities and commanded torques pass the same first-order low-pass filter, which also yields accelerations.
-The residual torque, `torque - Y(q, v, a) theta`, is compared with its uncertainty, due to the parameters' covariance,
-rounding of the velocities, and noise that is estimated while the arm moves. The parameters are updated as well (a
-Kalman filter for slowly drifting constants), so the tolerance narrows over time. As in
+Angles, velocities and commanded torques pass through the same first-order low-pass filter, which also yields
+accelerations. The residual torque, `torque - Y(q, v, a) theta`, is compared with its uncertainty, due to the
+parameters' covariance, rounding of the velocities, and noise that is estimated while the arm moves. The parameters are
+updated as well (a Kalman filter for slowly drifting constants), so the tolerance narrows over time. As in
 `hil.estimator.models.momentum_observer`, which planar arms use, the friction that can hold a joint at rest is
 subtracted from the residual. There is an alarm if the remainder exceeds `TIMES` standard deviations and a fraction of
 the largest planned torque for `HOLD_S`; large residuals raise it sooner.
@@ -11,7 +11,7 @@ the largest planned torque for `HOLD_S`; large residuals raise it sooner.
 The noise estimate describes motion, so it only learns from motion. The residual of a joint at rest is due to friction,
 or to something that blocks it, and would widen the tolerance until nothing exceeded it. A joint at rest is also judged
 by the range of torques on it (`hil.estimator.models.standstill`). A residual that may become an alarm enters the noise
-estimate only once it has ended without one.
+estimate only after it has ended without an alarm.
 """
 
 import math
@@ -126,7 +126,7 @@ class ChainObserver:
 
     @property
     def lacking(self) -> list[float]:
-        """Latest residual of each joint: commanded torque minus that which explains the motion (joints,) [N m]."""
+        """Latest residual of each joint: commanded torque minus the torque that explains the motion (joints,) [N m]."""
         return [float(value) for value in self._memory[LACKING, : self._joints]]
 
     @property

@@ -3,8 +3,8 @@ experiment.
 
 At each sample, a goal torque is added to the torque of a software spring and damper, which is computed from angles and
 velocities of the previous sample as in the real loop. In between, the motion is integrated by the linearly implicit
-Euler method, with the slope of friction at the old velocity. It is of first order only; the feedback at every sample
-keeps its errors small.
+Euler method, with the slope of friction at the old velocity. This method is only first-order; the feedback at every
+sample keeps its errors small.
 """
 
 import math
@@ -79,7 +79,8 @@ class Loop:
     limit: largest commanded torque (joints,) [N m].
     stops: side on which a joint lies on its own stop in the rest pose (joints,), -1, 1, or 0 if it does not; None if
     none does. A stop supports its joint instead of the surface, whatever the angles of the other joints. Nothing
-    supports a joint whose largest torque is 0. pull: added to the spring and damper; None if they act alone.
+    supports a joint whose largest torque is 0.
+    pull: added to the spring and damper; None if they act alone.
     """
 
     rate: float

@@ -3,7 +3,7 @@
 Friction and drive are modelled as in `hil.estimator.simulation.arm`. Each step uses that module's Rosenbrock method
 ROS2, with the second stage written so that both stages need the regressor at one acceleration only. With f the torques
 minus friction, S the slopes of friction, ID inverse dynamics, M the mass matrix, and primes for quantities at the end
-predicted by stage 1,
+of the step as predicted by the first stage,
 
     ID(q, v, k) + gamma h S k = f        ID(q', v', l + 2 k) + gamma h S' l = f'
     v += h (3 k + l) / 2                 q += h v + h^2 k / 2
