@@ -24,6 +24,7 @@ from hil.estimator.options import CovarianceOptions
 DEFAULTS = CovarianceOptions()
 FAINT_PRIOR = 1e-4  # fraction of a prior's precision that is kept, so that unmeasured coordinates stay finite
 SENSITIVE = 1e7  # largest change of a sample, in units of the noise, per unit of a coordinate (RMS)
+LEAST_INFORMATION = 1e-13  # about a combination of coordinates, relative to each by itself, that is not rounding
 VANISHED = 1e-3  # slope relative to its value below which a parameter has run into its floor
 
 
@@ -168,7 +169,7 @@ def _measured(
     seen: Mask = norm > 1e-12 * norm.max()
     lengths = np.outer(norm[seen], norm[seen])
     measured = (at.normal - prior)[np.ix_(seen, seen)] / lengths
-    inverse = np.asarray(linalg.pinv(measured, hermitian=True), dtype=np.float64)
+    inverse = _inverse(measured)
     if scatter is None:
         return seen, lengths, inverse, inverse
     freedom = max(1, samples - int(seen.sum()))
@@ -176,6 +177,18 @@ def _measured(
     robust = inverse @ scores @ inverse * (samples / freedom)
     found = larger_covariance(np.asarray(robust, dtype=np.float64), at.cost / freedom * inverse)
     return seen, lengths, inverse, found + 0.5 * structured * inverse
+
+
+def _inverse(information: Array) -> Array:
+    """Return the inverse of a matrix with diagonal elements of at most 1.
+
+    Coordinates that only matter together, such as a constant friction and one that varies beyond the speeds of the
+    motion, leave an eigenvalue that is zero but for rounding. A pseudoinverse would take their difference as known
+    exactly, although it is unknown.
+    """
+    size, directions = linalg.eigh(information)
+    inverse: Array = (directions / np.maximum(size, LEAST_INFORMATION)) @ directions.T
+    return inverse
 
 
 def larger_covariance(robust: Array, white: Array) -> Array:

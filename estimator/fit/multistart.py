@@ -10,6 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.errors import ConvergenceError
@@ -81,11 +83,23 @@ class Search:
         best = refined.best
         minimum = refined.weighted.minimise(best.x, ftol, options.minimiser.min_damping, best.at)
         spent = sum(each.free.iterations for each in starts) + refined.iterations + minimum.iterations
-        return refined, replace(minimum, iterations=spent)
+        return self._undisguised(refined, replace(minimum, iterations=spent))
+
+    def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
+        """Return the minimum without friction terms that the motion cannot separate, unless that explains less."""
+        if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
+            return refined, minimum
+        try:
+            plain = self.nearest(minimum.x)
+        except ConvergenceError:
+            return refined, minimum
+        worse = self.fine.cost_at(plain[1].x) - self.fine.cost_at(minimum.x)
+        return plain if worse < np.log(self.samples) else (refined, minimum)
 
     def nearest(self, x: Array) -> tuple[Refined, Minimum]:
         """Return the minimum reached from the coordinates `x` alone. Raises ConvergenceError."""
         options = self.options
+        x = self.fine.coordinates.undisguised(x)
         found = Minimum(x, self.fine.evaluate(x), 1)
         # Coarse steps lead away from a minimum where their motion is inaccurate: near a narrow friction step.
         if abs(self.rough.evaluate(x).cost / found.at.cost - 1.0) < options.same_motion:

@@ -13,13 +13,15 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.models.model import LEVER_STD, Model
-from hil.estimator.models.terms import Scale, joint_of, term_of
+from hil.estimator.models.terms import BEYOND_SPEEDS, Scale, joint_of, kind_of, term_of
 from hil.estimator.options import CoordinateOptions
 
 TYPICAL_SATURATION = 0.02  # typical fraction of the RMS torque lost; only a scale
 LEAST_WEIGHT = 0.02  # minimum gravity_2 to be used as a scale, as a fraction of the RMS torque
 TYPICAL_CABLE = 0.15  # stiffness of a stiff cable, as a fraction of the RMS torque per radian
 TYPICAL_COGGING = 0.01  # typical cogging, as a fraction of the RMS torque; only a scale
+LEAST_RISE = 0.05  # Stribeck rise below which nothing is disguised
+TYPICAL_SQUARE = 1.0 / 3.0  # mean square of a joint's speed, relative to that of its highest; only a guess
 TYPICAL_BEND = 0.01  # rad: typical presliding deflection; only a scale
 
 
@@ -36,6 +38,8 @@ class Coordinates:
     """Lower bound of each width, 0 for other parameters (parameters,) [rad/s]: the larger of this and `width_floor`
     counts.
     """
+    highest: Array | None = None
+    """Upper bounds, from `highest_values` (parameters,) [its unit]; by default none."""
 
     def values(self, x: Array) -> Array:
         """Return the parameters (parameters,) at the coordinates `x` (parameters,)."""
@@ -47,7 +51,7 @@ class Coordinates:
 
     def coordinates(self, value: Array) -> Array:
         """Return the coordinates of the parameters `value` (parameters,), moved into the physical range."""
-        above = np.maximum(value - self._floors, self.options.min_initial * self.scales)
+        above = np.maximum(np.minimum(value, self._highest) - self._floors, self.options.min_initial * self.scales)
         x = np.where(self._either_sign, value / self.scales, np.log(above))
         for share, first, second in self._shares:
             part = value[share] / np.sqrt(above[first] * above[second])
@@ -79,6 +83,27 @@ class Coordinates:
         share = 1.0 + self._floors[widths] * np.exp(-x[widths])  # width relative to its distance from the floor
         least[widths] = np.maximum(-1.0, -max_relative_decrease * share)
         most[widths] = self.options.max_relative_increase * share
+        for index in np.flatnonzero(np.isfinite(self._highest)):
+            above = np.exp(x[index])
+            room = max(float(self._highest[index] - self._floors[index] - above), 0.0) / above
+            most[index] = min(most[index], room if self._floors[index] else np.log1p(room))
+
+    def undisguised(self, x: Array) -> Array:
+        """Return `x`, which other coordinates may follow, with Stribeck rises that never fall as Coulomb friction.
+
+        Where the Stribeck velocity is beyond all speeds of the motion, only the sum of both is determined, and a fit
+        that has drifted there hardly finds its way back.
+        """
+        changed = x.copy()
+        for index, name in enumerate(self.names):
+            if kind_of(name) != "stribeck_velocity" or not np.isfinite(self._highest[index]):
+                continue
+            coulomb, rise = (self.names.index(f"{kind}_{joint_of(name)}") for kind in ("coulomb", "stribeck_rise"))
+            part = self._highest[index] / BEYOND_SPEEDS / np.exp(x[index])
+            if part < 1.0 and np.exp(x[rise]) > LEAST_RISE:
+                changed[coulomb] += np.log1p(np.exp(x[rise] - TYPICAL_SQUARE * part**2))
+                changed[rise], changed[index] = np.log(LEAST_RISE), np.log(term_of(name).initial)
+        return changed
 
     def slopes(self, x: Array) -> Array:
         """Return the derivatives of the parameters with respect to the coordinates (parameters, parameters) at `x`."""
@@ -93,7 +118,8 @@ class Coordinates:
     def ranges(self, value: Array) -> tuple[Array, Array]:
         """Return the lower and upper bounds (parameters,) of the parameters `value` (parameters,).
 
-        Widths have no bounds: a Coulomb step narrower than its lower limit has the same effect as a sharp one.
+        Widths have no bounds: a Coulomb step narrower than its lower limit has the same effect as a sharp one. The bounds
+        `highest` are not physical either.
         """
         positive = np.array([term_of(name).range == "positive" for name in self.names])
         lower, upper = np.where(positive, 0.0, -np.inf), np.full(value.size, np.inf)
@@ -111,6 +137,10 @@ class Coordinates:
         floor = self.options.width_floor
         floors = np.array([floor if term_of(name).range == "floor" else 0.0 for name in self.names])
         return floors if self.resolved is None else np.maximum(floors, self.resolved)
+
+    @cached_property
+    def _highest(self) -> Array:
+        return np.full(len(self.names), np.inf) if self.highest is None else self.highest
 
     @cached_property
     def _longest(self) -> Array:
@@ -213,6 +243,14 @@ class Sizes:
             "cogging": TYPICAL_COGGING * self.torque,
             "saturation": TYPICAL_SATURATION / self.torque**2,
         }[scale]
+
+
+def highest_values(names: tuple[str, ...], speeds: Array) -> Array:
+    """Return the upper bounds that `Term.fastest` declares (parameters,), inf for others; speeds: the highest speed of
+    each joint (joints,) [rad/s].
+    """
+    times = [(term_of(name).fastest, joint_of(name) or 1) for name in names]
+    return np.array([np.inf if most is None else most * float(speeds[joint - 1]) for most, joint in times])
 
 
 def scales_of(names: tuple[str, ...], sizes: Sizes) -> Array:

@@ -23,7 +23,7 @@ from hil.estimator.fit.covariance import (
 from hil.estimator.fit.levenberg_marquardt import Minimum
 from hil.estimator.fit.multistart import Refined, Search
 from hil.estimator.fit.objective import Objective, Run
-from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Lever, Sizes, scales_of
+from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Lever, Sizes, highest_values, scales_of
 from hil.estimator.fit.resolved_widths import resolved_widths
 from hil.estimator.fit.ripple import WAVES, find_waves
 from hil.estimator.fit.simulated_run import SimulatedRun
@@ -151,7 +151,9 @@ def _objective(
     states = [np.concatenate((m.position[:, 0], m.velocity[:, 0])) / state_scale for m in linear.motions]
     weights = tuple(np.where(period.valid, 1.0 / period.noise[:, None], 0.0) for period in periods)
     runs = tuple(_simulated(period, options) for period in periods)
-    coordinates = Coordinates(model.names, scales, options.coordinates, _resolved_widths(model, linear, options))
+    speeds = np.max([np.abs(motion.velocity).max(axis=1) for motion in linear.motions], axis=0)
+    bounds = _resolved_widths(model, linear, options), highest_values(model.names, speeds)
+    coordinates = Coordinates(model.names, scales, options.coordinates, *bounds)
     steps = options.minimiser, options.max_relative_decrease
     prior = CoordinatePrior.of(model.names, scales, sizes)
     weight = dict(zip(linear.names, linear.value.tolist(), strict=True)).get("gravity_2", 0.0)

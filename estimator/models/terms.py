@@ -14,6 +14,7 @@ from typing import Literal, get_args
 from hil.estimator.errors import ModelError
 
 __all__ = [
+    "BEYOND_SPEEDS",
     "DRIVES",
     "FRICTIONS",
     "OPTIONS",
@@ -68,6 +69,8 @@ OPTIONS: dict[Option, str] = {
     "lags": "different lags of the two joints' current loops",
 }
 """Optional parts of a model and their descriptions; also keys of `[model]`."""
+BEYOND_SPEEDS = 3.0
+"""Multiple of a joint's highest speed at which a Stribeck rise falls by no more than a tenth."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,12 @@ class Term:
     """Initial guess if neither the regression nor the caller provides one [unit]."""
     absent: float = 0.0
     """Value that disables the term in the simulation [unit]: 1 for factors and divisors."""
+    fastest: float | None = None
+    """Upper bound of a speed, as a multiple of the joint's highest speed; None for no bound.
+
+    A term that hardly changes over all speeds of the motion is another term in disguise: a Stribeck rise that never
+    falls is Coulomb friction, a Coulomb step that is never complete viscous friction.
+    """
     max_step: float | None = None
     """Maximum change of its coordinate (for positive terms, of the logarithm) per iteration; None: the fit's limit."""
     standstill: bool = False
@@ -158,6 +167,7 @@ _DECLARED = (
         range="floor",
         scale=0.05,
         absent=1.0,
+        fastest=BEYOND_SPEEDS,
         standstill=True,
         replaced_by="presliding",
     ),
@@ -178,6 +188,7 @@ _DECLARED = (
         scale="velocity",
         initial=0.2,
         absent=1.0,
+        fastest=BEYOND_SPEEDS,
         max_step=1.0,
         standstill=True,
         log_spread=1.0,

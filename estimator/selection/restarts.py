@@ -11,6 +11,7 @@ import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.fit.reparametrisation import LEAST_RISE
 from hil.estimator.fit.ripple import WAVES, Wave
 from hil.estimator.identify import Estimate
 from hil.estimator.models.terms import term_of
@@ -18,7 +19,6 @@ from hil.estimator.options import SelectionOptions
 from hil.estimator.selection.waves import ranked_cycles, wave_peaks, without_height
 
 ALIKE_STIFFNESS = 3.0  # ratio of two stiffnesses between which no minimum is expected
-LEAST_RISE = 0.05  # Stribeck rise below which nothing is disguised
 WIDE = 0.5  # width of the Coulomb step over the Stribeck velocity above which the two cannot be told apart
 NARROW = 1e-3  # rad/s: initial width of an undisguised step
 ALIKE_CYCLES = 0.3  # difference of two numbers of cycles per turn between which no minimum is expected

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from hil.estimator.data.recording import Recording
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 FAR_ABOVE = 10.0  # residual of a window, or of a stretch, relative to the usual one of its joint
 ABOVE_NOISE = 5.0  # the same, relative to the noise
@@ -136,7 +137,7 @@ def _silent(joint: _Joint, joints: Sequence[_Joint]) -> list[str]:
 
 
 def _spikes(joint: _Joint) -> list[str]:
-    """Single samples that are far from both neighbours."""
+    """Single samples that are far from both neighbours, and from a smooth motion through these."""
     known = np.flatnonzero(np.isfinite(joint.position))
     if known.size < FEWEST:
         return []
@@ -145,7 +146,9 @@ def _spikes(joint: _Joint) -> list[str]:
     away = np.abs(values - np.median(windows(np.pad(values, 2, mode="edge"), 5), axis=1))
     far = away > max(SPIKE_NOISES * joint.noise, SPIKE_USUAL * float(np.quantile(away, USUAL_QUANTILE)))
     # A wrong sample also moves the medians of its neighbours.
-    spikes = known[far & (away > 0.5 * windows(np.pad(away, 2), 5).max(axis=1))]
+    found = far & (away > 0.5 * windows(np.pad(away, 2), 5).max(axis=1))
+    found &= _departs(joint.time[known], values, found, SPIKE_NOISES * joint.noise)
+    spikes = known[found]
     if not 0 < spikes.size <= MOST_SPIKES * known.size:
         return []
     value = float(np.median(joint.position[spikes]))
@@ -155,6 +158,29 @@ def _spikes(joint: _Joint) -> list[str]:
         f"Single positions of {joint.name} are far from their neighbours: {spikes.size} of {known.size} samples"
         f"{where}, {_at(joint.time[spikes])}. Remove these samples, or leave their fields empty."
     ]
+
+
+def _departs(time: Array, values: Array, doubtful: Mask, least: float) -> Mask:
+    """Return which `doubtful` samples (samples,) differ by more than `least` from the cubic through their neighbours.
+
+    Where a motion turns, its samples are beyond those before and after, but on the same smooth curve.
+    """
+    departs = np.zeros_like(doubtful)
+    sound = np.flatnonzero(~doubtful)
+    if sound.size < 4:
+        return doubtful
+    at = np.flatnonzero(doubtful)
+    first = np.clip(np.searchsorted(sound, at) - 2, 0, sound.size - 4)
+    near = sound[first[:, None] + np.arange(4)]
+    smooth = np.zeros(at.size)
+    for i in range(4):
+        others = [j for j in range(4) if j != i]
+        weight = np.prod(
+            [(time[at] - time[near[:, j]]) / (time[near[:, i]] - time[near[:, j]]) for j in others], axis=0
+        )
+        smooth += weight * values[near[:, i]]
+    departs[at] = np.abs(values[at] - smooth) > least
+    return departs
 
 
 def _stop(joint: _Joint) -> list[str]:

@@ -138,3 +138,12 @@ def test_a_command_that_stays_at_its_largest_value_is_named_where_the_motion_is_
     clipped = replace(healthy(), torque=np.clip(healthy().torque, -0.8, 0.8))
     said = " ".join(doubts_of([clipped], estimate).warnings)
     assert ("its torque stays at 0.8 N m" in said) is named
+
+
+def test_turns_of_a_smooth_motion_are_not_wrong_samples() -> None:
+    """Positions that were filtered have so little noise that a turn stands out against it."""
+    recording = healthy()
+    smooth = replace(recording, position=np.stack([0.5 * np.sin(9.4 * recording.time), recording.position[1]]))
+    assert found(smooth, smooth.position + 1e-4) == ()
+    (named,) = found(spiky(smooth), smooth.position + 1e-4)
+    assert "4 of 1600 samples" in named
