@@ -118,8 +118,8 @@ class Coordinates:
     def ranges(self, value: Array) -> tuple[Array, Array]:
         """Return the lower and upper bounds (parameters,) of the parameters `value` (parameters,).
 
-        Widths have no bounds: a Coulomb step narrower than its lower limit has the same effect as a sharp one. The bounds
-        `highest` are not physical either.
+        Widths have no bounds: a Coulomb step narrower than its lower limit has the same effect as a sharp one. The
+        bounds `highest` are not physical either.
         """
         positive = np.array([term_of(name).range == "positive" for name in self.names])
         lower, upper = np.where(positive, 0.0, -np.inf), np.full(value.size, np.inf)
