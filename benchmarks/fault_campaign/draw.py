@@ -49,7 +49,7 @@ WORDS = {
     REPEATED: r"repeated|too late or twice",
     SETTING: r"changed the settings.{0,80}(Homing Offset|Return Delay Time|PWM Limit|Current Limit) is"
     r"|(Homing Offset|Return Delay Time|PWM Limit) was changed meanwhile",
-    HAND: r"pushes or holds|hit it|slips",
+    HAND: r"pushes or holds|pushing or holding|hit it|slips",
     DISK: r"\bdisk\b|no space|File too large|cannot be written",
     POSE: r"rest[_ ]pose|before the start|starts? (from|at)",
 }

@@ -84,7 +84,7 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
         "another program on the bus keeps requesting a servo's position", "seconds between requests", 0.01
     ),
     FaultKind.SILENT_SERVO: FaultFacts("a servo's bus cable is disconnected; its motor keeps running"),
-    FaultKind.REBOOT: FaultFacts("a servo reboots after a dip of its supply", "seconds without response", 0.25),
+    FaultKind.REBOOT: FaultFacts("a servo reboots after a dip in its supply voltage", "seconds without response", 0.25),
     FaultKind.OVERHEATING: FaultFacts("a servo is hotter than its Temperature Limit", "kelvin above it", 10),
     FaultKind.OVERLOAD: FaultFacts("a servo reports overload"),
     FaultKind.LOW_VOLTAGE: FaultFacts("the supply falls below a servo's Min Voltage Limit", "volts below it", 1.0),

@@ -42,10 +42,10 @@ class Drive(Described):
     viscous: NotNegative = Field(0.0, le=20, description="viscous friction, warm [N m s/rad]")
     coulomb: NotNegative = Field(0.0, le=20, description="Coulomb friction, warm [N m]")
     cold_viscous: NotNegative = Field(
-        0.0, le=10, description="excess of viscous friction at time 0, as a fraction of the warm one"
+        0.0, le=10, description="excess of viscous friction at time 0, as a fraction of its warm value"
     )
     cold_coulomb: NotNegative = Field(
-        0.0, le=10, description="excess of Coulomb friction at time 0, as a fraction of the warm one"
+        0.0, le=10, description="excess of Coulomb friction at time 0, as a fraction of its warm value"
     )
     warm_up_time: Positive = Field(60.0, le=36000, description="time constant of the warm-up [s]")
     coulomb_width: NotNegative = Field(

@@ -30,8 +30,8 @@ class PilotOptions:
     """Maximum number of settling periods of a pilot or an intermediate run."""
 
     first_torque_share: float = 0.02
-    """Torque of the first pilot, relative to the torque that the current limits allow, if no torque is safe in the
-    whole range.
+    """Torque of the first pilot, relative to the torque that the current limits allow, if no torque is safe over the
+    whole range of motion.
     """
     breakaway_raise: float = 1.6
     """Ratio of successive peak torques of a joint that has not moved yet."""
@@ -72,8 +72,7 @@ class PilotOptions:
     falling_share: float = 0.85
     """Fraction of the limits that runs may use on an arm that falls over when it is stopped."""
     min_falling_torque: float = 0.05
-    """Torque that an arm that falls over may receive in any case, as a fraction of the torque that the current limit
-    allows.
+    """Torque that is always allowed for an arm that falls over, as a fraction of what the current limit allows.
     """
     start_inside: float = 0.95
     """An arm that a stopped run left beyond its limits is assumed to start within this fraction of them."""

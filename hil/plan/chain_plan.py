@@ -67,7 +67,7 @@ def plan_of(config: Config) -> Plan:
 
 
 def missing_path(config: Config) -> str:
-    """Say that a spatial arm without a pilot lacks its path; "" if it does not."""
+    """Message that a spatial arm without a pilot lacks its path; "" if nothing is missing."""
     if config.joint_path is not None:
         return ""
     return (

@@ -110,7 +110,7 @@ class Confounded:
 
 @dataclass(frozen=True)
 class Levels:
-    """RMS of all lines together in encoder steps, per joint."""
+    """RMS of all spectral lines together, per joint, in encoder steps."""
 
     excited_lines: PerJoint
     distortion: PerJoint
@@ -121,7 +121,8 @@ class Levels:
 
 @dataclass(frozen=True)
 class LineGroup:
-    """Lines of one kind: their number, and the RMS motion and residual of one line in encoder steps, per joint."""
+    """Spectral lines of one kind: their number, and the RMS motion and residual per line in encoder steps, per joint.
+    """
 
     lines: int
     motion: PerJoint
@@ -130,7 +131,7 @@ class LineGroup:
 
 @dataclass(frozen=True)
 class LineLevels:
-    """RMS of one line in encoder steps, by kind of line; None for kinds that the multisine does not have."""
+    """RMS of one spectral line in encoder steps, by kind of line; None for kinds that the multisine does not have."""
 
     noise: PerJoint
     excited: LineGroup | None = None
@@ -224,7 +225,7 @@ class Quantiles:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamTiming:
-    """How well the stream kept its deadlines; rate_held [Hz], seconds [s].
+    """How well the stream kept its deadlines. seconds: duration [s]. rate_held: mean sample rate achieved [Hz].
 
     lateness_us: time from each deadline to its write. round_trip_us: time from the write to the last reply. drift_us:
     difference in lateness between the last and the first tenth of the writes. servo_clock_ppm: how much faster each
@@ -299,7 +300,9 @@ class PhysicalQuantity(Quantity):
 
 @dataclass(frozen=True)
 class Physical:
-    """Masses, centres of mass and inertias, using [known]. not_told_apart: groups that need another known quantity."""
+    """Masses, centres of mass and inertias, using [known]. not_told_apart: groups of quantities that cannot be
+    separated unless another one is known.
+    """
 
     quantities: Mapping[str, PhysicalQuantity]
     not_told_apart: tuple[tuple[str, ...], ...]

@@ -56,7 +56,7 @@ REBOOT_S = 0.6
 
 
 _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
-"""Said if every servo has answered in the end, and nothing else is wrong."""
+"""Said if every servo has answered in the end and nothing else is wrong."""
 
 COUNT_DOWN_S = 5.0
 """Time between the warning that an arm will move again after a stopped run and switching torque on [s].
@@ -81,7 +81,7 @@ class ServoSession:
     settings: Settings = field(default_factory=dict)
     """What `settings_now` found at the beginning."""
     lay: Lies = field(default_factory=dict)
-    """Where the servos were at the beginning."""
+    """Positions of the servos at the beginning."""
     _wanted: dict[Joint, dict[str, int]] = field(default_factory=dict)
     """Settings to restore: those saved, except for what another program changed since an earlier run was killed."""
     _left: dict[Joint, Kept] = field(default_factory=dict)
@@ -158,7 +158,7 @@ class ServoSession:
     def warn(self) -> None:
         """If the last run was stopped, announce that the arm is about to move again, and give people time to step back.
 
-        Anyone who saw it go limp may believe that the program has ended, and reach into the arm.
+        Anyone who saw it go limp may believe that the program has ended, and reach into the arm's workspace.
         """
         if not self.was_stopped:
             return
@@ -331,9 +331,10 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
 
 
 def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
-    """The exception to raise in place of `error` if torque is off on all servos by now; None if it is not. This is the
-    exception that caused torque to be cut, or an ExperimentError if only the silence of servos did. It has a note about
-    torque.
+    """The exception to raise in place of `error` if torque is off on all servos by now; None if it is not.
+
+    It is the exception that led to cutting torque. If there was none, and replies were only missing when torque was cut
+    at the end, it is an ExperimentError. A note about the torque state is attached to it.
     """
     report = bus.torque_off_report
     error.args = (str(report),)
@@ -388,6 +389,6 @@ def settings_at_start() -> Settings:
 
 
 def lay_at_start() -> Lies:
-    """Where the servos were at the beginning of this session; empty if a run may have moved the arm since."""
+    """Positions of the servos at the beginning of this session; empty if a run may have moved the arm since."""
     outer = _outermost.get()
     return {} if outer is None or outer.shared > 1 else outer.lay
