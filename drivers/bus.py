@@ -52,8 +52,8 @@ class BusConfig:
     slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
     voltage with temperature.
     watchdog_required: reject firmware without Bus Watchdog.
-    take_over: if torque is already on, let the arm sink slowly, then cut torque; otherwise refuse to start.
-    interval: time between two samples [s]; 0 without a fixed rate, in which case the servos' status is not read.
+    take_over: what to do if torque is already on: if true, let the arm sink slowly and cut torque; if false, refuse to
+    start. interval: time between two samples [s]; 0 without a fixed rate, in which case the servos' status is not read.
     """
 
     url: str

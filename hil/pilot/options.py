@@ -43,9 +43,9 @@ class PilotOptions:
     at_limit: float = 0.99
     """Fraction of a torque limit above which the limit counts as reached."""
     torque_after_limit: float = 0.85
-    """Cap on further torque, relative to the torque at which a limit was exceeded."""
+    """Cap on the torque of later runs, relative to the torque at which a limit was exceeded."""
     torque_after_unsettled: float = 0.85
-    """Cap on further torque after a run that never settled, relative to that run's torque. A large motion with little
+    """Cap on the torque of runs after one that never settled, relative to that run's torque. A large motion with little
     friction may never settle.
     """
     torque_over_friction: float = 1.8

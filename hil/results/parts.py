@@ -121,8 +121,7 @@ class Levels:
 
 @dataclass(frozen=True)
 class LineGroup:
-    """Spectral lines of one kind: their number, and the RMS motion and residual per line in encoder steps, per joint.
-    """
+    """Spectral lines of one kind: their number, and the RMS motion and residual of one line per joint, in encoder steps."""
 
     lines: int
     motion: PerJoint
@@ -151,9 +150,10 @@ class Validation:
     """How well the model predicts, per joint; None if that was not checked.
 
     held_out_rms: open-loop prediction error of a held-out multisine, encoder noise included, relative to the motion's
-    RMS (the verdict excludes the noise); if friction has changed since the fitted multisine, it is scaled by one factor
-    per joint, which is estimated from the held-out motion itself. held_out_as_fitted_rms: the same with friction as it
-    was in the fitted multisine; None if it has not changed. free_run_rms: the same for the fitted multisine.
+    RMS (the verdict excludes the noise); if friction has changed since the fitted multisine, the model's friction is
+    scaled by one factor per joint, estimated from the held-out motion itself. held_out_as_fitted_rms: the same with
+    friction as it was in the fitted multisine; None if it has not changed. free_run_rms: open-loop prediction error of
+    the fitted multisine, likewise relative.
     residual_over_floor: residual relative to the measured noise, which is at least that of rounding. correlated_lags:
     fraction of the residual's autocorrelations that exceed those of white noise. condition: condition number of the
     scaled information matrix.

@@ -31,7 +31,7 @@ ReadDrives = Callable[[Joint], tuple[float, ...]]
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the arm is."""
+    """A pose of the arm."""
 
     angles: tuple[float, ...]
     """Joint angles in the description's convention [rad]."""

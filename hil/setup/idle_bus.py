@@ -55,6 +55,6 @@ def _timing(config: Config, bus: ServoBus) -> str:
         missing += any(state.missing)
     late, there = (float(np.quantile(values, 0.99)) for values in (lateness, round_trip))
     return (
-        f"At {rate:g} cycles per second with torque off: lateness p99 {late:.0f} us, round trip p99 {there:.0f} of "
-        f"{1e6 / rate:.0f} us, {ticks.missed} missed deadlines, {missing} lost replies."
+        f"At {rate:g} cycles per second with torque off: lateness p99 {late:.0f} us, round trip p99 {there:.0f} us "
+        f"(period: {1e6 / rate:.0f} us), {ticks.missed} missed deadlines, {missing} lost replies."
     )

@@ -47,7 +47,11 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
         if stance == FLAT
         else math.radians(
             _number(
-                "By how many degrees is its plane of motion tilted from the vertical", "0", (0.0, _MOST_TILT), ask, say
+                "By how many degrees is the arm's plane of motion tilted from the vertical",
+                "0",
+                (0.0, _MOST_TILT),
+                ask,
+                say,
             )
         )
     )

@@ -79,7 +79,7 @@ class ServoSession:
     _delays: dict[Joint, int] = field(default_factory=dict)
     """Return Delay Time of each servo at the beginning [2 us]."""
     settings: Settings = field(default_factory=dict)
-    """What `settings_now` found at the beginning."""
+    """The servos' settings at the beginning, as read by `settings_now`."""
     lay: Lies = field(default_factory=dict)
     """Positions of the servos at the beginning."""
     _wanted: dict[Joint, dict[str, int]] = field(default_factory=dict)
@@ -287,7 +287,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
     Raises ExperimentError at the end if a setting could not be restored and no other error has ended the block.
 
     A TorqueNotOff that leaves the block reports the final state: servos that answer again are read back. If torque is
-    off on all servos, the error that ended the block before is raised instead.
+    off on all servos, the error that had ended the block is raised instead.
 
     folder: run folder that receives a copy of the settings. say: receives messages for the user. Raises the same errors
     as `ServoBus.open`, and RunFolderError.

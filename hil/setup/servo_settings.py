@@ -1,4 +1,6 @@
-"""Configure one servo: ID, baud rate, return delay. Every EEPROM write is confirmed first and read back afterwards."""
+"""Configure one servo: ID, baud rate, return delay. Every EEPROM write must be confirmed first, and is read back
+afterwards.
+"""
 
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,5 +1,5 @@
-"""The folder of a study: only one process at a time works in it, and it can only be continued under the conditions of
-its start.
+"""The folder of a study: only one process at a time works in it, and it can only be continued with the inputs and
+versions it was started with.
 
 DIR/study.toml   an exact copy of the study
 DIR/about.json   number of runs, seed, versions, hashes of the arm's file and of the recordings

@@ -90,7 +90,7 @@ def test_answers_are_asked_again_until_they_make_sense(arm_file: ArmFile) -> Non
 def test_which_way_up_the_arm_is_says_rest_and_gravity(
     arm_file: ArmFile, stance: str, tilt: str, rest: float, gravity: float
 ) -> None:
-    answers = {"Is the arm hanging": stance, "By how many degrees is its plane": tilt}
+    answers = {"Is the arm hanging": stance, "By how many degrees is the arm's plane": tilt}
 
     def ask(question: str, usual: str) -> str:
         return next((given for start, given in answers.items() if question.startswith(start)), usual)
