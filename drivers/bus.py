@@ -475,8 +475,8 @@ class ServoBus:
     def confirm_later(self, drive: Joint) -> bool:
         """Cut the torque of a servo (a key of `drives`) that `torque_off` could not confirm as off, and read it back.
 
-        Returns whether there was anything to do; `torque_off_report` then counts it as confirmed. Raises DriverError if
-        it still does not answer.
+        Returns False if there was nothing to do; otherwise `torque_off_report` then lists the servo as confirmed.
+        Raises DriverError if the servo still does not answer.
         """
         report = self.torque_off_report
         if report is None or drive not in [joint for joint, _ in report.unconfirmed]:

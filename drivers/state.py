@@ -138,7 +138,7 @@ reboot.
 def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans]:
     """Return the registers that end with the goal, and those that end with SETTINGS.
 
-    They begin at an earlier address than necessary: the answers then differ in length from those that other programs
+    They begin at an earlier address than necessary, so that the answers differ in length from those that other programs
     usually request.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)

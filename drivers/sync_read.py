@@ -119,7 +119,7 @@ class GroupRead(Protocol):
         ...
 
     def senders(self, received: bytes) -> list[int]:
-        """Return the IDs of the intact answers found in an irregular reply, including IDs that were not asked."""
+        """Return the IDs of the intact answers found in an irregular reply, including IDs that were not addressed."""
         ...
 
 

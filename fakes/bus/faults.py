@@ -91,7 +91,7 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
     FaultKind.STUCK_JOINT: FaultFacts("a joint is jammed"),
     FaultKind.ENCODER_JUMP: FaultFacts("an encoder reads a position that is offset", "ticks", 512),
     FaultKind.CABLE_PULLED: FaultFacts(
-        "the adapter's cable is unplugged and replugged at the end; the port must be reopened"
+        "the adapter's cable is unplugged, and replugged when the fault ends; the port must be reopened"
     ),
 }
 """What every kind of fault does."""
@@ -111,7 +111,9 @@ _LEAST_REPEAT_S = 1e-3
 
 
 class Fault(Described):
-    """One injected fault, immutable. `servo` is a bus ID at the time the fault begins; None means all servos."""
+    """One injected fault, immutable. `servo` is the bus ID that the servo has when the fault begins; None means all
+    servos.
+    """
 
     kind: Annotated[FaultKind, Field(strict=False, description="kind of fault; see FAULTS")]
     at: Annotated[
@@ -147,7 +149,7 @@ class Fault(Described):
 
 
 class Happened(NamedTuple):
-    """A fault that took effect: time [s since the bus was created], kind, and servo (None: no single one)."""
+    """A fault that took effect: time [s since the bus was created], kind, and servo (None: no particular one)."""
 
     time: float
     kind: FaultKind

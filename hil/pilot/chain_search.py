@@ -180,7 +180,8 @@ class ChainSearch(SafeShares):
 def identify_chain_in_steps(
     config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
 ) -> tuple[str, SettledResult]:
-    """Identify a spatial arm from its description, limits and rest pose. Returns the torque state and the result.
+    """Identify a spatial arm from its description, limits and rest pose. Returns a sentence about the torque state, and
+    the result.
 
     Raises whatever a run raises, and NoSafeTorque.
     """

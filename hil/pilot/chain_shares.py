@@ -53,7 +53,7 @@ RAISED_RATE = 1.6
 """The first higher rate that is tried in order to advise the user, relative to the configured rate."""
 
 ROOM = 1.2
-"""Advised room beyond a limit, relative to how far the simulated arms exceed it."""
+"""Advised extension of a limit, relative to the amount by which the simulated arms exceed the limit."""
 
 SATURATED = 0.98
 LEAST_SPREAD_SHARE = 0.1

@@ -62,7 +62,7 @@ class PilotOptions:
     wide_range: float = 0.74
     """Other waves are tried if a joint uses less than this fraction of its position range."""
     other_waves: int = 7
-    """Maximum number of other waves: either sign of each joint, and all of these reversed in time."""
+    """Maximum number of other waves, which differ in the sign of each joint and in the direction of time."""
 
     falling_raise: float = 1.35
     """Maximum ratio of the torques of successive runs of an arm that falls over when it is stopped."""

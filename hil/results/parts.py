@@ -121,7 +121,7 @@ class Levels:
 
 @dataclass(frozen=True)
 class LineGroup:
-    """Spectral lines of one kind: their number, and the RMS motion and residual of one line per joint, in encoder steps."""
+    """Spectral lines of one kind: their number, and RMS motion and residual of one line per joint, in encoder steps."""
 
     lines: int
     motion: PerJoint
@@ -154,7 +154,7 @@ class Validation:
     scaled by one factor per joint, estimated from the held-out motion itself. held_out_as_fitted_rms: the same with
     friction as it was in the fitted multisine; None if it has not changed. free_run_rms: open-loop prediction error of
     the fitted multisine, likewise relative.
-    residual_over_floor: residual relative to the measured noise, which is at least that of rounding. correlated_lags:
+    residual_over_floor: residual relative to the measured noise, which is at least the rounding noise. correlated_lags:
     fraction of the residual's autocorrelations that exceed those of white noise. condition: condition number of the
     scaled information matrix.
     """
@@ -208,7 +208,7 @@ class ModelChoice:
 
     @property
     def plainest(self) -> str:
-        """The model with the fewest parameters of those that could be judged."""
+        """The model with the fewest parameters among those that could be judged."""
         judged = [trial for trial in self.tried if trial.score is not None]
         return min(judged, key=lambda trial: trial.parameters).model if judged else self.chosen
 

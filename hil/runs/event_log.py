@@ -18,7 +18,7 @@ LATE_NAME = "events-late.jsonl"
 class EventLog:
     """Events of one run.
 
-    On exit it waits a moment until all events are written. Events that could not be written in time, because
+    On exit it waits briefly for all events to be written. Events that could not be written in time, because
     events.jsonl blocks, go to events-late.jsonl.
     """
 

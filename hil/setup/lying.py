@@ -57,7 +57,7 @@ def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
 
 def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float]) -> str:
     """Say how far a spatial arm that was in its rest pose (joints,) [rad] has moved since torque was cut, and which
-    rest pose to configure; "" if it stayed, was elsewhere, or its servos do not answer.
+    rest pose to configure; "" if it stayed there, had not been there, or its servos do not answer.
     """
     at, rest = np.array(before), np.array(config.arm.rest_pose)
     if not config.is_chain or not np.abs(at - rest).max() < FROM_REST_RAD:

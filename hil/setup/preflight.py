@@ -250,7 +250,7 @@ def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, 
 
 def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     torque = servo.read("Torque Enable")
-    fix = "Another program drives it: stop that program first, or power-cycle the servo."
+    fix = "Another program is driving it: stop that program first, or power-cycle the servo."
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
 
 

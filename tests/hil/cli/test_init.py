@@ -135,7 +135,7 @@ def test_friction_that_holds_the_arm_aside_is_read_from_both_sides(arm_file: Arm
     bus = port._serial.bus
 
     def ask(question: str, usual: str) -> str:
-        for start, angle in (("Let the arm hang", 0.2), ("Friction may hold it to one side", -0.1)):
+        for start, angle in (("Let the arm hang", 0.2), ("Friction may hold the arm to one side", -0.1)):
             if question.startswith(start):
                 bus.hand.move(Move(servo=2, to=angle, duration=0.1))
                 port.clock.wait_until(port.clock.now() + 0.5)
