@@ -111,9 +111,7 @@ _LEAST_REPEAT_S = 1e-3
 
 
 class Fault(Described):
-    """One injected fault, immutable. `servo` is the bus ID that the servo has when the fault begins; None means all
-    servos.
-    """
+    """One injected fault, immutable. `servo` is the servo's bus ID when the fault begins; None means all servos."""
 
     kind: Annotated[FaultKind, Field(strict=False, description="kind of fault; see FAULTS")]
     at: Annotated[
