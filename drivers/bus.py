@@ -360,7 +360,7 @@ class ServoBus:
         if seen is None:
             return ""
         # A tripped watchdog or a reboot also leaves 0.
-        who = ": another program commands it, or writes are lost" if seen.value else ""
+        who = ": another program is commanding it, or writes are being lost" if seen.value else ""
         return (
             f"Just before, {seen.register} of {self._drives[seen.place].title} was {seen.value} although "
             f"{seen.written} had been written{who}."

@@ -150,10 +150,12 @@ class FakeArm(Described):
             raise ValueError(f"{servos} for {len(arm.drives)} drives of the arm: one servo per drive")
         for fault in self.faults:
             if fault.servo is not None and fault.servo not in ids:
-                raise ValueError(f"faults: {fault.kind} of servo {fault.servo}: the IDs are {', '.join(map(str, ids))}")
+                raise ValueError(
+                    f"faults: {fault.kind}: no servo has the ID {fault.servo}; the IDs are {', '.join(map(str, ids))}"
+                )
         for move in self.moves:
             if move.servo not in ids:
-                raise ValueError(f"moves: servo {move.servo}: the IDs are {', '.join(map(str, ids))}")
+                raise ValueError(f"moves: no servo has the ID {move.servo}; the IDs are {', '.join(map(str, ids))}")
         return self
 
     @property

@@ -70,7 +70,7 @@ class Drive(Described):
     )
     cable_angle: Angle = Field(0.0, description="joint angle at which the cable is slack [rad]")
     ripple: NotNegative = Field(
-        0.0, le=1, description="amplitude of the torque ripple over the angle, as a fraction of torque"
+        0.0, le=1, description="amplitude of the torque ripple over the angle, as a fraction of the torque"
     )
     ripple_cycles: Positive = Field(7.0, description="cycles of torque ripple per turn of the joint")
     cogging: NotNegative = Field(0.0, le=10, description="amplitude of the cogging torque at the output shaft [N m]")

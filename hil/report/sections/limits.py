@@ -9,7 +9,7 @@ from hil.report.words import number, percent
 
 
 def limits(data: RunData) -> Section:
-    """The section, always present."""
+    """Return the section, which every report has."""
     rows: list[tuple[str, ...]] = []
     for index, joint in enumerate(data.config.joints):
         position, velocity = data.samples["position"][:, index], data.samples["velocity"][:, index]

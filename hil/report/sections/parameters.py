@@ -17,7 +17,7 @@ TWO_SIDED_95 = 1.96
 
 
 def parameters(data: RunData) -> Section:
-    """The section, always present."""
+    """Return the section, which every report has."""
     truth = truth_of(data.result, data.config)
     return parameters_of(data.result, truth.values, truth.note)
 
