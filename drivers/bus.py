@@ -57,8 +57,8 @@ class BusConfig:
     slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
     voltage with temperature.
     watchdog_required: reject firmware without Bus Watchdog.
-    take_over: if torque is already on, let the arm sink slowly, then cut torque; otherwise refuse to start.
-    interval: time between two samples [s]; 0 without a fixed rate, in which case the servos' status is not read.
+    take_over: what to do if torque is already on: if true, let the arm sink slowly and cut torque; if false, refuse to
+    start. interval: time between two samples [s]; 0 without a fixed rate, in which case the servos' status is not read.
     """
 
     url: str
@@ -393,7 +393,7 @@ class ServoBus:
         if seen is None:
             return ""
         # A tripped watchdog or a reboot also leaves 0.
-        who = ": another program commands it, or writes are lost" if seen.value else ""
+        who = ": another program is commanding it, or writes are being lost" if seen.value else ""
         return (
             f"Just before, {seen.register} of {self._drives[seen.place].title} was {seen.value} although "
             f"{seen.written} had been written{who}."
@@ -537,8 +537,8 @@ class ServoBus:
     def confirm_later(self, drive: Joint) -> bool:
         """Cut the torque of a servo (a key of `drives`) that `torque_off` could not confirm as off, and read it back.
 
-        Returns whether there was anything to do; `torque_off_report` then counts it as confirmed. Raises DriverError if
-        it still does not answer.
+        Returns False if there was nothing to do; otherwise `torque_off_report` then lists the servo as confirmed.
+        Raises DriverError if the servo still does not answer.
         """
         report = self.torque_off_report
         if report is None or drive not in [joint for joint, _ in report.unconfirmed]:

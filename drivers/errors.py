@@ -76,8 +76,8 @@ class ServoFault(DriverError):
 
 
 class BusShared(DriverError):
-    """Another master sends instructions on this bus, or has written goals or modes. Example: a controller board wired
-    next to the adapter.
+    """Another master is sending instructions on this bus, or has written goals or modes. Example: a controller board
+    wired next to the adapter.
     """
 
 
@@ -90,7 +90,7 @@ class WrongSetting(DriverError):
 
 
 class TorqueHeld(WrongSetting):
-    """A servo's torque is already on. Example: another program holds the arm up."""
+    """A servo's torque is already on. Example: another program is holding the arm up."""
 
 
 class TorqueNotOff(DriverError):

@@ -293,7 +293,7 @@ class Exchange:
         try:
             goals = self._pack(goal_ticks)
         except struct.error:
-            raise ValueError(f"goals {list(goal_ticks)} must each be a whole number from -32768 to 32767") from None
+            raise ValueError(f"goals {list(goal_ticks)}: each must be a whole number from -32768 to 32767") from None
         self._sent.append(tuple(goal_ticks))
         before = self._now()
         if self._echoes:

@@ -65,7 +65,7 @@ def open_port(url: str, baud: int) -> "Port":
 class Port:
     """An open serial port. Every method but `close` raises PortLost when the device fails.
 
-    After PortLost the same object may be used again; it fails again as long as the device is gone. After replugging the
+    After PortLost, methods may be called again; they fail as long as the device is gone. After replugging the
     cable, open a new port. `latency` is the longest time the adapter may hold back a reply [s].
     """
 
@@ -298,7 +298,7 @@ class DescriptorPort(Port):
     def _check_alive(self, received: bytes) -> None:
         if not received:
             raise OSError(
-                "the device reports data but returns none; it was unplugged, or another program reads from it"
+                "the device reports data but returns none; it was unplugged, or another program is reading from it"
             )
 
     def _write_rest(self, data: bytes) -> None:

@@ -25,7 +25,7 @@ _tick = partial(tuple.__new__, Tick)  # half the time of Tick(...)
 
 
 class FixedRate:
-    """Deadlines at `rate` per second, the first one interval after the first call of `wait`.
+    """Deadlines at `rate` per second; the first is one interval after the first call of `wait`.
 
     After a stall the missed deadlines are returned at once, one by one and marked as missed. A caller that plays back
     samples thus stays in step with the clock without sending a burst. `missed` counts them.

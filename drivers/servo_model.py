@@ -50,11 +50,11 @@ published: supplies sag, and resistance and no-load speed differ by tens of perc
 """
 
 LEAST_OF_MEASURED = 0.75
-"""`LEAST_SUPPLY` if the supply was measured: it may sag between two readings, and motors differ."""
+"""Used in place of `LEAST_SUPPLY` if the supply was measured: it may sag between two readings, and motors differ."""
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
-"""If a current is below the first fraction of its goal, the servo may also have its torque off. The second value then
-replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
+"""If a current is below the first fraction of its goal, another possible cause is that torque is off. The second value
+then replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
 """
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
@@ -109,7 +109,7 @@ class ServoModel:
     no_load: the e-Manual's no-load speed at the nominal voltage.
     other_constants: further published torque constants [N m/A].
     position_steps: ticks of Present Position per turn.
-    min_voltage: supply voltage below which it shuts down with factory settings (Min Voltage Limit) [V].
+    min_voltage: supply voltage below which the servo shuts down with factory settings (Min Voltage Limit) [V].
     watchdog_firmware: first firmware with a Bus Watchdog.
     fast_sync_read_firmware: first firmware that supports Fast Sync Read; None if none does.
     senses_supply: whether Present Current is the supply current, that is, the motor current times the bridge's duty

@@ -130,15 +130,15 @@ def _status_names(mode: Mode) -> tuple[str, ...]:
 
 
 SETTINGS = ("Drive Mode", "Operating Mode", "Homing Offset")
-"""Settings that another program may change while torque is on, or with a reboot, and that change what goals and angles
-mean.
+"""Settings that determine what goals and angles mean, and that another program may change while torque is on or by a
+reboot.
 """
 
 
 def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans]:
     """Return the registers that end with the goal, and those that end with SETTINGS.
 
-    They begin at an earlier address than necessary: the answers then differ in length from those that other programs
+    They begin at an earlier address than necessary, so that the answers differ in length from those that other programs
     usually request.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
@@ -248,9 +248,9 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
     """Return the state of the joints, given that of their servos.
 
     of: the joint index of each servo, in ascending order. count: number of joints.
-    Goals and currents are summed; angle, velocity and clock are the first servo's; of the voltages the lowest is taken,
-    of the temperatures the highest; an error or a missing reply of one servo applies to its joint. `apart` shows how
-    the servos of one joint disagree.
+    Goals and currents are summed; angle, velocity and clock are the first servo's; the lowest voltage and the highest
+    temperature are taken; an error or a missing reply of one servo applies to its joint. `apart` shows how the servos
+    of one joint disagree.
     """
     servos = [[place for place, joint in enumerate(of) if joint == wanted] for wanted in range(count)]
     first = [places[0] for places in servos]

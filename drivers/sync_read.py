@@ -87,10 +87,13 @@ class Span:
 
 
 def one_each(span: Span | Sequence[Span], count: int) -> tuple[Span, ...]:
-    """Return one span per servo; raises ValueError unless all cover the same addresses with equally many registers."""
+    """Return one span per servo; raises ValueError unless all have the same addresses and number of registers."""
     spans = (span,) * count if isinstance(span, Span) else tuple(span)
     if len(spans) != count or len({(each.address, each.size, len(each.registers)) for each in spans}) != 1:
-        raise ValueError(f"{count} servos read together need spans of the same addresses and register count: {spans}")
+        raise ValueError(
+            f"reading {count} servos together needs one span per servo, all with the same addresses and number of "
+            f"registers: {spans}"
+        )
     return spans
 
 
@@ -116,7 +119,7 @@ class GroupRead(Protocol):
         ...
 
     def senders(self, received: bytes) -> list[int]:
-        """Return the IDs of the intact answers found in an irregular reply, including IDs that were not asked."""
+        """Return the IDs of the intact answers found in an irregular reply, including IDs that were not addressed."""
         ...
 
 

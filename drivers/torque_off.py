@@ -136,7 +136,7 @@ class TorqueOff:
             )
         return (
             f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, "
-            "but cut the supply before you reach into the arm."
+            "but cut the supply before you touch the arm."
         )
 
 

@@ -33,7 +33,7 @@ class DescriptionError(ValueError):
 
 
 class FakeServo(Described):
-    """One servo as delivered to the bus: set up for its arm, powered, torque off."""
+    """The initial state of one servo on the bus: set up for its arm, powered, torque off."""
 
     id: Annotated[int, Field(ge=0, le=MAX_ID, description="bus ID")]
     model: Annotated[str, Field(description='name as printed on the servo, e.g. "XM430-W350"')]
@@ -150,10 +150,12 @@ class FakeArm(Described):
             raise ValueError(f"{servos} for {len(arm.drives)} drives of the arm: one servo per drive")
         for fault in self.faults:
             if fault.servo is not None and fault.servo not in ids:
-                raise ValueError(f"faults: {fault.kind} of servo {fault.servo}: the IDs are {', '.join(map(str, ids))}")
+                raise ValueError(
+                    f"faults: {fault.kind}: no servo has the ID {fault.servo}; the IDs are {', '.join(map(str, ids))}"
+                )
         for move in self.moves:
             if move.servo not in ids:
-                raise ValueError(f"moves: servo {move.servo}: the IDs are {', '.join(map(str, ids))}")
+                raise ValueError(f"moves: no servo has the ID {move.servo}; the IDs are {', '.join(map(str, ids))}")
         return self
 
     @property
@@ -192,8 +194,8 @@ def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def found_beside(folder: Path, name: str) -> Path:
-    """Return the file at the path `name`, which a TOML file in `folder` gives; if there is none, the same name in
-    `folder`.
+    """Return the file at the path `name`, which a TOML file in `folder` gives; if there is no such file, the one of the
+    same name in `folder`.
     """
     named = folder / name
     return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name

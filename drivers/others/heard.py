@@ -1,4 +1,4 @@
-"""Unexpected bytes on the wire, besides the requested replies or instead of them, and what to do about them."""
+"""Unexpected bytes on the wire, in addition to the requested replies or instead of them, and what to do about them."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence

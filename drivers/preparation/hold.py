@@ -37,9 +37,10 @@ def refuse_held(servos: Mapping[Joint, Servo]) -> None:
     held = [joint for joint, servo in servos.items() if is_held(servo)]
     if held:
         raise TorqueHeld(
-            f"{' and '.join(joint.title for joint in held)}: torque is on, so another program drives or holds the arm, "
-            "or left torque on. Switching it off would let the arm fall, so nothing was written. Stop that program, or "
-            "hold the arm by hand and take it over with --take-over (BusConfig.take_over), which lets it sink slowly."
+            f"{' and '.join(joint.title for joint in held)}: torque is on, so another program is driving or holding "
+            "the arm, or has left torque on. Switching it off would let the arm fall, so nothing was written. Stop "
+            "that program, or hold the arm by hand and take it over with --take-over (BusConfig.take_over), which lets "
+            "it sink slowly."
         )
 
 

@@ -73,7 +73,7 @@ def check_quiet(port: Port) -> None:
     heard = list(Framer().feed(port.read(_MOST_HEARD_BYTES, LISTEN_S)))
     targets = sorted({packet.id for packet in heard if not packet.is_status})
     if targets:
-        raise shared(f"sends instructions to ID {', '.join(map(str, targets))}")
+        raise shared(f"is sending instructions to ID {', '.join(map(str, targets))}")
 
 
 def shared(what: str) -> BusShared:

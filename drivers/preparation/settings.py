@@ -73,7 +73,7 @@ def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
     """The settings, with goals clamped to the limits, which another program may have lowered meanwhile.
 
     A limit that is among the settings is restored before its goal; for any other limit, the servo's present value
-    counts. Raises the same errors as `Servo.read`.
+    applies. Raises the same errors as `Servo.read`.
     """
     cut = dict(settings)
     for goal, limit in _BOUNDS.items():

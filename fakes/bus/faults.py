@@ -84,14 +84,14 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
         "another program on the bus keeps requesting a servo's position", "seconds between requests", 0.01
     ),
     FaultKind.SILENT_SERVO: FaultFacts("a servo's bus cable is disconnected; its motor keeps running"),
-    FaultKind.REBOOT: FaultFacts("a servo reboots after a dip of its supply", "seconds without response", 0.25),
+    FaultKind.REBOOT: FaultFacts("a servo reboots after a dip in its supply voltage", "seconds without response", 0.25),
     FaultKind.OVERHEATING: FaultFacts("a servo is hotter than its Temperature Limit", "kelvin above it", 10),
     FaultKind.OVERLOAD: FaultFacts("a servo reports overload"),
     FaultKind.LOW_VOLTAGE: FaultFacts("the supply falls below a servo's Min Voltage Limit", "volts below it", 1.0),
     FaultKind.STUCK_JOINT: FaultFacts("a joint is jammed"),
-    FaultKind.ENCODER_JUMP: FaultFacts("an encoder reads an offset position", "ticks", 512),
+    FaultKind.ENCODER_JUMP: FaultFacts("an encoder reads a position that is offset", "ticks", 512),
     FaultKind.CABLE_PULLED: FaultFacts(
-        "the adapter's cable is unplugged and replugged at the end; the port must be reopened"
+        "the adapter's cable is unplugged, and replugged when the fault ends; the port must be reopened"
     ),
 }
 """What every kind of fault does."""
@@ -111,7 +111,7 @@ _LEAST_REPEAT_S = 1e-3
 
 
 class Fault(Described):
-    """One injected fault, immutable. `servo` is a bus ID at the time the fault begins; None means all servos."""
+    """One injected fault, immutable. `servo` is the servo's bus ID when the fault begins; None means all servos."""
 
     kind: Annotated[FaultKind, Field(strict=False, description="kind of fault; see FAULTS")]
     at: Annotated[
@@ -147,7 +147,7 @@ class Fault(Described):
 
 
 class Happened(NamedTuple):
-    """A fault that took effect: time [s since the bus was created], kind, and servo (None: no single one)."""
+    """A fault that took effect: time [s since the bus was created], kind, and servo (None: no particular one)."""
 
     time: float
     kind: FaultKind

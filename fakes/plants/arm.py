@@ -42,10 +42,10 @@ class Drive(Described):
     viscous: NotNegative = Field(0.0, le=20, description="viscous friction, warm [N m s/rad]")
     coulomb: NotNegative = Field(0.0, le=20, description="Coulomb friction, warm [N m]")
     cold_viscous: NotNegative = Field(
-        0.0, le=10, description="excess of viscous friction at time 0, as a fraction of the warm one"
+        0.0, le=10, description="excess of viscous friction at time 0, as a fraction of its warm value"
     )
     cold_coulomb: NotNegative = Field(
-        0.0, le=10, description="excess of Coulomb friction at time 0, as a fraction of the warm one"
+        0.0, le=10, description="excess of Coulomb friction at time 0, as a fraction of its warm value"
     )
     warm_up_time: Positive = Field(60.0, le=36000, description="time constant of the warm-up [s]")
     coulomb_width: NotNegative = Field(
@@ -70,7 +70,7 @@ class Drive(Described):
     )
     cable_angle: Angle = Field(0.0, description="joint angle at which the cable is slack [rad]")
     ripple: NotNegative = Field(
-        0.0, le=1, description="amplitude of the torque ripple over the angle, as a fraction of torque"
+        0.0, le=1, description="amplitude of the torque ripple over the angle, as a fraction of the torque"
     )
     ripple_cycles: Positive = Field(7.0, description="cycles of torque ripple per turn of the joint")
     cogging: NotNegative = Field(0.0, le=10, description="amplitude of the cogging torque at the output shaft [N m]")

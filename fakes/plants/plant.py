@@ -68,7 +68,7 @@ class CanBeHeld(Protocol):
     """A plant whose joints a hand can grip and move, for `hil.fakes.bus.hand`."""
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Grip joint `joint` (from 0) and move it at `velocity` [rad/s] until the next call; None releases it."""
+        """Grip a joint (counted from 0) and move it at `velocity` [rad/s] until the next call; None releases it."""
         ...
 
 

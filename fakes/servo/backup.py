@@ -1,7 +1,7 @@
 """Factory Reset and Control Table Backup: their effect on a control table.
 
-Source: ROBOTIS e-Manual, protocol2. It is uncertain what exactly a backup contains. Here it is every writable register
-except ID, Baud Rate, Torque Enable, Bus Watchdog and the goals.
+Source: ROBOTIS e-Manual, protocol2. It is uncertain what exactly a backup contains. Here, it contains every writable
+register except ID, Baud Rate, Torque Enable, Bus Watchdog and the goals.
 """
 
 from hil.drivers.packet import StatusError

@@ -61,7 +61,7 @@ class Memory:
         return bool(points) and any(at in points for at in range(address, address + length))
 
     def follow_indirect_addresses(self) -> None:
-        """Update the targets of the indirect addresses; must be called after one was written."""
+        """Update the targets of the indirect addresses; must be called after one of them has been written."""
         self._points.clear()
         for first_address, first_data, count in self._blocks:
             for index in range(count):

@@ -79,7 +79,7 @@ NEVER = 256
 """A firmware version that no servo has."""
 
 INDIRECT_MOVED_FIRMWARE = 52
-"""First firmware with which the 330 series has its indirect data at 208.
+"""First firmware with which the 330 series has its indirect data at address 208.
 
 Source: dynamixel-sdk 4.1 and ROBOTIS' dynamixel_hardware_interface (pull request 69) have one control table for older
 330 servos, with the data at 224, and a second one named fw52, with the data at 208. The e-Manual only mentions 208.

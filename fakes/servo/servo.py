@@ -167,7 +167,7 @@ class EmulatedServo(Powered):
         self.controller.start(self.present.ticks(angle()))
 
     def reboot(self, now: float, boot_s: float = BOOT_S) -> None:
-        """Switch the servo off and on again, as the Reboot instruction or a dip of its supply does."""
+        """Switch the servo off and on again, as the Reboot instruction or a dip in its supply voltage does."""
         self.power_up(now, self._angle, boot_s)
 
     def hears(self, now: float, baud: int) -> bool:

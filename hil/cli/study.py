@@ -56,7 +56,10 @@ def study(
         print(strict_json.dumps({"out": str(folder), **asdict(found)}))
         return
     low, high = found.done.interval
-    print(f"{found.done.count} of {found.done.of} runs done (95 % interval {100 * low:.1f} to {100 * high:.1f} %).")
+    print(
+        f"{found.done.count} of {found.done.of} runs succeeded "
+        f"(95 % confidence interval of the success rate: {100 * low:.1f} to {100 * high:.1f} %)."
+    )
     for message, count in list(found.failures.items())[:10]:
         print(f"  {count} failed: {message}")
     for name, rates in found.categories.items():

@@ -1,4 +1,4 @@
-"""Breakaway of joints that friction holds: more torque from run to run, stopped soon after a joint begins to move.
+"""Breaking away joints that friction holds: torque rises from run to run, and a run ends soon after a joint moves.
 
 A joint that stood still reveals little more than that its friction is larger than the torque. Just above that friction,
 motion grows quickly: on many of the plausible arms even a few percent more torque exceeds a limit. A torque that is
@@ -19,9 +19,9 @@ Mask = NDArray[np.bool_]
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
-    """Return `torque` (joints,) [N m], with more than in the `former` run for joints that stood `still`.
+    """Return `torque` (joints,) [N m], but `ratio` times the `former` torque for joints that stood `still`.
 
-    most: torque that the current limits allow (joints,) [N m].
+    most: largest torque that the current limits allow (joints,) [N m].
     """
     return np.asarray(np.where(still, np.minimum(ratio * former, most), torque))
 
@@ -43,7 +43,7 @@ def _near(joint: JointConfig, pose: float, options: PilotOptions) -> tuple[float
 
 
 def broke_free(config: Config, narrow: Config, seen: Array) -> Mask:
-    """Return which joints (joints,) exceeded only limits that are tighter in `narrow` than in the configuration.
+    """Return which joints (joints,) exceeded a limit of `narrow` but none of the wider limits of `config`.
 
     seen: lowest and highest position and largest speed of each joint (3, joints) [rad, rad/s].
     """

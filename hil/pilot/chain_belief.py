@@ -1,4 +1,5 @@
-"""Ensemble of spatial arms consistent with what is known of the real one, and its update with the recording of a run.
+"""Ensemble of spatial arms consistent with what is known about the real one, and its update with the recording of a
+run.
 
 Torque is linear in base parameters and friction, so each arm is updated by one randomised maximum a posteriori step (Y.
 Chen and D. Oliver, Mathematical Geosciences 44 (2012) 1), with itself as the prior mean and independent noise added to
@@ -47,7 +48,7 @@ SIMULATED = 100
 class ChainBelief:
     """An ensemble of arms; only the first ones are simulated.
 
-    lightest: smallest inertia of each joint with the others free, of all arms of the prior (joints,) [kg m^2].
+    lightest: smallest inertia of each joint with the others free, over all arms of the prior (joints,) [kg m^2].
     """
 
     config: Config
@@ -81,8 +82,8 @@ class ChainBelief:
         return given.model_copy(update={"stabiliser": gains})
 
     def stiffness_share(self, given: Config) -> Array:
-        """Stiffness of each joint's stabiliser at this rate, relative to that at a high rate (joints,); 1 if it is
-        configured.
+        """Stiffness of each joint's stabiliser at this rate, relative to its stiffness at a high rate (joints,); 1 if
+        the configuration sets the gains.
         """
         if given.stabiliser is not None:
             return np.ones(len(given.joints))

@@ -28,9 +28,9 @@ _WAY_POSES = 40
 
 @dataclass(frozen=True)
 class Reserve:
-    """What a path leaves unused, for errors of the assumed model.
+    """What a path leaves unused, to allow for errors of the assumed model.
 
-    position: fraction of a joint's range that stays free at either limit. speed, torque: fractions of the limits that
+    position: fraction of a joint's range that stays free at each limit. speed, torque: fractions of the limits that
     the path may use. clearance: distance in addition to the margin [m], which transitions from and to the rest pose
     need not keep.
     """

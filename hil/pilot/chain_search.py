@@ -35,19 +35,19 @@ from hil.setup.servo_session import servo_session
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7
 RAISED = 1.3
-"""Another step precedes the full run if the safe share is at least this multiple of the previous run's share."""
+"""Another step precedes the full run if the safe share of the amplitude is at least this multiple of the last run's."""
 
 MOST_RAISE = 2.5
 """Largest ratio of a step's share of the amplitude to that of the previous run."""
 
 SILENT_S = 30.0
-"""Longest silence while a safe motion is searched for [s]."""
+"""Longest time without a message while searching for a safe motion [s]."""
 
 
 class Said:
     """Passes messages on, and reports progress when there has been no message for a while.
 
-    now: the time [s].
+    now: returns the time [s].
     """
 
     def __init__(self, say: Say, now: Callable[[], float] = time.monotonic) -> None:
@@ -65,14 +65,14 @@ class Said:
         self._say(text)
 
     def tell(self, done: int, total: int) -> None:
-        """Report the progress of simulations after every SILENT_S of silence."""
+        """Report the progress of simulations after every SILENT_S without a message."""
         which = f"{self._trying}, " if self._trying else ""
         self._after_silence(
             f"Still looking for a motion safe for all arms: {which}{done} of {total} simulations of this amplitude."
         )
 
     def designing(self, done: int, total: int) -> None:
-        """Report the progress of a path's design after every SILENT_S of silence."""
+        """Report the progress of a path's design after every SILENT_S without a message."""
         self._after_silence(f"Still designing a path: {done} of {total} steps.")
 
     def _after_silence(self, text: str) -> None:
@@ -82,7 +82,7 @@ class Said:
 
 @dataclass(kw_only=True)
 class ChainSearch(SafeShares):
-    """Runs so far and the current belief."""
+    """State of the search: the runs so far and the current belief about the arm."""
 
     run: RunFolder
     shown_path: Path
@@ -123,9 +123,7 @@ class ChainSearch(SafeShares):
         return found
 
     def limit_after(self, error: ExperimentError, found: Found) -> None:
-        """Allow less of the path after a run that exceeded a limit, but not after one in which friction held a
-        joint.
-        """
+        """Reduce the largest allowed amplitude after a run that exceeded a limit, but not if friction held a joint."""
         if not isinstance(error, NotSettled | DidNotMove):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
@@ -151,7 +149,7 @@ class ChainSearch(SafeShares):
         return error
 
     def learn(self, config: Config, folder: RunFolder) -> None:
-        """Update the belief and the list of joints that lie on their own stops, from the recording in a folder."""
+        """Update the belief, and which joints were beyond their rest pose, from the recording in a folder."""
         samples = load_samples(folder.samples_path, len(config.joints))
         self.belief = self.belief.learn(config, samples)
         found = passed_rest(config, samples["position"])
@@ -166,7 +164,10 @@ class ChainSearch(SafeShares):
         torque = found.plan.segments[0].peak_goal * np.array([joint.torque_per_goal for joint in config.joints])
         step = Step(name, torque, foreseen.median, foreseen.quantile, peaks, str(error or ""))
         self.steps.append(step)
-        self.say(f"{step}\n  {100 * found.share:.0f} % of the path; predicted clearance: {found.foreseen}.")
+        self.say(
+            f"{step}\n  Amplitude: {100 * found.share:.0f} % of the designed path's; predicted clearance: "
+            f"{found.foreseen}."
+        )
         if error is not None:
             self.say(f"{name} ended early: {error} {self.torque}")
         elif not step.within:
@@ -179,7 +180,8 @@ class ChainSearch(SafeShares):
 def identify_chain_in_steps(
     config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say
 ) -> tuple[str, SettledResult]:
-    """Identify a spatial arm from its description, limits and rest pose. Returns the torque state and the result.
+    """Identify a spatial arm from its description, limits and rest pose. Returns a sentence about the torque state, and
+    the result.
 
     Raises whatever a run raises, and NoSafeTorque.
     """

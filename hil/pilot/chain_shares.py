@@ -50,10 +50,10 @@ STOPPED_SHARE = 0.5
 """Effort of simulating a stop, relative to the effort of simulating one arm on a path and its transitions."""
 
 RAISED_RATE = 1.6
-"""Ratio of the first higher rate that is tried, for advice, to the configured one."""
+"""The first higher rate that is tried in order to advise the user, relative to the configured rate."""
 
 ROOM = 1.2
-"""Advised room beyond a limit, relative to how far the simulated arms exceed it."""
+"""Advised extension of a limit, relative to the amount by which the simulated arms exceed the limit."""
 
 SATURATED = 0.98
 LEAST_SPREAD_SHARE = 0.1
@@ -106,7 +106,7 @@ class SafeShares:
     def safe(self, config: Config, shares: tuple[float, ...], most: float = np.inf) -> Found:
         """Find the first of the `shares` of the designed path that is safe for all simulated arms.
 
-        most: largest share, to which `shares` are scaled; on other paths, it is the share with the same amplitude.
+        most: largest share, to which `shares` are scaled; on other paths, the share that gives the same amplitude.
 
         If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
         kept. If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.
@@ -123,8 +123,8 @@ class SafeShares:
             if times is None:
                 break
             self.say(
-                f"No amplitude of the designed path is safe for all arms: {why}. Trying another path, {number + 1} of "
-                f"{OTHER_SEEDS}."
+                f"No amplitude of the designed path is safe for all arms: {why}. Trying another path ({number + 1} of "
+                f"{OTHER_SEEDS})."
             )
             most = most / times
             found, other_why = self._safe_of_these(config, shares, most)
@@ -133,7 +133,7 @@ class SafeShares:
             self.given, self.paths, self.cap, self.last = first
             raise NoSafeTorque(
                 f"{config.path}: no motion is safe for all arms consistent with what is known, not even "
-                f"{100 * shares[-1]:.0f} % of the designed path: {why}."
+                f"the designed path at {100 * shares[-1]:.0f} % of its amplitude: {why}."
                 f"{self._ended_early()}{self._helped_by_rate(config, shares)}"
             )
         return found
@@ -324,7 +324,7 @@ def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
         )
     torque = QUANTITIES.index("torque")
     if peaks.quantile[torque, at] > SATURATED * peaks.limits[torque, at]:
-        helps.append(f"a larger {joint.goal_limit_name} of {joint.name!r}, since some arms need all of it")
+        helps.append(f"a larger {joint.goal_limit_name} of {joint.name!r}, since some simulated arms need all of it")
     if has_room:
         spread = _spread(config)
         helps.append(

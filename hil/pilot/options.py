@@ -30,8 +30,8 @@ class PilotOptions:
     """Maximum number of settling periods of a pilot or an intermediate run."""
 
     first_torque_share: float = 0.02
-    """Torque of the first pilot, relative to the torque that the current limits allow, if no torque is safe in the
-    whole range.
+    """Torque of the first pilot, relative to the torque that the current limits allow, if no torque is safe over the
+    whole range of motion.
     """
     breakaway_raise: float = 1.6
     """Ratio of successive peak torques of a joint that has not moved yet."""
@@ -43,9 +43,9 @@ class PilotOptions:
     at_limit: float = 0.99
     """Fraction of a torque limit above which the limit counts as reached."""
     torque_after_limit: float = 0.85
-    """Cap on further torque, relative to the torque at which a limit was exceeded."""
+    """Cap on the torque of later runs, relative to the torque at which a limit was exceeded."""
     torque_after_unsettled: float = 0.85
-    """Cap on further torque after a run that never settled, relative to that run's torque. A large motion with little
+    """Cap on the torque of runs after one that never settled, relative to that run's torque. A large motion with little
     friction may never settle.
     """
     torque_over_friction: float = 1.8
@@ -62,7 +62,7 @@ class PilotOptions:
     wide_range: float = 0.74
     """Other waves are tried if a joint uses less than this fraction of its position range."""
     other_waves: int = 7
-    """Maximum number of other waves: either sign of each joint, and all of these reversed in time."""
+    """Maximum number of other waves, which differ in the sign of each joint and in the direction of time."""
 
     falling_raise: float = 1.35
     """Maximum ratio of the torques of successive runs of an arm that falls over when it is stopped."""
@@ -72,8 +72,7 @@ class PilotOptions:
     falling_share: float = 0.85
     """Fraction of the limits that runs may use on an arm that falls over when it is stopped."""
     min_falling_torque: float = 0.05
-    """Torque that an arm that falls over may receive in any case, as a fraction of the torque that the current limit
-    allows.
+    """Torque that is always allowed for an arm that falls over, as a fraction of what the current limit allows.
     """
     start_inside: float = 0.95
     """An arm that a stopped run left beyond its limits is assumed to start within this fraction of them."""

@@ -21,6 +21,6 @@ def punctual(play: Callable[[], str], config: Config, folder: RunFolder, name: s
             if stopped.cause is not Cause.LATE:
                 raise
             torque = " ".join(getattr(stopped, "__notes__", []))
-            say(f"{name} ended early: {stopped} {torque}\nRepeating it, {number} of at most {MOST_REPEATS} times.")
+            say(f"{name} ended early: {stopped} {torque}\nRepeating it (repeat {number} of at most {MOST_REPEATS}).")
             folder.set_aside(f"late-{number}", config)
     return play()

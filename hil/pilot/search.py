@@ -307,7 +307,7 @@ class Search:
         return self.player.play(config if self.pose is None else _from_anywhere(config), folder, name, found, arms)
 
     def waves(self, config: Config) -> Plan:
-        """Waves for the full run of the arm according to the current belief."""
+        """Design the waves of the full run for the arm as currently believed."""
         arm = Physics.of(self.belief.middle)
         if config.experiment.design == "optimal":
             return designed_plan(config, arm, [name for name in self.belief.names if _is_base(name)])
@@ -340,7 +340,7 @@ class Search:
             f"{_and(_names(self.config, fast))} exceeded the velocity limit while breaking away, before moving far "
             f"enough to be measured ({said}). More torque would only increase the speed: raise velocity_limit."
             + (
-                f" {_and(_names(self.config, held))} did not move even with all the allowed torque."
+                f" {_and(_names(self.config, held))} did not move even at the maximum allowed torque."
                 if held.any()
                 else ""
             )

@@ -36,9 +36,9 @@ _BESIDE = 2
 class Step:
     """One intermediate run.
 
-    name: name shown to the user. peak_torque: peak torques (joints,) [N m]. median, quantile: predicted median and 99 %
-    peaks; seen: measured peaks, each (quantities, joints) in the order of hil.dry_run.prediction.QUANTITIES. ended: why
-    the run ended early; empty if it did not.
+    name: name shown to the user. peak_torque: peak torques (joints,) [N m]. median, quantile: predicted peaks, as the
+    median and the 99 % quantile of the simulated arms; seen: measured peaks, each (quantities, joints) in the order of
+    hil.dry_run.prediction.QUANTITIES. ended: why the run ended early; empty if it did not.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Step:
 
     @property
     def within(self) -> bool:
-        """Whether all measured peaks that have a limit stayed within the predicted 99 %."""
+        """Whether all measured peaks that have a limit stayed within those predicted for 99 % of the arms."""
         low, high, velocity = self.seen[:GUARDED]
         bounds = self.quantile
         return bool((low >= bounds[0]).all() and (high <= bounds[1]).all() and (velocity <= bounds[2]).all())
@@ -158,8 +158,8 @@ def tells_of_the_arm(error: ExperimentError) -> bool:
     """Whether the error is informative about the arm, so that another run may follow: limit, no motion, no steady
     motion, a period that differs from the one before.
 
-    Errors caused by another program or by goals changed on the way are not informative: a further run with less torque
-    or speed would only hide their cause.
+    Errors caused by another program, or by goals that were altered before they reached the servos, are not informative:
+    a further run with less torque or speed would only hide their cause.
     """
     if isinstance(error, SafetyStop):
         return not error.overruled and (error.cause in _AT_A_LIMIT or error.cause is Cause.UNLIKE_BEFORE)

@@ -37,7 +37,7 @@ Some increase is normal: gravity and the other joint's brake act on the joint.
 """
 
 NOTICED_AFTER = 2
-"""Samples for which a brake of the wrong sign acts before it is noticed: one sample, and one in progress."""
+"""Number of samples for which a brake of the wrong sign acts before this is noticed: one, plus the one in progress."""
 
 
 def may_brake(config: Config, error: BaseException) -> bool:
@@ -78,8 +78,8 @@ class Brake:
         self._first: tuple[list[float], list[float]] | None = None
 
     def goals(self, state: State) -> list[float] | None:
-        """Goal currents [A] for this sample; None if braking is over: arm at rest, reply missing, or a joint
-        accelerates.
+        """Goal currents [A] for this sample; None if braking is over: the arm is at rest, a reply is missing, or a
+        joint accelerates.
         """
         velocities = self._recent.believed(state)
         speeds = [abs(velocity) for velocity in state.velocity]

@@ -67,7 +67,7 @@ def plan_of(config: Config) -> Plan:
 
 
 def missing_path(config: Config) -> str:
-    """Say that a spatial arm without a pilot lacks its path; "" if it does not."""
+    """Message that a spatial arm without a pilot lacks its path; "" if nothing is missing."""
     if config.joint_path is not None:
         return ""
     return (
@@ -141,7 +141,7 @@ def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array |
 
 
 def check_rest_pose(config: Config) -> None:
-    """Raise ConfigError if parts of the arm would be inside each other, the floor or a box in its rest pose."""
+    """Raise ConfigError if, in the rest pose, parts of the arm would be inside each other, the floor or a box."""
     if wrong := Space.of(config).wrong_rest_pose():
         raise ConfigError(f"{config.path}: {wrong}.")
 
@@ -159,7 +159,7 @@ def check_clearance(config: Config, plan: Plan) -> None:
             if nearest.room < 0.0:
                 raise ConfigError(
                     f"{config.path}: the path has too little clearance: {nearest}, at least "
-                    f"{1e3 * nearest.needed:.0f} mm are required. Move joint_path.centre, "
+                    f"{1e3 * nearest.needed:.0f} mm is required. Move joint_path.centre, "
                     "lower joint_path.swing, or correct [clearance] and the URDF's collision geometry; "
                     "`hil dry-run` shows where."
                 )

@@ -1,4 +1,4 @@
-"""How fast each joint can be turning, judged by the change of its position: no brake may rely on a reported velocity
+"""How fast each joint can be turning, judged from the change of its position: no brake may rely on a reported velocity
 alone.
 
 A servo can report a false velocity in an intact reply. A brake that trusted it would drive the joint. Therefore the
@@ -102,7 +102,9 @@ class RecentMotion:
         return abs(velocity) > self._fastest[joint]
 
     def travels(self, joint: int) -> list[Travel]:
-        """The changes of a joint's position over the short and the long span; none if it has been seen only once."""
+        """The changes of a joint's position over the short and the long span; none if the joint has been seen only
+        once.
+        """
         states = [state for state in self._states if not isnan(state.position[joint])]
         if len(states) < 2 or isnan(self._states[-1].position[joint]):
             return []

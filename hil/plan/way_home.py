@@ -22,8 +22,8 @@ PULL_PER_S, PULL_SHARE = 2.0, 0.25
 """Growth of an additional torque towards the path, relative to the spring's torque [1/s], and its largest value,
 relative to the joint's largest torque.
 
-At a low rate the spring must be soft to be stable. It alone is then too weak for the friction of a light joint, which
-would stop tenths of a radian from the rest pose.
+At a low rate the spring must be soft to be stable. On its own, it is then too weak for the friction of a light joint,
+which would stop tenths of a radian from the rest pose.
 """
 
 LOOKED_AT = 25  # poses of a straight line that are checked

@@ -48,7 +48,7 @@ def read_csv_table(path: Path) -> Table:
 def _text(path: Path) -> str:
     try:
         if path.stat().st_size > MOST_CSV_BYTES:
-            raise CsvError(f"{path} is larger than {MOST_CSV_BYTES // 2**20} MB, the most that is read. Split it.")
+            raise CsvError(f"{path} is larger than {MOST_CSV_BYTES // 2**20} MB, the most that can be read. Split it.")
         data = path.read_bytes()
     except OSError as error:
         raise CsvError(f"{path} cannot be read: {error.strerror}.") from error

@@ -40,7 +40,7 @@ def _in_space(found: ChainDryRun) -> SpatialMotion | None:
     closest = int(np.argmin(found.foreseen.rooms[: len(motions)]))
     said = (
         f"The simulated arm with the least clearance, out of {len(motions)}. It moves from the rest pose to the path, "
-        "twice along it, and back."
+        "follows it twice, and returns."
     )
     ways = found.foreseen.ways
     return spatial_motion(found.config, np.nan_to_num(motions[closest]), found.prediction.rate, said, (ways, ways))

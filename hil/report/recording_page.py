@@ -108,7 +108,7 @@ def _next(shown: _Shown) -> Section:
     commands = (
         ("the arm for MuJoCo, or as URDF", f"hil export {folder} --format mjcf --format urdf"),
         ("compare with another recording", f"hil diff {folder} OTHER_RUN"),
-        ("estimate again, after a change of config.toml", f"hil estimate {folder}"),
+        ("estimate again after changing config.toml", f"hil estimate {folder}"),
     )
     return Section("next", "What next", tables=(Table(("", ""), commands, 2),))
 

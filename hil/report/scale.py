@@ -28,7 +28,7 @@ class Scale:
 
     @property
     def ticks(self) -> list[float]:
-        """Round values between low and high."""
+        """Tick values: round numbers between low and high."""
         low, high = self._ends
         if self.log:
             return [10.0**power for power in range(math.ceil(low - 1e-9), math.floor(high + 1e-9) + 1)]

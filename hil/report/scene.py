@@ -19,7 +19,7 @@ MOST_FRAMES = 600
 FEW_POSES = 60
 """Number of poses that determine the size of the picture."""
 MOST_SHOWN_M = 1.0
-"""Clearances above this are shown as this [m]."""
+"""Larger clearances are shown as this value [m]."""
 
 
 def planar_motion(config: Config, position: Array, rate: float, caption: str) -> Motion:

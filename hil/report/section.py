@@ -31,7 +31,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Folded:
-    """Long text that is shown on a click."""
+    """Long text that is shown only after a click."""
 
     title: str
     text: str

@@ -110,7 +110,7 @@ class Confounded:
 
 @dataclass(frozen=True)
 class Levels:
-    """RMS of all lines together in encoder steps, per joint."""
+    """RMS of all spectral lines together, per joint, in encoder steps."""
 
     excited_lines: PerJoint
     distortion: PerJoint
@@ -121,7 +121,7 @@ class Levels:
 
 @dataclass(frozen=True)
 class LineGroup:
-    """Lines of one kind: their number, and the RMS motion and residual of one line in encoder steps, per joint."""
+    """Spectral lines of one kind: their number, and RMS motion and residual of one line per joint, in encoder steps."""
 
     lines: int
     motion: PerJoint
@@ -130,7 +130,7 @@ class LineGroup:
 
 @dataclass(frozen=True)
 class LineLevels:
-    """RMS of one line in encoder steps, by kind of line; None for kinds that the multisine does not have."""
+    """RMS of one spectral line in encoder steps, by kind of line; None for kinds that the multisine does not have."""
 
     noise: PerJoint
     excited: LineGroup | None = None
@@ -150,10 +150,11 @@ class Validation:
     """How well the model predicts, per joint; None if that was not checked.
 
     held_out_rms: open-loop prediction error of a held-out multisine, encoder noise included, relative to the motion's
-    RMS (the verdict excludes the noise); if friction has changed since the fitted multisine, it is scaled by one factor
-    per joint, which is estimated from the held-out motion itself. held_out_as_fitted_rms: the same with friction as it
-    was in the fitted multisine; None if it has not changed. free_run_rms: the same for the fitted multisine.
-    residual_over_floor: residual relative to the measured noise, which is at least that of rounding. correlated_lags:
+    RMS (the verdict excludes the noise); if friction has changed since the fitted multisine, the model's friction is
+    scaled by one factor per joint, estimated from the held-out motion itself. held_out_as_fitted_rms: the same with
+    friction as it was in the fitted multisine; None if it has not changed. free_run_rms: open-loop prediction error of
+    the fitted multisine, likewise relative.
+    residual_over_floor: residual relative to the measured noise, which is at least the rounding noise. correlated_lags:
     fraction of the residual's autocorrelations that exceed those of white noise. condition: condition number of the
     scaled information matrix.
     """
@@ -207,7 +208,7 @@ class ModelChoice:
 
     @property
     def plainest(self) -> str:
-        """The model with the fewest parameters of those that could be judged."""
+        """The model with the fewest parameters among those that could be judged."""
         judged = [trial for trial in self.tried if trial.score is not None]
         return min(judged, key=lambda trial: trial.parameters).model if judged else self.chosen
 
@@ -224,7 +225,7 @@ class Quantiles:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamTiming:
-    """How well the stream kept its deadlines; rate_held [Hz], seconds [s].
+    """How well the stream kept its deadlines. seconds: duration [s]. rate_held: mean sample rate achieved [Hz].
 
     lateness_us: time from each deadline to its write. round_trip_us: time from the write to the last reply. drift_us:
     difference in lateness between the last and the first tenth of the writes. servo_clock_ppm: how much faster each
@@ -299,7 +300,9 @@ class PhysicalQuantity(Quantity):
 
 @dataclass(frozen=True)
 class Physical:
-    """Masses, centres of mass and inertias, using [known]. not_told_apart: groups that need another known quantity."""
+    """Masses, centres of mass and inertias, using [known]. not_told_apart: groups of quantities that cannot be
+    separated unless another one is known.
+    """
 
     quantities: Mapping[str, PhysicalQuantity]
     not_told_apart: tuple[tuple[str, ...], ...]

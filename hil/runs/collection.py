@@ -58,7 +58,7 @@ def find_runs(folder: Path) -> list[RunSummary]:
     """
     if not folder.is_dir():
         raise RunFolderError(
-            f"{folder} is not a folder. `hil identify` creates its runs in runs/ of the current folder."
+            f"{folder} is not a folder. `hil identify` creates its runs in runs/ in the current folder."
         )
     found = [summarise(path) for path in _run_folders(folder)]
     return sorted(found, key=lambda run: (run.started.timestamp() if run.started else 0.0, str(run.path)))

@@ -10,7 +10,7 @@ from hil.runs.run_folder import RunFolder
 
 MOST_WAITING = 1000
 PATIENCE_S = 0.5
-"""Time for which the end of a run, with torque off, waits for its events to be written [s]."""
+"""Longest time that a run waits at its end, with torque off, for its events to be written [s]."""
 
 LATE_NAME = "events-late.jsonl"
 
@@ -18,7 +18,7 @@ LATE_NAME = "events-late.jsonl"
 class EventLog:
     """Events of one run.
 
-    On exit it waits a moment until all events are written. Events that could not be written in time, because
+    On exit it waits briefly for all events to be written. Events that could not be written in time, because
     events.jsonl blocks, go to events-late.jsonl.
     """
 

@@ -54,7 +54,8 @@ def lost_samples(samples: NDArray[np.void], names: Sequence[str]) -> str:
     left_out = float(np.mean(~sent))
     listed = ", ".join(f"{100 * share:.1f} % of {name}" for name, share in zip(names, shares.tolist(), strict=True))
     late = (
-        f" In {100 * left_out:.1f} %, this computer was too late: close other programs, or lower experiment.rate."
+        f" Of all samples, {100 * left_out:.1f} % were not taken because this computer was too late: close other "
+        "programs, or lower experiment.rate."
         if left_out > LOST_SHARE
         else ""
     )

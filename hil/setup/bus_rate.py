@@ -18,9 +18,9 @@ from hil.setup.realtime import on_time
 CYCLES = 200
 SLOW_EVERY = 10
 USUAL = 0.9
-"""The rate is one that this fraction of the exchanges sustains; an experiment needs four fifths of them on time."""
+"""Fraction of the exchanges that are fast enough for the reported rate; an experiment needs four fifths on time."""
 PATIENCE_S = 0.05
-"""Time after which a reply counts as lost [s]; on a busy computer the kernel may deliver one 10 to 20 ms late."""
+"""Time after which a reply counts as lost [s]; on a busy computer the kernel may deliver a reply 10 to 20 ms late."""
 AGAIN_AFTER_S = 0.5
 """Time after which a rate that seems too high is measured again [s]."""
 SHARE = 0.9
@@ -108,8 +108,8 @@ def measure_modes(bus: ServoBus) -> list[ExchangeMode]:
 def choose_mode(bus: ServoBus, modes: Sequence[ExchangeMode], rates: Sequence[float]) -> tuple[ExchangeMode, float]:
     """The exchange mode to configure, and the highest of `rates` [Hz] that it sustains with a margin.
 
-    The configured mode is kept unless another one loses fewer replies or sustains a higher one of the rates. If even
-    the lowest rate is too high, it is returned.
+    The configured mode is kept unless another one loses fewer replies or sustains a higher rate. If no mode sustains
+    even the lowest of `rates`, that rate is returned.
     """
 
     def highest(mode: ExchangeMode) -> float:
@@ -132,7 +132,8 @@ def goal_register(joint: Joint) -> str:
 
 
 def goals_taken(bus: ServoBus) -> list[Joint]:
-    """The drives, one per servo, that accept goals from a Sync Write. Only with torque off. Raises DriverError.
+    """The drives, one per servo, that accept goals from a Sync Write. To be called only with torque off. Raises
+    DriverError.
 
     Each is sent a goal that differs from its present one. The goal is read back, then the previous one is restored.
     """

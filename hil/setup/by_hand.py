@@ -1,7 +1,7 @@
 """The pose read from the bus, compared with the arm's description: each joint in turn is moved by hand, torque off.
 
 An identification cannot detect wrong IDs, directions, zeros or axes: they only make the parameters of a spatial arm
-wrong. A person who moves the joints notices them at once.
+wrong. A person who moves the joints notices such errors at once.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ ReadDrives = Callable[[Joint], tuple[float, ...]]
 
 @dataclass(frozen=True)
 class Pose:
-    """Where the arm is."""
+    """A pose of the arm."""
 
     angles: tuple[float, ...]
     """Joint angles in the description's convention [rad]."""
@@ -67,7 +67,7 @@ def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
 def guided(
     config: Config, read: Read, clock: Clock, ask: Callable[[str], None], read_drives: ReadDrives
 ) -> Iterator[Moved]:
-    """Ask for each joint in turn to be moved in its positive direction, and compare.
+    """Ask for each joint in turn to be moved in its positive direction, and compare the motion with the description.
 
     read: angles of all joints [rad]. read_drives: angles of a joint according to each of its servos [rad].
     """

@@ -28,8 +28,8 @@ def _limits(config: Config, bus: ServoBus) -> list[str]:
             for name in ("Present Input Voltage", "Min Voltage Limit", "Max Voltage Limit")
         )
         parts = [
-            f"supply {supply:.1f} V of {least:.1f} to {most:.1f}",
-            f"{servo.read('Present Temperature')} of {servo.read('Temperature Limit')} degrees C",
+            f"supply {supply:.1f} V (allowed: {least:.1f} to {most:.1f} V)",
+            f"{servo.read('Present Temperature')} degrees C (limit: {servo.read('Temperature Limit')})",
             f"velocity limit {VELOCITY_UNIT * servo.read('Velocity Limit'):.1f} rad/s (not enforced in current mode)",
         ]
         if joint.mode is Mode.CURRENT:
@@ -55,6 +55,6 @@ def _timing(config: Config, bus: ServoBus) -> str:
         missing += any(state.missing)
     late, there = (float(np.quantile(values, 0.99)) for values in (lateness, round_trip))
     return (
-        f"At {rate:g} cycles per second with torque off: lateness p99 {late:.0f} us, round trip p99 {there:.0f} of "
-        f"{1e6 / rate:.0f} us, {ticks.missed} missed deadlines, {missing} lost replies."
+        f"At {rate:g} cycles per second with torque off: lateness p99 {late:.0f} us, round trip p99 {there:.0f} us "
+        f"(period: {1e6 / rate:.0f} us), {ticks.missed} missed deadlines, {missing} lost replies."
     )

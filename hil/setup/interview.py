@@ -47,7 +47,11 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
         if stance == FLAT
         else math.radians(
             _number(
-                "By how many degrees is its plane of motion tilted from the vertical", "0", (0.0, _MOST_TILT), ask, say
+                "By how many degrees is the arm's plane of motion tilted from the vertical",
+                "0",
+                (0.0, _MOST_TILT),
+                ask,
+                say,
             )
         )
     )
@@ -79,7 +83,9 @@ def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: A
     first = [servo.read("Present Position") for servo in handles]
     if stance != HANGING:
         return first
-    ask("Friction may hold it to one side: push each joint slightly to the other side, let go, and press Enter", "")
+    ask(
+        "Friction may hold the arm to one side: push each joint slightly to the other side, let go, and press Enter", ""
+    )
     second = [servo.read("Present Position") for servo in handles]
     for name, before, after in zip(names, first, second, strict=True):
         if abs(after - before) > _MOVED_TICKS:

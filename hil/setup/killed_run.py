@@ -42,7 +42,9 @@ class Left:
         others = self.others if self.changed else ""
         if not self.is_to_restore:
             return f"{title}: {others}" if others else ""
-        restored = f"an earlier run ended before it could restore its settings ({self.kept.since}); this one will."
+        restored = (
+            f"an earlier run ended before it could restore the servo's settings ({self.kept.since}); this one will."
+        )
         return f"{title}: {restored} {others[:1].upper()}{others[1:]}".rstrip()
 
     @property

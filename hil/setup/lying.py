@@ -18,10 +18,10 @@ AFTER_A_RUN = 2.0
 """Factor on the tolerance after a run: friction may hold the arm farther from its rest pose than before."""
 
 NEAR_RAD = 0.02
-"""Deviation from the rest pose that makes no difference [rad]."""
+"""Deviation up to which arm.rest_pose is used although the arm lies elsewhere [rad]."""
 
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
-"""Motion after torque off that is reported, and largest deviation from the rest pose before it [rad]."""
+"""Smallest motion after torque off that is reported, and largest deviation from the rest pose before it [rad]."""
 
 _LONGEST_SAG_S = 3.0  # wait for an arm that moves after torque off
 
@@ -37,8 +37,8 @@ def tolerance_now(config: Config) -> float:
 def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
     """Wait at most `longest` [s] for an arm that is still swinging or falling after an earlier run.
 
-    Returns a sentence about a joint that is still moving then, "" if none is. Raises BusShared if another program
-    switches torque on meanwhile.
+    Returns a sentence about a joint that is still moving after that time; "" if all are at rest. Raises BusShared if
+    another program switches torque on meanwhile.
     """
     clock = bus.port.clock
     former, end = bus.read_positions(), clock.now() + longest
@@ -58,8 +58,8 @@ def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
 
 def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float]) -> str:
     """Say how far a spatial arm that was in its rest pose (joints,) [rad] has moved since torque was cut, and which
-    rest pose to configure; "" if it stayed, was elsewhere, or its servos do not answer. Raises BusShared if another
-    program switches torque on meanwhile.
+    rest pose to configure; "" if it stayed there, had not been there, or its servos do not answer. Raises BusShared if
+    another program switches torque on meanwhile.
     """
     at, rest = np.array(before), np.array(config.arm.rest_pose)
     if not config.is_chain or not np.abs(at - rest).max() < FROM_REST_RAD:
@@ -83,7 +83,7 @@ def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float])
 
 
 def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
-    """The configuration with the measured pose (joints,) [rad] as rest pose, as far as position_limit contains it.
+    """The configuration with the measured pose (joints,) [rad], clipped to position_limit, as rest pose.
 
     It is returned unchanged if the poses hardly differ, or if the arm is so far from its rest pose that the run is
     refused.
@@ -99,7 +99,7 @@ def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
 
 
 def said_of_the_rest(config: Config, lies: Config) -> str:
-    """Say where the arm lies instead of in its rest pose."""
+    """Message that the arm does not lie in its rest pose, and where it lies."""
     each = zip(config.joints, lies.arm.rest_pose, config.arm.rest_pose, strict=True)
     away = [
         f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})"

@@ -267,7 +267,7 @@ def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, 
 
 def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     torque = servo.read("Torque Enable")
-    fix = "Another program drives it: stop that program first, or power-cycle the servo."
+    fix = "Another program is driving it: stop that program first, or power-cycle the servo."
     return _graded(torque == 0, "torque", "on" if torque else "off", fix)
 
 
@@ -392,7 +392,9 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     ticks = servo.read("Present Position")
     index = [joint.id in each.ids for each in config.joints].index(True)
     if joint.id != config.joints[index].id:
-        found = f"determined by the first servo (ID {config.joints[index].id}); only motion shows this one's direction"
+        found = (
+            f"determined by the first servo (ID {config.joints[index].id}); only motion shows this servo's direction"
+        )
         return Level.OK, "pose", found, ""
     angle = within_limits(joint.within_turn(ticks).angle(ticks), config.joints[index].position_limit)
     rest = config.arm.rest_pose[index]

@@ -1,9 +1,9 @@
 """A session with the arm's servos: their settings are saved before the first write and restored after the last.
 
-A session holds the port. A session inside another one for the same arm shares it, so that the steps of a pilot write
-each EEPROM register only once. Each register is also restored only once, when the outermost block is left for whatever
-reason. If a killed program left saved settings behind, these count as the servos' own and are restored at the end
-(`killed_run`).
+A session holds the port. A session inside another one for the same arm shares the port, so that the steps of a pilot
+write each EEPROM register only once. Each register is also restored only once, when the outermost block is left for
+whatever reason. If a killed program left saved settings behind, these count as the servos' own and are restored at the
+end (`killed_run`).
 """
 
 import re
@@ -61,7 +61,7 @@ REBOOT_S = 0.6
 
 
 _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
-"""Said if every servo has answered in the end, and nothing else is wrong."""
+"""Said if every servo has answered in the end and nothing else is wrong."""
 
 _TELLS_OF_TORQUE = re.compile("torque (off )?is", re.IGNORECASE)
 """Found in each sentence that says whether torque is off (`TorqueOff`)."""
@@ -87,9 +87,9 @@ class ServoSession:
     _delays: dict[Joint, int] = field(default_factory=dict)
     """Return Delay Time of each servo at the beginning [2 us]."""
     settings: Settings = field(default_factory=dict)
-    """What `settings_now` found at the beginning."""
+    """The servos' settings at the beginning, as read by `settings_now`."""
     lay: Lies = field(default_factory=dict)
-    """Where the servos were at the beginning."""
+    """Positions of the servos at the beginning."""
     _wanted: dict[Joint, dict[str, int]] = field(default_factory=dict)
     """Settings to restore: those saved, except for what another program changed since an earlier run was killed."""
     _left: dict[Joint, Kept] = field(default_factory=dict)
@@ -170,7 +170,7 @@ class ServoSession:
     def warn(self) -> None:
         """If the last run was stopped, announce that the arm is about to move again, and give people time to step back.
 
-        Anyone who saw it go limp may believe that the program has ended, and reach into the arm.
+        Anyone who saw it go limp may believe that the program has ended, and reach into the arm's workspace.
         """
         if not self.was_stopped:
             return
@@ -360,7 +360,7 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
     Raises ExperimentError at the end if a setting could not be restored and no other error has ended the block.
 
     A TorqueNotOff that leaves the block reports the final state: servos that answer again are read back. If torque is
-    off on all servos, the error that ended the block before is raised instead.
+    off on all servos, the error that had ended the block is raised instead.
 
     folder: run folder that receives a copy of the settings. say: receives messages for the user. Raises the same errors
     as `ServoBus.open`, and RunFolderError.
@@ -431,9 +431,10 @@ def _retract(stopped: BaseException, told: str) -> None:
 
 
 def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
-    """The exception to raise in place of `error` if torque is off on all servos by now; None if it is not. This is the
-    exception that caused torque to be cut, or an ExperimentError if only the silence of servos did. It has a note about
-    torque.
+    """The exception to raise in place of `error` if torque is off on all servos by now; None if it is not.
+
+    It is the exception that led to cutting torque. If there was none, and replies were only missing when torque was cut
+    at the end, it is an ExperimentError. A note about the torque state is attached to it.
     """
     report = bus.torque_off_report
     error.args = (str(report),)
@@ -488,6 +489,6 @@ def settings_at_start() -> Settings:
 
 
 def lay_at_start() -> Lies:
-    """Where the servos were at the beginning of this session; empty if a run may have moved the arm since."""
+    """Positions of the servos at the beginning of this session; empty if a run may have moved the arm since."""
     outer = _outermost.get()
     return {} if outer is None or outer.shared > 1 else outer.lay

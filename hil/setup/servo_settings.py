@@ -1,4 +1,6 @@
-"""Configure one servo: ID, baud rate, return delay. Every EEPROM write is confirmed first and read back afterwards."""
+"""Configure one servo: ID, baud rate, return delay. Every EEPROM write must be confirmed first, and is read back
+afterwards.
+"""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -38,7 +40,7 @@ def open_servo(port: Port, servo_id: int) -> Servo:
     servo = Servo(port, servo_id, load_control_table(model))
     if servo.read("Torque Enable"):
         raise WrongSetting(
-            f"{servo.title} has torque on, which locks its EEPROM. Stop the program that drives it, then try again."
+            f"{servo.title} has torque on, which locks its EEPROM. Stop the program that is driving it, then try again."
         )
     return servo
 

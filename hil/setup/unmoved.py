@@ -1,7 +1,7 @@
 """Check that the arm stays in the pose in which it was first read until torque is switched on.
 
-Without torque, only a hand or gravity can move it. Any other change means that its readings are no longer right: a horn
-slips, another servo answers, or another program changes Homing Offset. From then on every angle would be wrong.
+Without torque, only a hand or gravity can move it. Any other change means that its readings are no longer correct: a
+horn slips, another servo answers, or another program changes Homing Offset. From then on every angle would be wrong.
 """
 
 import math
@@ -14,7 +14,7 @@ from hil.errors import ExperimentError
 __all__ = ["MOST_RAD", "Lies", "has_stirred", "refuse_moved", "where_it_lies"]
 
 MOST_RAD = 0.05
-"""Largest motion before torque is switched on [rad]; the guard allows the same motion before the start."""
+"""Largest allowed motion before torque is switched on [rad]; the guard allows as much before the start."""
 
 STIRRED_RAD = 0.004
 """Motion that encoder noise cannot explain [rad]: the arm is not at rest."""
@@ -41,8 +41,8 @@ def refuse_moved(before: Lies, now: Lies) -> None:
             raise ExperimentError(
                 f"{drive.title} has turned by {turned:+.3f} rad since this command first read it, before torque was "
                 f"switched on; at most {MOST_RAD} is allowed. Let the arm come to rest, then start again. Check "
-                "whether a hand or a cable pushes or holds it, whether its horn slips, and whether another program "
-                "changes its settings."
+                "whether a hand or a cable is pushing or holding it, whether its horn slips, and whether another "
+                "program is changing its settings."
             )
 
 

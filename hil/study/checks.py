@@ -37,8 +37,8 @@ def check_study(study: Study, out: Path) -> int:
     free = shutil.disk_usage(_existing(out)).free
     if needed > free:
         raise ConfigError(
-            f"{study.path}: {runs} runs would write about {needed / 1e9:.3g} GB, and {out} has {free / 1e9:.3g} GB "
-            "free: set keep.run_folders = false, or name another folder with --out."
+            f"{study.path}: {runs} runs would write about {needed / 1e9:.3g} GB, but {out} has only {free / 1e9:.3g} "
+            "GB free: set keep.run_folders = false, or name another folder with --out."
         )
     return runs
 

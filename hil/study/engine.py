@@ -48,7 +48,7 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
     """Connect to a Dask cluster; scheduler: None for this machine, "tcp://HOST:PORT", or "slurm".
 
     Raises MissingExtra if Dask is not installed, and ConfigError if no scheduler answers, there is no worker, or a
-    worker has other versions of hil or of Python packages.
+    worker has different versions of hil or of Python packages.
     """
     try:
         import dask
@@ -132,7 +132,9 @@ def executor(scheduler: str | None = None, count: int | None = None) -> Iterator
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that affects the numbers, in this process, or in a worker if Dask runs it there."""
+    """Versions of everything that affects the numbers, in this process, or in a worker if Dask runs this function
+    there.
+    """
     return {"hil": __version__, **_package_versions()}
 
 

@@ -1,4 +1,4 @@
-"""Summary figures of a study: rates with confidence intervals, and quantiles of every number."""
+"""Summary figures of a study: rates with confidence intervals, and quantiles of every numeric column."""
 
 import math
 from collections import Counter

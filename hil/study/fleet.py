@@ -9,7 +9,7 @@ import pyarrow as pa
 FEWEST_ARMS = 4
 _MAD_TO_STD = 1.4826
 UNLIKE = 4.0
-"""Threshold for an outlier: robust standard deviations from the fleet's median."""
+"""Distance from the fleet's median beyond which an arm is an outlier [robust standard deviations]."""
 
 _PREFIX, _SUFFIX = "parameters.", ".value"
 _TYPE, _TRUST = "arm_type", "verdict.trust"

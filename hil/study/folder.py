@@ -1,5 +1,5 @@
-"""The folder of a study: only one process at a time works in it, and it can only be continued under the conditions of
-its start.
+"""The folder of a study: only one process at a time works in it, and it can only be continued with the inputs and
+versions it was started with.
 
 DIR/study.toml   an exact copy of the study
 DIR/about.json   number of runs, seed, versions, hashes of the arm's file and of the recordings
@@ -27,7 +27,8 @@ from hil.study.schema import Study
 def opened(study: Study, out: Path, runs: int, *, resume: bool) -> Iterator[Dataset]:
     """The dataset in `out`, new or of the same study, locked for this process.
 
-    Raises RunFolderError if it cannot be used, ConfigError if it holds another study or one started differently.
+    Raises RunFolderError if it cannot be used, ConfigError if it holds another study, or this study with other inputs
+    or versions.
     """
     copy, about = out / "study.toml", out / "about.json"
     text, now = study.path.read_bytes(), _about(study, runs)

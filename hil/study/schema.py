@@ -100,7 +100,7 @@ class StudyTable(_Table):
         if self.task in ON_ARM and self.config is None:
             raise ValueError(f'task = "{self.task}" needs config = "ARM.toml"')
         if (self.task == "estimate") != (self.recordings is not None):
-            raise ValueError('task = "estimate" needs recordings = "FOLDER"; no other task has recordings')
+            raise ValueError('task = "estimate" needs recordings = "FOLDER"; no other task takes recordings')
         if self.task == "estimate" and (self.config is not None or self.runs is not None):
             raise ValueError('task = "estimate" takes the recordings as they are: omit config and runs')
         return self
@@ -177,8 +177,8 @@ def load_study(path: Path) -> Study:
         raise ConfigError(f"{path}: path is not a known key.")
     if "study" not in values and "joints" in values:
         raise ConfigError(
-            f"{path}: it describes an arm, not a study. A study is a separate file, with a [study] table that names "
-            "the arm's: see docs/scale.md."
+            f"{path}: it describes an arm, not a study. A study is a separate file with a [study] table that names "
+            "the arm's file: see docs/scale.md."
         )
     try:
         return Study(path=path, **values)

@@ -15,7 +15,7 @@ _EVERY_S = 0.2
 
 @contextmanager
 def slurm_cluster(count: int, memory: str, environment: Mapping[str, str]) -> Iterator[Any]:
-    """A Dask cluster with `count` workers submitted.
+    """A Dask cluster whose `count` workers have been submitted to Slurm.
 
     Args:
         count: number of workers, each a job with one core.
@@ -24,7 +24,7 @@ def slurm_cluster(count: int, memory: str, environment: Mapping[str, str]) -> It
 
     Raises:
         MissingExtra: dask-jobqueue is not installed.
-        ConfigError: there is no queue here, or it rejects the jobs.
+        ConfigError: this machine cannot submit Slurm jobs, or the queue rejects them.
     """
     try:
         from dask_jobqueue import SLURMCluster

@@ -38,8 +38,8 @@ class Spec:
     """Specification of one run.
 
     toml: the arm's file with this run's values in it, or "". versions: package versions that the worker must have.
-    seconds: processor time after which the run has failed. recording: the run folder to estimate, or None. keep_in:
-    where the run folder is kept; None if it is deleted.
+    seconds: processor time after which the run counts as failed. recording: the run folder to estimate, or None.
+    keep_in: where the run folder is kept; None if it is deleted.
     """
 
     run: int
@@ -82,7 +82,9 @@ def lost_row(spec: Spec, error: BaseException | None) -> Row:
     """Return the row of a run that returned no result because every worker that attempted it died."""
     why = RuntimeError("no worker finished it") if error is None else error
     if type(error).__name__ == "KilledWorker":
-        why = MemoryError("every worker that tried it died: it needs more than engine.worker_memory_gib, or crashes")
+        why = MemoryError(
+            "every worker that attempted it died: it crashes, or needs more memory than engine.worker_memory_gib"
+        )
     return _row_of(spec) | _failure(why) | {"seconds": None, "cpu_seconds": None, "worker": None}
 
 

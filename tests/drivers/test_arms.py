@@ -245,7 +245,7 @@ def test_an_echo_and_a_lost_reply(opened: Open) -> None:
 
 def test_another_master_is_heard_before_anything_moves(opened: Open) -> None:
     joints = Joint("a", 1, XM430), Joint("b", 2, XM430)
-    with pytest.raises(BusShared, match="sends instructions to ID 2"):
+    with pytest.raises(BusShared, match="is sending instructions to ID 2"):
         opened(arm({}, {}), *joints, faults=(Fault(kind="other_master", servo=2, amount=0.02),))
 
 

@@ -59,7 +59,7 @@ def _curve(data: RunData, joint: int, name: str, speed: Array, torque: Array) ->
     )
     chart = Chart(f"friction_{joint + 1}", f"Friction of {name}", "speed [rad/s]", "friction [N m]", series)
     load = data.model.values.get(f"load_{joint + 1}")
-    more = f" It also grows with torque: {load:.3g} N m per N m, not drawn." if load else ""
+    more = f" It also grows with the motor torque, by {load:.3g} N m per N m, which is not drawn." if load else ""
     return Picture(chart, f"{name}: friction versus speed, without the constant offset.{more}")
 
 
@@ -68,7 +68,7 @@ def friction_curve(model: ArmModel, speed: Array) -> Array:
 
 
 def friction_interval(model: ArmModel, kept: Covariance, speed: Array, joint: int) -> tuple[Array, Array]:
-    """The curve's 2.5 and 97.5 percentiles under the parameters' covariance."""
+    """The curve's 2.5th and 97.5th percentiles under the parameters' covariance."""
     names = [name for name in kept.names if name.endswith(f"_{joint + 1}")]
     index = [kept.names.index(name) for name in names]
     covariance = kept.array()[np.ix_(index, index)]

@@ -9,7 +9,7 @@ from hil.report.words import number, percent
 
 
 def limits(data: RunData) -> Section:
-    """The section, always present."""
+    """Return the section, which every report has."""
     rows: list[tuple[str, ...]] = []
     for index, joint in enumerate(data.config.joints):
         position, velocity = data.samples["position"][:, index], data.samples["velocity"][:, index]
@@ -32,7 +32,7 @@ def limits(data: RunData) -> Section:
     table = Table(("joint and quantity", "most used", "limit", "share"), tuple(rows))
     words = (
         "Extremes over the whole run, ramps included, compared with the limits in the TOML file. For a position "
-        "range, 100 % means either end.",
+        "range, 100 % is reached at either end.",
     )
     return Section("limits", "Limits used", words, (table,))
 

@@ -53,7 +53,7 @@ def next_commands(data: RunData) -> Section:
             "a hundred arms drawn from the posterior",
             f"hil export {run} --format mjcf --samples 100 --out arms{length}",
         ),
-        ("estimate again, after a change of [model] in its config.toml", f"hil estimate {run}"),
+        ("estimate again after changing [model] in its config.toml", f"hil estimate {run}"),
         ("what changed compared with another run", f"hil diff OTHER_RUN {run}"),
         ("other methods on the same recording", f"hil compare {run}"),
     )

@@ -15,9 +15,9 @@ def steps(data: RunData) -> Section | None:
         return None
     outside = [step.name for step in played if not step.within_quantile]
     said = (
-        f"In {listed(outside)} a peak exceeded the dry run's 99 % prediction."
+        f"In {listed(outside)}, a peak exceeded the value that the dry run predicted for 99 % of the arms."
         if outside
-        else "Every peak with a limit stayed within the dry run's 99 % prediction."
+        else "No peak with a limit exceeded the value that the dry run predicted for 99 % of the arms."
     )
     tables = tuple(_table(step, data.config) for step in played)
     return Section("steps", "Predicted and measured peaks", (said,), tables)

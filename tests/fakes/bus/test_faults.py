@@ -362,7 +362,7 @@ def test_from_toml(tmp_path: Path) -> None:
     [
         ('kind = "gone"', "fake.faults[1].kind = 'gone'"),
         ('kind = "overload"\nat = -1.0', "fake.faults[1].at = -1.0: must be at least 0"),
-        ('kind = "overload"\nservo = 3', "overload of servo 3: the IDs are 1, 2"),
+        ('kind = "overload"\nservo = 3', "overload: no servo has the ID 3; the IDs are 1, 2"),
         ('kind = "overload"\nwhen = 3.0', "fake.faults[1].when is not a known key"),
     ],
 )

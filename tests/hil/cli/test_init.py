@@ -90,7 +90,7 @@ def test_answers_are_asked_again_until_they_make_sense(arm_file: ArmFile) -> Non
 def test_which_way_up_the_arm_is_says_rest_and_gravity(
     arm_file: ArmFile, stance: str, tilt: str, rest: float, gravity: float
 ) -> None:
-    answers = {"Is the arm hanging": stance, "By how many degrees is its plane": tilt}
+    answers = {"Is the arm hanging": stance, "By how many degrees is the arm's plane": tilt}
 
     def ask(question: str, usual: str) -> str:
         return next((given for start, given in answers.items() if question.startswith(start)), usual)
@@ -135,7 +135,7 @@ def test_friction_that_holds_the_arm_aside_is_read_from_both_sides(arm_file: Arm
     bus = port._serial.bus
 
     def ask(question: str, usual: str) -> str:
-        for start, angle in (("Let the arm hang", 0.2), ("Friction may hold it to one side", -0.1)):
+        for start, angle in (("Let the arm hang", 0.2), ("Friction may hold the arm to one side", -0.1)):
             if question.startswith(start):
                 bus.hand.move(Move(servo=2, to=angle, duration=0.1))
                 port.clock.wait_until(port.clock.now() + 0.5)

@@ -231,7 +231,9 @@ def test_where_little_of_a_path_is_safe_another_one_with_more_reserve_is_tried(
 def test_an_arm_too_heavy_for_any_path_is_refused_with_the_reason_and_what_helps() -> None:
     config = chain_config(load_config(LEG))
     search = search_of(config, heavier(ChainBelief.prior(config), 20.0), [])
-    with pytest.raises(NoSafeTorque, match=r"not even 90 % of the designed path: .*needs about.*More accurate.*larger"):
+    with pytest.raises(
+        NoSafeTorque, match=r"not even the designed path at 90 % of its amplitude: .*needs about.*More accurate.*larger"
+    ):
         search.safe(step_config(search.config), (1.0, 0.9))
 
 
@@ -248,10 +250,10 @@ def test_paths_from_other_seeds_are_tried_before_a_refusal(monkeypatch: pytest.M
 
     monkeypatch.setattr(search, "_largest", largest)
     safe = None
-    with pytest.raises(NoSafeTorque, match=r"not even 18 % of the designed path: shank hits floor\."):
+    with pytest.raises(NoSafeTorque, match=r"not even the designed path at 18 % of its amplitude: shank hits floor\."):
         search.safe(search.config, (1.0, 0.18))
     assert search.paths is first and search.given.experiment.seed == seed
-    assert [line.partition("Trying another path, ")[2] for line in said] == ["1 of 2.", "2 of 2."]
+    assert [line.partition("Trying another path ")[2] for line in said] == ["(1 of 2).", "(2 of 2)."]
     safe = seed + 200
     assert search.safe(search.config, (1.0, 0.18)).share == 1.0
     assert search.given.experiment.seed == safe and search.paths is not first

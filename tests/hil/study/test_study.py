@@ -98,7 +98,7 @@ def test_the_command_makes_rows_and_a_page(
     study_file.write_text(text.replace("runs = 4", "runs = 2"), encoding="utf-8")
     assert hil("study", study_file, "--out", "out", "--workers", "1") == 0
     said = capsys.readouterr().out
-    assert "1 of 2 runs done" in said
+    assert "1 of 2 runs succeeded" in said
     assert "1 failed: SafetyStop" in said
     page = (tmp_path / "out" / "study.html").read_text(encoding="utf-8")
     assert "SafetyStop" in page and "parameters.coulomb_1.value" in page
