@@ -134,7 +134,7 @@ class ResultError(HilError):
 
 
 class ExportError(HilError):
-    """A model cannot be written in a format. Example: no link of positive mass has these parameters."""
+    """A model cannot be written in a format. Example: no link of positive mass could have these parameters."""
 
     exit_code = 2
 

@@ -85,7 +85,7 @@ def estimate(
 
 
 def are_recordings(paths: Sequence[Path]) -> bool:
-    """Whether these are recordings made with other tools, not one run folder. Raises ValueError for a mixture."""
+    """Whether these are recordings made with other tools rather than one run folder. Raises ValueError if mixed."""
     if not paths:
         raise ValueError("no recording is given: name a run folder, or recordings (CSV, Parquet, MCAP).")
     files = [is_recording(path) for path in paths]

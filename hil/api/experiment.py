@@ -177,14 +177,14 @@ def _taking_over(config: Config) -> Config:
 
 
 def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None) -> RunFolder:
-    """The folder `out`, or a new one in runs/ named after time and arm. Raises RunFolderError."""
+    """The folder `out`, or a new one in runs/ named after the time and the arm. Raises RunFolderError."""
     path = unused_path(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}") if out is None else Path(out)
     log.info("run folder %s", path)
     return RunFolder.create(path, config)
 
 
 def unused_path(path: Path) -> Path:
-    """`path`, with a number appended if it exists: a program may start two runs within a second."""
+    """`path`, with a number appended if it already exists: a program may start two runs within a second."""
     number = 2
     tried = path
     while tried.exists():

@@ -82,7 +82,7 @@ class Space:
     at_rest: Array
     """Distance of each pair in the rest pose (pairs,) [m]."""
     is_touched: NDArray[np.bool_]
-    """For each joint (joints,): whether anything may touch the part of the arm that it moves, in the rest pose."""
+    """Whether anything may touch, in the rest pose, the part of the arm that each joint moves (joints,)."""
     _built: Array
     """Median distance of pairs that are near each other by design, otherwise infinite (pairs,) [m]."""
     _pairs: NDArray[np.int64]
@@ -105,7 +105,7 @@ class Space:
     def has_reserve(self, position: Array, reserve: float) -> bool:
         """Whether a motion (joints, samples) [rad] keeps `reserve` [m] more than the required distance.
 
-        Pairs that are near each other by design keep at least half of their median distance instead, if that is less.
+        For pairs that are near each other by design, half of their median distance is enough if that is less.
         """
         needed = self._needed(False)
         needed = np.minimum(needed + reserve, np.maximum(needed, 0.5 * self._built))

@@ -48,7 +48,7 @@ def list_faults() -> None:
 
 
 def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
-    """Move joints of the fake arm served at `device` whose torque is off, or release them. Raises ConfigError."""
+    """Move joints whose torque is off, or release joints, of the fake arm served at `device`. Raises ConfigError."""
     try:
         for servo in release:
             ask_hand(device, f"release {servo}")

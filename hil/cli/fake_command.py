@@ -33,7 +33,7 @@ def fake(
             help="Move this servo's joint by hand while its torque is off (or ID:ticks=POSITION); may be repeated.",
         ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of noise and faults, overriding the file's.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed for noise and faults, overriding the file's.")] = None,
     _: Annotated[
         bool,
         typer.Option("--list-faults", is_eager=True, callback=_list_faults, help="List the fault kinds and exit."),

@@ -95,7 +95,7 @@ class ExperimentConfig(Table):
 
 
 class PathConfig(Table):
-    """`[joint_path]`: the path that excites a spatial arm. The upper end of the band is its highest frequency."""
+    """`[joint_path]`: the path that excites a spatial arm. The upper end of experiment.band limits its frequency."""
 
     centre: list[Angle] = Field(description="rad per joint: centre of the path")
     swing: list[Annotated[float, Field(gt=0, le=4 * math.pi)]] = Field(

@@ -58,7 +58,7 @@ LYING_RAD = 0.25
 """Largest deviation from the rest pose at the start of a spatial arm, unless arm.rest_tolerance is given [rad]."""
 
 SLOW_INTERVAL_S = 0.25
-"""Interval between slow reads [s], which alternate between the servos' clocks and voltage and temperature."""
+"""Interval between slow reads [s]: in turn, the servos' clocks, and their voltages and temperatures."""
 
 
 class PortConfig(Table):
@@ -122,7 +122,7 @@ class SafetyConfig(Table):
     allow_no_watchdog: bool = Field(
         False, description="accept firmware without a Bus Watchdog: if packets cease, nothing then stops the servo"
     )
-    write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
+    write_current_limit: bool = Field(True, description="lower each servo's Current Limit for the run, then restore it")
     missing_time: PositiveFloat = Field(0.015, le=2, description="s, time for which a servo may fail to reply")
     late_time: PositiveFloat = Field(0.05, le=2, description="s, time for which deadlines may be missed")
     max_missing: int | None = Field(
@@ -132,7 +132,7 @@ class SafetyConfig(Table):
     rest_time: float = Field(3.0, gt=0, le=60, description="s, time allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, le=2, description="rad/s, speed below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, le=1e4, description="A/s (V/s in PWM mode): maximum rate of change of goals")
-    max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C, highest inside a servo")
+    max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C, highest allowed inside a servo")
     min_voltage: float = Field(0.0, ge=0, le=60, description="V; default: the models' factory shutdown thresholds")
     max_voltage: PositiveFloat = Field(30.0, le=60, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s, time for which a current may deviate from its goal")

@@ -161,8 +161,8 @@ class _Tree:
         for name, body, before in zip(names, moved, [WORLD, *moved], strict=False):
             if body not in way:
                 raise ArmFileError(
-                    f'{self.path}: joint "{name}" does not lie between base and "{names[-1]}": the joints must form '
-                    "one branch, from the base outwards"
+                    f'{self.path}: joint "{name}" does not lie between the base and "{names[-1]}": the joints must '
+                    "form one branch, from the base outwards"
                 )
             between = [other for other in self._way(body) if other not in self._way(before) and other != body]
             loose = [other for other in between if self.model.body_jntnum[other]]

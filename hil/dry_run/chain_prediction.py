@@ -26,7 +26,7 @@ LOOKED_AT_HZ = 100.0
 """Rate at which the clearance of a motion is computed [Hz]."""
 
 RAN_AWAY = 1e3
-"""Peak of an arm whose simulation diverges, as a multiple of the limit."""
+"""Peak assigned to an arm whose simulation diverges, as a multiple of the limit."""
 
 
 @dataclass(frozen=True)

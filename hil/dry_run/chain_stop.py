@@ -26,7 +26,7 @@ MOMENTS, ARMS = 16, 6
 FALL_S = 1.5
 SATURATED = 0.98
 LAID_DOWN = 0.95
-"""Share of the simulated stops that must end in the rest pose."""
+"""Fraction of the simulated stops that must end in the rest pose."""
 
 
 @dataclass(frozen=True)

@@ -47,8 +47,8 @@ class Prediction:
     same as fractions of the distance from rest to the limit. limits: limits (quantities, joints). settled_after: number
     of periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over time
     of a few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: samples per
-    second [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at the farther one
-    of rest and centre.
+    second [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at
+    rest or centre, whichever is farther.
     """
 
     values: Array
@@ -79,7 +79,7 @@ class Prediction:
 
     @property
     def stop_chance(self) -> float:
-        """Probability that the guard stops the run: the larger of the observed fraction and the tail estimate."""
+        """Probability that the guard stops the run: the fraction of simulated arms or the tail estimate, if larger."""
         counted = float(np.mean((self.shares[:, :GUARDED] >= 1).any(axis=(1, 2))))
         return max(counted, min(1.0, float(self.limit_chance[:GUARDED].sum())))
 

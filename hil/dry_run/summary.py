@@ -41,7 +41,7 @@ class DryRun:
 
     source: "prior" or "result". arms: number of simulated arms. asked: prediction for the configured
     experiment.peak_torque, None if not configured. largest: the largest safe torque with its prediction; None if no
-    torque is safe for all arms, so that only a pilot can find it. servos: messages from reading the servos. first: the
+    torque is safe for all arms, so that only a pilot can find one. servos: messages from reading the servos. first: the
     first run of the pilot, None if the torque is configured.
     """
 
@@ -224,7 +224,7 @@ def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> 
         ]
     return [
         *lines,
-        f"SAFE: {starts}{closer}: probability of a guard stop: {chance}. The pilot then raises the torque from run to "
+        f"SAFE: {starts}{closer}. Probability of a guard stop: {chance}. The pilot then raises the torque from run to "
         "run.",
     ]
 

@@ -40,7 +40,7 @@ class Driven(Protocol):
 
 
 def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity]) -> str:
-    """Sentences on how the values depend on the torque constants and how well these are known.
+    """Sentences about how the values depend on the torque constants and how well these are known.
 
     extra: the result's terms besides the base parameters. If they include the ratios of the torque constants, only the
     first constant remains uncertain.
@@ -94,7 +94,7 @@ def contradictions(
     constants.
 
     joints: names. extra: terms of a result that include the ratios, if there are any. ratio_std: relative standard
-    deviation of the ratio of the torque constants, by parameter, where given; otherwise it is that among servos of one
+    deviation of the ratio of the torque constants, by parameter, where given; otherwise the spread among servos of one
     model. known: contradictions that have sentences of their own.
     """
     said = {each.name for each in known}

@@ -40,8 +40,8 @@ UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "ca
 @dataclass(frozen=True)
 class ChainEstimated:
     """An estimate from recordings. result: complete except for what the caller adds. predicted: positions per recording
-    (joints, samples) [rad]; NaN: no
-    prediction.
+    (joints, samples) [rad]; NaN if there
+    is none.
     """
 
     result: ShootingResult
