@@ -77,7 +77,7 @@ class ExperimentConfig(Table):
 
     @property
     def drift_within(self) -> float:
-        """Limit on the difference between periods for a motion that still drifts slowly after max_settling_periods.
+        """Limit on the difference between periods for motion that is still drifting slowly after max_settling_periods.
 
         Relative to the motion's RMS, like settle_within. Warming grease, for example, makes the motion drift.
         """

@@ -120,7 +120,7 @@ class Guard:
         return self._commands.clamp(goals)
 
     def holding(self, goals: Sequence[float]) -> None:
-        """The goals that the servos have now [A or V]: `clamp` continues from these."""
+        """Set the goals that the servos have now [A or V], from which `clamp` continues."""
         self._commands.holding(goals)
 
     def woke_up(self, now: float, late: float) -> None:
@@ -240,7 +240,7 @@ class Guard:
                 self._stop(
                     index,
                     Cause.EARLY_MOTION,
-                    f"moves before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
+                    f"moved before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
                     f"is allowed. {self._still_swings()} Otherwise check whether a hand or a cable pushes or holds it, "
                     "or whether its horn slips.",
                 )
@@ -248,9 +248,9 @@ class Guard:
     def _still_swings(self) -> str:
         """What to do where the arm has not come to rest."""
         if not self._left_by_a_run:
-            return "If it still swings, as an arm with little friction does, wait until it is at rest."
+            return "If it is still swinging, as an arm with little friction does, wait until it is at rest."
         longer = f"raise safety.rest_time ({self._safety.rest_time:g} s)"
-        return f"If it still swings after the run before, as an arm with little friction does, {longer}."
+        return f"If it is still swinging after the previous run, as an arm with little friction does, {longer}."
 
     def does_not_repeat(self, index: int, position: float) -> NoReturn:
         """Raise SafetyStop for a joint that is at `position` [rad], not where it was one period ago."""
@@ -259,7 +259,7 @@ class Guard:
             Cause.UNLIKE_BEFORE,
             f"does not repeat its motion: under the same torque it is at {position:.3f} rad, far from where it was one "
             "period ago. Something pushes or holds it, its load has changed, it slips, or its encoder has failed. If "
-            f"none applies, it swings so far that its motion never repeats.{self._lower_torque}",
+            f"none of these applies, it swings so far that its motion never repeats.{self._lower_torque}",
         )
 
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
@@ -322,7 +322,7 @@ class Guard:
         self._stop(
             index,
             Cause.VELOCITY,
-            f"moves at {state.velocity[index]:.2f} rad/s, more than its velocity limit of "
+            f"is moving at {state.velocity[index]:.2f} rad/s, more than its velocity limit of "
             f"{self._joints[index]['fastest']:g} rad/s.{self._lower_torque}",
         )
 
@@ -427,8 +427,8 @@ class Guard:
         self._stop(
             index,
             Cause.WRONG_SIGN,
-            f"moves against its command: its motor has taken {self._joints[index]['found']:.2f} J out of the arm, more "
-            "than friction can account for. Is its direction reversed, or does something else drive the arm?",
+            f"is moving against its command: its motor has taken {self._joints[index]['found']:.2f} J out of the arm, "
+            "more than friction can account for. Is its direction reversed, or does something else drive the arm?",
         )
 
     def _look_slow(self, slow: Slow) -> None:

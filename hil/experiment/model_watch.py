@@ -34,7 +34,7 @@ _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupli
 _RELATIVE_STD = 0.1
 _FRICTIONS, _FRICTIONS_UNDESCRIBED = 8.0, 3.0
 """Lower bounds on the torque scale, in multiples of the mean dry friction: up to twice that friction must not raise an
-alarm. Without a description, friction is that of typical servos; the bound then only concerns arms whose planned torque
+alarm. Without a description, friction is that of typical servos; the bound then matters only if the planned torque
 hardly exceeds it.
 """
 _TILT_SHARE = 0.2  # standard deviation of gravity perpendicular to the assumed direction, relative to gravity

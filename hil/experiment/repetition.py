@@ -27,7 +27,9 @@ FLOOR_RAD = 0.05
 
 LASTING_S = 0.03
 UNJUDGED_S, _MOST_UNJUDGED = 0.2, 0.25
-"""Time at the end of a period that does not affect the tolerance in the next one [s], and its largest share."""
+"""Time at the end of a period that does not affect the tolerance in the next one [s], and the largest fraction of a
+period that this may be.
+"""
 
 _FEWEST = 2  # samples, however low the rate
 

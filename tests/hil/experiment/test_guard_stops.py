@@ -291,7 +291,7 @@ def test_an_arm_that_is_elsewhere_once_torque_is_on_has_moved_before_the_start(
     monkeypatch.setattr(ServoBus, "_torque_on", shift)
     held = (("[experiment]\n", "[stabiliser]\nstiffness = [0.5, 0.2]\ndamping = [0.05, 0.02]\n\n[experiment]\n"),)
     stop, samples = run_until_stopped(arm(*(held if holds else ())), tmp_path / "run", lambda _: None, plan)
-    assert stop.cause is Cause.EARLY_MOTION and "'elbow'" in str(stop) and "moves before the start: +0.09" in str(stop)
+    assert stop.cause is Cause.EARLY_MOTION and "'elbow'" in str(stop) and "moved before the start: +0.09" in str(stop)
     assert len(samples) <= 2 and not samples["goal_current"].any()
     assert_stopped(ports[0])
 
