@@ -76,7 +76,7 @@ def calibrate(
     from hil.runs.run_folder import RunFolder
 
     if without.resolve() == with_mass.resolve():
-        raise typer.BadParameter(f"{without} is given twice: one run without the mass, one with it.")
+        raise typer.BadParameter(f"{without} is given twice: give one run without the mass and one with it.")
     runs = RunFolder.open(without), RunFolder.open(with_mass)
     with Terminal(quiet=json_only).busy("Calibrating"):
         result = calibrate_runs(*runs, AddedMass(mass, inertia, distance, length, at, joint))

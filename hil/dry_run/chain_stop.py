@@ -1,7 +1,7 @@
 """Simulated stops of a spatial arm, which is lowered if its servos still accept commands, and falls if they do not.
 
 Stops begin at times spread over the planned path, on arms of the ensemble. For each one, the path home is simulated as
-the stream would command it, and the fall without torque until the first collision.
+the stream would command it, and so is the fall without torque, up to the first collision.
 """
 
 from collections.abc import Callable
@@ -98,7 +98,7 @@ def foreseen_stops(
 ) -> ChainStops:
     """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError.
 
-    tell: called with the number of simulations done and their total. passed: as in `resting_stops`.
+    tell: called with the number of simulations done and the total number. passed: as in `resting_stops`.
     """
     segment = plan.segments[0]
     assert isinstance(segment, PathSegment)
