@@ -49,13 +49,13 @@ def calibrate(
     mass: Annotated[float, typer.Option("--mass", min=1e-6, metavar="KG", help="Mass bolted to the last link.")],
     distance: Annotated[
         float | None,
-        typer.Option("--distance", min=1e-6, metavar="M", help="Distance of its centre of mass from the last joint."),
+        typer.Option("--distance", min=1e-6, metavar="M", help="Distance of the mass's centre from the last joint."),
     ] = None,
     length: Annotated[
         float | None, typer.Option("--length", min=1e-6, metavar="M", help="Length of link 1; default: known.length_1.")
     ] = None,
     inertia: Annotated[
-        float, typer.Option("--inertia", min=0.0, metavar="KG_M2", help="Inertia about its own centre of mass.")
+        float, typer.Option("--inertia", min=0.0, metavar="KG_M2", help="Inertia of the mass about its own centre.")
     ] = 0.0,
     at: Annotated[
         tuple[float, float, float] | None,

@@ -117,7 +117,7 @@ def estimate(
     all_samples: AllSamples = False,
     json_only: Json = False,
 ) -> None:
-    """Estimate from a run's recording, or from recordings from other tools; write result.json and the report."""
+    """Estimate from a run's recording, or from recordings made with other tools; write result.json and the report."""
     from hil.api.estimate import are_recordings
     from hil.api.estimate import estimate as estimate_arm
     from hil.cli.terminal import Terminal

@@ -28,7 +28,7 @@ def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
     """Read the arm formed by these joints, from the base outwards; by default, by all hinges. The base is MuJoCo's
     world.
 
-    Raises ArmFileError as `hil.description.urdf.read_urdf` does, and if MuJoCo is not installed.
+    Raises ArmFileError for the same reasons as `hil.description.urdf.read_urdf`, and if MuJoCo is not installed.
     """
     tree = _Tree(_compiled(path), path)
     names = list(joints) if joints is not None else tree.hinges

@@ -79,7 +79,7 @@ class Prediction:
 
     @property
     def stop_chance(self) -> float:
-        """Probability that the guard stops the run: the fraction of simulated arms or the tail estimate, if larger."""
+        """Probability that the guard stops the run: the fraction of arms it stops, or the tail estimate if larger."""
         counted = float(np.mean((self.shares[:, :GUARDED] >= 1).any(axis=(1, 2))))
         return max(counted, min(1.0, float(self.limit_chance[:GUARDED].sum())))
 

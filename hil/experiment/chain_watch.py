@@ -112,7 +112,7 @@ class ChainWatch:
             since = self._seen_at - WINDOW_S
             recent = [torque[joint] for at, torque in self._commanded if at.time_before_write >= since]
             said = (
-                f"{name} stands still, with {min(recent):+.3f} to {max(recent):+.3f} N m commanded in the last "
+                f"{name} is not moving, with {min(recent):+.3f} to {max(recent):+.3f} N m commanded in the last "
                 f"{WINDOW_S:g} s: any arm consistent with the prior and the data so far would move. "
                 f"{self._blocked_by[joint]}"
             )

@@ -240,7 +240,7 @@ class ModelWatch:
             recent = [torque[joint] for at, torque in self._commanded if at.time_before_write >= since]
             low, high = min(recent), max(recent)
             said = (
-                f"{name} stands still, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "
+                f"{name} is not moving, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "
                 f"arm consistent with the prior and the data so far would move. {self._blocked_by[joint]}"
             )
         else:

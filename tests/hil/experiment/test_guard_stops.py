@@ -311,7 +311,7 @@ def test_a_foreign_goal_just_before_a_stop_is_noted(
     ("happens", "said"),
     [
         (lambda ports: turn_round(ports, 0), "any arm"),
-        (lambda ports: fault(ports, FaultKind.STUCK_JOINT, servo=1), "stands still|any arm"),
+        (lambda ports: fault(ports, FaultKind.STUCK_JOINT, servo=1), "is not moving|any arm"),
     ],
 )
 def test_the_model_alone_stops_a_motor_that_does_not_do_as_told(
