@@ -21,7 +21,9 @@ def fake(
         Path, typer.Argument(metavar="ARM", help="TOML file with a [fake] table, or an arm's name (see above).")
     ],
     pty: Annotated[bool, typer.Option("--pty", help="Serve it on a pseudo-terminal until Ctrl-C or SIGTERM.")] = False,
-    link: Annotated[Path | None, typer.Option(metavar="PATH", help="Create this symbolic link to the pseudo-terminal.")] = None,
+    link: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Symbolic link to create to the pseudo-terminal.")
+    ] = None,
     fault: Annotated[
         list[str] | None,
         typer.Option(metavar="KIND[:KEY=VALUE,...]", help="Inject this fault; may be repeated. See --list-faults."),
