@@ -82,8 +82,8 @@ class Cause(Enum):
     def allows_lowering(self) -> bool:
         """Whether the servos still accept commands, so that an arm may be lowered under supervision.
 
-        Without its watchdog a servo obeys as before; if the watchdog had tripped, the loss of torque would be detected
-        during lowering.
+        A servo that has lost its watchdog still obeys; if the watchdog had tripped, the loss of torque would be
+        detected during lowering.
         """
         others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
         return self.allows_braking or self in others

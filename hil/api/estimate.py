@@ -56,7 +56,7 @@ def estimate(
         ConfigError: `config` is wrong.
         RecordingCutShort: the run holds no settled period; `all_samples` does not need one.
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
-        ValueError: run folders and other recordings together, or several run folders.
+        ValueError: run folders and other recordings are mixed, or there are several run folders.
     """
     if isinstance(recording, Run):
         paths = [recording.path]

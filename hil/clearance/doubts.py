@@ -53,8 +53,8 @@ def _same_direction(config: Config, joint: JointConfig) -> str:
     given = list(joint.directions) if isinstance(joint.turns, list) else sign
     return (
         f"direction = {given} means that IDs {first} and {second} of joint {joint.name!r} turn the same way. Servos "
-        f"that face each other turn oppositely: they need direction = [{sign}, {-sign}]; otherwise they work against "
-        f"each other. {_how_to_compare(config)}"
+        f"that face each other turn in opposite directions: they need direction = [{sign}, {-sign}]; otherwise they "
+        f"work against each other. {_how_to_compare(config)}"
     )
 
 

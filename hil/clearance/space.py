@@ -98,7 +98,7 @@ class Space:
     def room(self, position: Array, on_the_way: bool = False) -> Array:
         """Smallest excess over the required distance (samples,) [m] along a motion (joints, samples) [rad].
 
-        on_the_way: whether the motion leads from or to the rest pose, in which distances may be less than the margin.
+        on_the_way: whether the motion leads from or to the rest pose; distances may then be less than the margin.
         """
         return self._least(position, self._needed(on_the_way), on_the_way)[0]
 

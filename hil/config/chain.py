@@ -64,7 +64,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
             continue
         if max(-lower, upper) > _MOST_TURNED_RAD:
             in_rad = f"[{math.radians(lower):.3g}, {math.radians(upper):.3g}]"
-            yield f"{where}: are these degrees? Limits must be in radians, here {in_rad}."
+            yield f"{where}: are these degrees? Limits must be in radians: {in_rad}."
             continue
         low, high = joint.position_limit
         free = POSITION_RESERVE * (high - low)

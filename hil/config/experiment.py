@@ -67,7 +67,7 @@ class ExperimentConfig(Table):
                 raise ValueError(f"band = [{low}, {high}]: {rule}{self._meant(self.band)}")
         for lines in self.lines or []:
             if not lines or len(set(lines)) != len(lines) or min(lines) < 1 or max(lines) > samples / 4:
-                raise ValueError(f"lines: the harmonics in a list must be different and from 1 to {samples // 4:g}")
+                raise ValueError(f"lines: the harmonics in a list must be distinct and from 1 to {samples // 4:g}")
         return self
 
     def _meant(self, band: list[float]) -> str:

@@ -278,22 +278,22 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is spatial. Every arm with [arm] urdf is, except a planar arm without [joint_path]."""
+        """Whether the arm is spatial. An arm with [arm] urdf is spatial, except a planar arm without [joint_path]."""
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property
     def rest_tolerance(self) -> float:
         """Largest deviation from the rest pose at the start [rad]: `arm.rest_tolerance`.
 
-        The default for a spatial arm is LYING_RAD: such an arm lies on something, and friction holds it closer to its
-        rest pose than an arm that hangs.
+        The default for a spatial arm is LYING_RAD: such an arm lies on something, and comes to rest closer to its
+        rest pose than a hanging arm does.
         """
         is_given = "rest_tolerance" in self.arm.model_fields_set
         return LYING_RAD if self.is_chain and not is_given else self.arm.rest_tolerance
 
     @property
     def url(self) -> str:
-        """The port's URL; that of a fake arm is completed with the path of the file that describes it."""
+        """The port's URL; for a fake arm, completed with the path of the file that describes it."""
         return url_from(self.port.url, self.path)
 
     @property
@@ -317,7 +317,7 @@ class Config(Table):
 
 
 def load_config(path: str | PathLike[str]) -> Config:
-    """Read and check a TOML file, or the bundled one of that bare name. Raises ConfigError."""
+    """Read and check a TOML file, or the bundled one with that name. Raises ConfigError."""
     path = find_config(Path(path))
     if path.is_dir():
         within = next(iter(sorted(path.glob("*.toml"))), None)

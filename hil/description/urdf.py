@@ -84,7 +84,7 @@ def parse_urdf(path: Path) -> ET.Element:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ArmFileError(f"{path} cannot be read: it is not UTF-8 text; save it with the encoding UTF-8") from error
+        raise ArmFileError(f"{path} cannot be read: it is not UTF-8 text; save it as UTF-8") from error
     except OSError as error:
         raise ArmFileError(f"{path} cannot be read: {error.strerror or error}") from error
     if "<!DOCTYPE" in text or "<!ENTITY" in text:

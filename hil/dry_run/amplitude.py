@@ -34,9 +34,9 @@ class AmplitudeOptions:
     close: float = 0.94
     """The limits count as reached once this fraction of them is used at the required probability."""
     over: float = 0.97
-    """Fraction of the limits that the next iteration aims at if the last torque exceeded them."""
+    """Fraction of the limits that the next iteration aims for if the last torque exceeded them."""
     under: float = 0.99
-    """Fraction of the limits that the next iteration aims at if the last torque did not reach them."""
+    """Fraction of the limits that the next iteration aims for if the last torque did not reach them."""
     max_ratio: float = 2.0
     """Maximum ratio of the torques of two successive iterations."""
     damping: float = 0.85

@@ -78,7 +78,7 @@ class ChainStops:
             return (
                 f"too little clearance when a stop lowers the arm, {down.nearest}, at least "
                 f"{1e3 * down.nearest.needed:.0f} mm required. Lower safety.lower_speed, choose a rest_pose farther "
-                "from obstacles, or give the masses more accurately"
+                "from obstacles, or specify the masses more accurately"
             )
         if down.lies < LAID_DOWN:
             return (
@@ -167,7 +167,7 @@ def _helps(config: Config, at: int, longest: float, used: float, needed: float) 
         first = f"Raise its {joint.goal_limit_name}, {slower}, "
     else:  # what is left is friction, or an error of the masses, against a spring that is soft at a low rate
         first = f"Raise experiment.rate above {config.experiment.rate:g}, which makes its stabiliser stiffer, "
-    return f"{first}choose a rest_pose in which gravity loads it less, or give the masses more accurately"
+    return f"{first}choose a rest_pose in which gravity loads it less, or specify the masses more accurately"
 
 
 def _lowered(

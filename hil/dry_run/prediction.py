@@ -117,7 +117,7 @@ class Prediction:
 
 
 def quantities_of(joint: JointConfig) -> tuple[tuple[str, str], ...]:
-    """Names and units of a prediction's rows for one joint; its goal is a voltage if it is driven by PWM."""
+    """Names and units of a prediction's rows for one joint; a goal is a voltage if the joint is driven by PWM."""
     named = tuple(zip(QUANTITIES, UNITS, strict=True))
     if joint.drive_mode is not Mode.PWM:
         return named

@@ -30,7 +30,7 @@ class FirstRun:
     played: Config
 
     def is_narrowed(self, config: Config) -> bool:
-        """Whether the position limits of this run are closer than those of `config`."""
+        """Whether the position limits of this run are narrower than those of `config`."""
         pairs = zip(self.played.joints, config.joints, strict=True)
         return any(tuple(mine.position_limit) != tuple(whole.position_limit) for mine, whole in pairs)
 
@@ -215,7 +215,7 @@ def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> 
     limits = "; ".join(
         f"{joint.name} {joint.position_limit[0]:.2f} to {joint.position_limit[1]:.2f}" for joint in first.played.joints
     )
-    closer = f" and with closer position limits ({limits} rad)" if first.is_narrowed(config) else ""
+    closer = f" and with narrower position limits ({limits} rad)" if first.is_narrowed(config) else ""
     if largest is None:
         return [
             *lines,

@@ -19,8 +19,8 @@ _EVERY = 4  # evaluate every fourth sample
 
 
 def roomy_plan(config: Config, physics: Physics) -> Plan:
-    """The configured plan, with the variant of each multisine that uses most of the arm's position range. physics:
-    parameters of the arm.
+    """The configured plan, with the variant of each multisine that uses the largest part of the arm's position range.
+    physics: parameters of the arm.
 
     The phases determine how evenly an arm swings to both sides. Reversing the sign or time of a wave gives another wave
     with the same lines and peaks at no design cost.

@@ -203,7 +203,7 @@ def lost(memory: Any) -> None:
 
 
 def moved_at_standstill(states: Iterable[State], joint: int, still: float) -> str:
-    """Describe how far a joint moved while its velocity was reported to be below `still` [rad/s]; "" if it did not.
+    """Describe how far a joint moved while its velocity was reported to be below `still` [rad/s]; "" if not at all.
 
     states: the latest states, the last one first.
     """

@@ -49,7 +49,7 @@ accept its goals.
 """
 
 NONE_HEARD = "No servo was heard"
-"""Beginning of the message of a stop due to missing replies from all servos."""
+"""Beginning of the message if the arm is stopped because no servo replies."""
 
 
 class Guard:
@@ -447,8 +447,8 @@ class Guard:
                 self._stop(
                     index,
                     Cause.VOLTAGE,
-                    f"has {volt:.1f} V; safety.min_voltage and max_voltage allow {safety.min_voltage:g} to "
-                    f"{safety.max_voltage:g}. Check the supply.",
+                    f"has a supply voltage of {volt:.1f} V; safety.min_voltage and max_voltage allow "
+                    f"{safety.min_voltage:g} to {safety.max_voltage:g}. Check the supply.",
                 )
 
     def _stop(self, index: int, cause: Cause, what: str) -> NoReturn:

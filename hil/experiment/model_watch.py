@@ -241,12 +241,12 @@ class ModelWatch:
             low, high = min(recent), max(recent)
             said = (
                 f"{name} is not moving, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "
-                f"arm consistent with the prior and the data so far would move. {self._blocked_by[joint]}"
+                f"arm consistent with the prior and the data so far would be moving. {self._blocked_by[joint]}"
             )
         else:
             said = (
                 f"{name} does not move like any arm consistent with the prior and the data so far: "
-                f"{lacking:+.3f} N m of the commanded torque are not reflected in its motion. Its motor or its "
+                f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "
                 "encoder has failed, something pushes or holds it, or the arm is not the one described."
             )
         raise SafetyStop(said, Cause.UNEXPECTED)

@@ -42,7 +42,7 @@ def look(joints: Any, joint: int, goal: float, moved: float) -> float:
     """Add the work done by the previous goal; return the work taken out of the arm [J] if it is too much, otherwise -1.
 
     joints: records of all joints, with this memory in their field `work`. goal: the new goal [A or V]. moved:
-    displacement since the previous sample [rad], 0 if it is unknown what the servo did meanwhile.
+    displacement since the previous sample [rad], 0 if it is unknown what the servo did in between.
     """
     memory = joints[joint].work
     held, memory.held = memory.held, goal

@@ -68,7 +68,7 @@ def current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindin
 
 
 def settled_current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindings:
-    """Compare the currents of the periodic samples only, on which a settled estimate is based."""
+    """Like `current_findings`, but only for the periodic samples, on which a settled estimate is based."""
     return current_findings(config, samples[samples["phase"] == Phase.PERIODIC])
 
 

@@ -48,8 +48,7 @@ NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 @dataclass(frozen=True)
 class Estimated:
     """An estimate from recordings. result: complete except for what the caller adds. predicted: positions per recording
-    (joints, samples) [rad]; NaN if there
-    is none.
+    (joints, samples) [rad]; NaN if there is none.
     """
 
     result: ShootingResult
