@@ -62,10 +62,13 @@ def _how_to_compare(config: Config) -> str:
     """Say how to find out which way the two servos of a joint turn."""
     if config.arm.urdf is not None:
         guided = command("pose", config.path, "--guide")
-        return f"Only motion shows which is right: `{guided}` compares both servos while you turn the joint by hand."
+        return (
+            f"Only motion shows which direction is right: `{guided}` compares both servos while you turn the joint by "
+            "hand."
+        )
     return (
-        "Only motion shows which is right: with torque off, turn the joint by hand and compare the Present Positions "
-        "of both servos in DYNAMIXEL Wizard 2.0."
+        "Only motion shows which direction is right: with torque off, turn the joint by hand and compare the Present "
+        "Positions of both servos in DYNAMIXEL Wizard 2.0."
     )
 
 

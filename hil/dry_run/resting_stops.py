@@ -45,7 +45,7 @@ def resting_stops(config: Config, arms: ChainArms, passed: NDArray[np.bool_] | N
 
 
 def passed_rest(config: Config, position: Array) -> NDArray[np.bool_]:
-    """Whether each joint was ever below and above its rest pose (2, joints) in a recording (samples, joints) [rad]."""
+    """Whether each joint was ever below (row 0) or above (row 1) its rest pose in a recording (samples, joints) [rad]."""
     away = position - np.array(config.arm.rest_pose)
     away = np.where(np.isfinite(away), away, 0.0)
     found: NDArray[np.bool_] = np.stack((away.min(axis=0) < -PASSED_RAD, away.max(axis=0) > PASSED_RAD))

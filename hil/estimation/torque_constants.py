@@ -71,7 +71,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
     found = f"{given}. Every value scales only with the torque constant of {first.name}"
     if not first.torque_per_goal_std:
         return f"{found}, whose uncertainty is not given."
-    return f"{found}, known to {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
+    return f"{found}, known to within {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
 
 
 def ratios_of(names: Sequence[str], value: Values, std: Values) -> dict[str, Quantity]:
