@@ -103,7 +103,7 @@ def record(
 ) -> Run:
     """Run the experiment and store its recording for a later estimate: `hil record` as a function.
 
-    The arm moves. Arguments and exceptions are those of `identify`.
+    The arm moves. Arguments and exceptions are as for `identify`.
     """
     checked, shown = loaded(config)
     if take_over:

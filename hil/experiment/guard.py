@@ -97,7 +97,7 @@ class Guard:
         planned = planned or _planned(config)
         interval = 1.0 / rate if interval is None else interval
         self.recent = RecentMotion(config, interval) if recent is None else recent
-        """The latest exchanges, those of a stop included."""
+        """The latest exchanges, including those during a stop."""
         self._silence = Silence(config, interval, patience)
         self._patience = patience or float("inf")
         self._heard_instead = heard_instead

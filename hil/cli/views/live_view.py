@@ -43,7 +43,7 @@ def layout_for(columns: int, name: int) -> Layout:
 class LiveView:
     """Draws progress reports; stores values that are not in every sample: positions, temperatures and voltages.
 
-    Each run of a pilot starts over: its timing is not compared with that of the previous run.
+    Each run of a pilot starts over: its timing is not compared with the previous run's.
     """
 
     def __init__(self, config: Config, columns: int) -> None:
