@@ -46,7 +46,7 @@ def init(
     finally:
         opened.close()
     parse_config(arm_toml(answers), out)  # raises if the file would not be valid
-    with terminal.busy("Measuring the rate of the bus"):
+    with terminal.busy("Measuring what rate the bus allows"):
         found, said = measured_bus(answers, out)
     terminal.say(said)
     text = arm_toml(replace(answers, measured=found))

@@ -163,7 +163,7 @@ def chain_slips(config: "Config") -> Iterator[str]:
             "on its path. Give both, or set experiment.pilot = true, which finds them"
         )
     if config.known is not None:
-        yield "known: only for planar arms; a URDF gives its own masses"
+        yield "known: only for planar arms; a URDF already gives the masses"
     told = [option for option in _OPTIONS if getattr(config.model, option)]
     if told:
         yield f"model.{told[0]} = true: only planar arms support this term so far; remove it"

@@ -126,9 +126,11 @@ class SafetyConfig(Table):
     missing_time: PositiveFloat = Field(0.015, le=2, description="s, time for which a servo may fail to reply")
     late_time: PositiveFloat = Field(0.05, le=2, description="s, time for which deadlines may be missed")
     max_missing: int | None = Field(
-        None, ge=1, le=1000, description="allowed consecutive lost replies, instead of missing_time"
+        None, ge=1, le=1000, description="number of consecutive lost replies allowed, instead of missing_time"
     )
-    max_late: int | None = Field(None, ge=1, le=1000, description="consecutive missed deadlines, instead of late_time")
+    max_late: int | None = Field(
+        None, ge=1, le=1000, description="number of consecutive missed deadlines allowed, instead of late_time"
+    )
     rest_time: float = Field(3.0, gt=0, le=60, description="s, time allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, le=2, description="rad/s, speed below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, le=1e4, description="A/s (V/s in PWM mode): maximum rate of change of goals")

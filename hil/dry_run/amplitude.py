@@ -49,7 +49,7 @@ class AmplitudeOptions:
     polishing_ratio: float = 1.06
     """Factor by which each of the final increases raises a joint's torque."""
     back_off: float = 0.93
-    """Factor on the torque when the check on all arms has failed."""
+    """Factor applied to the torque when the check on all arms has failed."""
     torque_share: float = 0.97
     """Fraction of the current limit that may be used, since clamping would distort the designed wave."""
     initial_share: float = 0.125

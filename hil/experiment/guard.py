@@ -36,7 +36,7 @@ JUMP_FACTOR = 1.5
 """Ratio of the distance a joint may appear to move between two samples to the distance its velocity limit allows."""
 
 EARLY_MOTION_RAD = 0.05
-"""Largest motion allowed while resting before the start [rad]."""
+"""Largest motion allowed while the arm rests before the start [rad]."""
 
 BELOW_VOLTAGE = 0.9
 """If the supply cannot drive the commanded current at some speed, this fraction of that speed is proposed as a

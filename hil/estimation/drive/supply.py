@@ -21,7 +21,7 @@ from hil.estimator import linalg
 Array = NDArray[np.float64]
 
 FEWEST = 40
-"""Minimum number of readings of the voltage."""
+"""Minimum number of voltage readings."""
 STEP_V = 0.1  # of the register
 SIGNIFICANT = 6.0
 """Number of standard errors by which the drop at full load must differ from zero."""
@@ -49,7 +49,7 @@ class Sag:
         return self.worst / float(self.volts.min())
 
     def remaining(self, samples: NDArray[np.void]) -> Array:
-        """Voltage relative to that without load (samples, joints)."""
+        """Voltage relative to the voltage without load (samples, joints)."""
         goal, velocity = samples["goal_current"], np.nan_to_num(samples["velocity"])
         drop = goal**2 @ self.by_square + (goal * velocity) @ self.by_product
         return np.asarray(1.0 - np.maximum(drop, 0.0)[:, None] / self.volts)
