@@ -92,7 +92,11 @@ def stall(ports: list[Any], seconds: float) -> None:
 
 CAUSES: list[tuple[Cause, str, Callable[[list[Any]], None]]] = [
     (Cause.TEMPERATURE, r"'shoulder'.*at 50 degrees C", lambda p: setattr(p[0].bus.servos[1], "temperature_c", 50.0)),
-    (Cause.VOLTAGE, r"'elbow'.*has a supply voltage of 10\.5 V", lambda p: setattr(p[0].bus.servos[2], "input_voltage_v", 10.5)),
+    (
+        Cause.VOLTAGE,
+        r"'elbow'.*has a supply voltage of 10\.5 V",
+        lambda p: setattr(p[0].bus.servos[2], "input_voltage_v", 10.5),
+    ),
     (Cause.ALERT, r"'elbow'.*overload", lambda p: fault(p, FaultKind.OVERLOAD, servo=2)),
     (Cause.MISSING, r"'elbow'.*missed 6 replies", lambda p: fault(p, FaultKind.LOST_REPLY, servo=2, duration=0.1)),
     (Cause.LATE, r"deadlines in a row", lambda p: stall(p, 0.06)),
