@@ -5,7 +5,7 @@
     result = hil.identify("fake_two_link")
     result.parameters["inertia_1"].value
 
-Each function does the same as the command of its name. The functions are loaded on first use, so that `import hil`
+Each function does the same as the command of the same name. The functions are loaded on first use, so that `import hil`
 takes almost no time.
 """
 

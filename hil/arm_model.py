@@ -1,6 +1,6 @@
 """An identified arm as a model: inverse and forward dynamics, gravity and friction. Needs numpy only.
 
-Equations and names are those of docs/model.md. The last axis of every array is the joints; any axes may come before it,
+Equations and names are as in docs/model.md. The last axis of every array is the joints; any axes may come before it,
 so a single pose, a trajectory and a batch of trajectories are all accepted.
 """
 

@@ -82,8 +82,8 @@ class Cause(Enum):
     def allows_lowering(self) -> bool:
         """Whether the servos still accept commands, so that an arm may be lowered under supervision.
 
-        Without its watchdog a servo obeys as before; if the watchdog had tripped, the loss of torque would be detected
-        during lowering. Replies that are missing may return: the arm is driven on without them for a moment.
+        A servo that has lost its watchdog still obeys; if the watchdog had tripped, the loss of torque would be
+        detected during lowering. Missing replies may return: the arm is driven on without them for a moment.
         """
         others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
         others.add(Cause.MISSING)
@@ -135,7 +135,7 @@ class ResultError(HilError):
 
 
 class ExportError(HilError):
-    """A model cannot be written in a format. Example: no link of positive mass has these parameters."""
+    """A model cannot be written in a format. Example: no link of positive mass could have these parameters."""
 
     exit_code = 2
 

@@ -12,7 +12,7 @@ _INDENT = 2
 
 
 class ResultConsole(Console):
-    """Standard output, without rich's own colours and its own handling of a closed pipe (see `hil.cli.output`)."""
+    """Standard output, without rich's colours and its handling of a closed pipe (see `hil.cli.output`)."""
 
     def on_broken_pipe(self) -> None:
         raise BrokenPipeError

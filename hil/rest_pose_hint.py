@@ -32,7 +32,7 @@ def rest_pose_hint(position: float, rest: float, tolerance: float, zero_ticks: i
     mirrored = (
         "In a first run, check direction: with the opposite one it would be at rest. "
         if abs(-position - rest) <= tolerance
-        else "If direction or id belong to another joint, correct them first. "
+        else "If direction or id is that of another joint, correct it first. "
     )
     return (
         "Move it there by hand: friction may hold it away from rest, or it has fallen since an earlier run. If this "

@@ -43,12 +43,12 @@ def _encoding_of(path: Path, error: UnicodeDecodeError) -> str:
     """Say what a file that is not UTF-8 text is, and how to save it as UTF-8."""
     data = path.read_bytes()
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and (b"=\0" in data or b"\0=" in data):
-        return "UTF-16 text, as some Windows programs write it: save it with the encoding UTF-8"
+        return "UTF-16 text, as some Windows programs write it: save it as UTF-8"
     if b"\0" in data:
         return "not UTF-8 text but a binary file"
     number = error.object.count(b"\n", 0, error.start) + 1
     line = error.object.splitlines()[number - 1].decode("latin-1").strip()
-    return f"not UTF-8 text, from line {number} on:\n  {line}\nSave it with the encoding UTF-8"
+    return f"not UTF-8 text, from line {number} on:\n  {line}\nSave it as UTF-8"
 
 
 def _not_toml(path: Path, error: Exception, text: str) -> str:
@@ -145,9 +145,9 @@ _HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*(\]\]?)")
 _KEY = re.compile(r"^\s*([\w.\"'-]+)\s*=")
 _NUMBER = r"[-+]?\d[\d_.]*(?:[eE][-+]?\d+)?"
 _SYNTAX = (
-    (rf"{_NUMBER}\s*(?:°|º|deg)", "Angles are numbers in rad, without a sign or unit: 90 degrees are 1.5708."),
-    (rf"=\s*{_NUMBER.replace('.', '', 1)},\d+\s*$", "The decimal sign is a point, not a comma: 4.0, not 4,0."),
-    (r"[\[,]\s*[-+]?\d+,0\d", "The decimal sign is a point, not a comma: 1.06, not 1,06."),
+    (rf"{_NUMBER}\s*(?:°|º|deg)", "Angles are numbers in rad, without a sign or unit: 90 degrees is 1.5708."),
+    (rf"=\s*{_NUMBER.replace('.', '', 1)},\d+\s*$", "The decimal separator is a point, not a comma: 4.0, not 4,0."),
+    (r"[\[,]\s*[-+]?\d+,0\d", "The decimal separator is a point, not a comma: 1.06, not 1,06."),
     (r"[=\[,]\s*(?:True|False|TRUE|FALSE)\b", "Write true or false in lower case."),
     (r"[=\[,]\s*(?:yes|no|on|off|None|null|nil)\b", "Write true or false; leave out a key that has no value."),
     (rf"[=\[,]\s*{_NUMBER}\s*[%A-Za-zµμΩ]", "Write the number without its unit; each key has one fixed unit."),

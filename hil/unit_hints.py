@@ -42,8 +42,8 @@ OTHER_UNITS: dict[str, tuple[tuple[_Unit, ...], ...]] = {
     "ticks": ((("thousandths", 1e-3),),),
     FRACTION: ((("percent", 1e-2), ("per mille", 1e-3)),),
 }
-"""Units that people use for a quantity, as multiples of its unit. Only the first unit of each group that makes sense is
-proposed; the groups are different quantities (a torque in newton metres, or in kilogram-force centimetres).
+"""Units that people use for a quantity, as multiples of its unit. In each group, only the first unit that makes sense
+is proposed; the groups are different kinds of unit (for torque, newton metres and kilogram-force centimetres).
 """
 
 _LEAST = {"m/s^2": 1.5, "m": 1e-2, "samples per second": 1.0}

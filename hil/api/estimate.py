@@ -38,9 +38,9 @@ def estimate(
     Args:
         recording: a run folder or a `Run` (its result.json is rewritten), or one or more recordings of one arm made
             with other tools: CSV, Parquet or MCAP files, LeRobot datasets, ROS 2 bags.
-        config: for recordings of other tools, a TOML file whose [columns] table describes them; without it, the
+        config: for recordings from other tools, a TOML file whose [columns] table describes them; without it, the
             column names must be clear enough.
-        out: for recordings of other tools, the folder for the result, which must be new or empty; by default
+        out: for recordings from other tools, the folder for the result, which must be new or empty; by default
             runs/TIME-NAME.
         all_samples: use every sample of a run, by multiple shooting; no settled period is needed.
         executor: a concurrent.futures executor, or `hil.study.engine.executor`; with `friction = "auto"` it also starts
@@ -48,7 +48,7 @@ def estimate(
         on_progress: called with a `Progress` when a new stage begins.
 
     Returns:
-        An `Identification` from settled periods; an `Estimation` from recordings of other tools, or with `all_samples`.
+        An `Identification` from settled periods; an `Estimation` from other recordings, or with `all_samples`.
 
     Raises:
         RunFolderError: the folder holds no readable run.
@@ -56,7 +56,7 @@ def estimate(
         ConfigError: `config` is wrong.
         RecordingCutShort: the run holds no settled period; `all_samples` does not need one.
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
-        ValueError: run folders and other recordings together, or several run folders.
+        ValueError: run folders and other recordings are mixed, or there are several run folders.
     """
     if isinstance(recording, Run):
         paths = [recording.path]
@@ -85,14 +85,14 @@ def estimate(
 
 
 def are_recordings(paths: Sequence[Path]) -> bool:
-    """Whether these are recordings made with other tools, not one run folder. Raises ValueError for a mixture."""
+    """Whether these are recordings made with other tools rather than one run folder. Raises ValueError if mixed."""
     if not paths:
         raise ValueError("no recording is given: name a run folder, or recordings (CSV, Parquet, MCAP).")
     files = [is_recording(path) for path in paths]
     if any(files) and not all(files):
         raise ValueError("give either one run folder or recordings (CSV, Parquet, MCAP), not both.")
     if not any(files) and len(paths) != 1:
-        raise ValueError("give one run folder at a time; only recordings of other tools can be estimated together.")
+        raise ValueError("give one run folder at a time; only recordings from other tools can be estimated together.")
     return all(files)
 
 

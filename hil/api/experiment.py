@@ -48,8 +48,8 @@ def identify(
         out: run folder, which must be new or empty; by default runs/TIME-ARM.
         take_over: take over an arm that another program left with its torque on, and lower it slowly; support it by
             hand.
-        start_from: run folder or result.json of an earlier identification of the same arm. It replaces the prior and
-            saves runs; only with experiment.pilot. If the arm moves differently, the prior is used.
+        start_from: run folder or result.json of an earlier identification of the same arm. It replaces the prior,
+            so that fewer runs are needed; only with experiment.pilot. If the arm moves differently, the prior is used.
         on_progress: called with a `Progress` about 20 times a second while the arm moves; on a real bus, in a separate
             thread. It cannot disturb the experiment: reports that arrive too fast are dropped. If it raises, the
             exception is logged and it is not called again.
@@ -103,7 +103,7 @@ def record(
 ) -> Run:
     """Run the experiment and store its recording for a later estimate: `hil record` as a function.
 
-    The arm moves. Arguments and exceptions are those of `identify`.
+    The arm moves. Arguments and exceptions are as for `identify`.
     """
     checked, shown = loaded(config)
     if take_over:
@@ -177,14 +177,14 @@ def _taking_over(config: Config) -> Config:
 
 
 def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None) -> RunFolder:
-    """The folder `out`, or a new one in runs/ named after time and arm. Raises RunFolderError."""
+    """The folder `out`, or a new one in runs/ named after the time and the arm. Raises RunFolderError."""
     path = unused_path(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}") if out is None else Path(out)
     log.info("run folder %s", path)
     return RunFolder.create(path, config)
 
 
 def unused_path(path: Path) -> Path:
-    """`path`, with a number appended if it exists: a program may start two runs within a second."""
+    """`path`, with a number appended if it already exists: a program may start two runs within a second."""
     number = 2
     tried = path
     while tried.exists():

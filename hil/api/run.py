@@ -131,7 +131,7 @@ class Run:
 
     @property
     def timing(self) -> StreamTiming:
-        """How well the stream kept its deadlines."""
+        """How well the stream met its deadlines."""
         return timing(self.samples, self.config.experiment.rate)
 
     @property

@@ -53,8 +53,8 @@ def _same_direction(config: Config, joint: JointConfig) -> str:
     given = list(joint.directions) if isinstance(joint.turns, list) else sign
     return (
         f"direction = {given} means that IDs {first} and {second} of joint {joint.name!r} turn the same way. Servos "
-        f"that face each other turn oppositely: they need direction = [{sign}, {-sign}]; otherwise they work against "
-        f"each other. {_how_to_compare(config)}"
+        f"that face each other turn in opposite directions: they need direction = [{sign}, {-sign}]; otherwise they "
+        f"work against each other. {_how_to_compare(config)}"
     )
 
 
@@ -62,10 +62,13 @@ def _how_to_compare(config: Config) -> str:
     """Say how to find out which way the two servos of a joint turn."""
     if config.arm.urdf is not None:
         guided = command("pose", config.path, "--guide")
-        return f"Only motion shows which is right: `{guided}` compares both servos while you turn the joint by hand."
+        return (
+            f"Only motion shows which direction is right: `{guided}` compares both servos while you turn the joint by "
+            "hand."
+        )
     return (
-        "Only motion shows which is right: with torque off, turn the joint by hand and compare the Present Positions "
-        "of both servos in DYNAMIXEL Wizard 2.0."
+        "Only motion shows which direction is right: with torque off, turn the joint by hand and compare the Present "
+        "Positions of both servos in DYNAMIXEL Wizard 2.0."
     )
 
 

@@ -22,7 +22,7 @@ ALWAYS_SHARE = 0.9
 
 NEAR_SHARE, NEAR_SHARE_OF_OTHERS = 0.75, 0.98
 """Two capsules that are closer than BUILT_NEAR in at least this fraction of poses are near each other by design: they
-must not touch, but need no margin. First value: exactly one link lies between them; second: more than one.
+must not touch, but need no margin. First value: if exactly one link lies between them; second: if more do.
 """
 
 BUILT_NEAR = 0.02  # m beyond the margin
@@ -82,7 +82,7 @@ class Space:
     at_rest: Array
     """Distance of each pair in the rest pose (pairs,) [m]."""
     is_touched: NDArray[np.bool_]
-    """For each joint (joints,): whether anything may touch the part of the arm that it moves, in the rest pose."""
+    """Whether anything may touch, in the rest pose, the part of the arm that each joint moves (joints,)."""
     _built: Array
     """Median distance of pairs that are near each other by design, otherwise infinite (pairs,) [m]."""
     _pairs: NDArray[np.int64]
@@ -98,14 +98,14 @@ class Space:
     def room(self, position: Array, on_the_way: bool = False) -> Array:
         """Smallest excess over the required distance (samples,) [m] along a motion (joints, samples) [rad].
 
-        on_the_way: whether the motion leads from or to the rest pose, in which distances may be less than the margin.
+        on_the_way: whether the motion leads from or to the rest pose; distances may then be less than the margin.
         """
         return self._least(position, self._needed(on_the_way), on_the_way)[0]
 
     def has_reserve(self, position: Array, reserve: float) -> bool:
         """Whether a motion (joints, samples) [rad] keeps `reserve` [m] more than the required distance.
 
-        Pairs that are near each other by design keep at least half of their median distance instead, if that is less.
+        For pairs that are near each other by design, half of their median distance is enough if that is less.
         """
         needed = self._needed(False)
         needed = np.minimum(needed + reserve, np.maximum(needed, 0.5 * self._built))

@@ -49,13 +49,13 @@ def calibrate(
     mass: Annotated[float, typer.Option("--mass", min=1e-6, metavar="KG", help="Mass bolted to the last link.")],
     distance: Annotated[
         float | None,
-        typer.Option("--distance", min=1e-6, metavar="M", help="Distance of its centre of mass from the last joint."),
+        typer.Option("--distance", min=1e-6, metavar="M", help="Distance of the mass's centre from the last joint."),
     ] = None,
     length: Annotated[
         float | None, typer.Option("--length", min=1e-6, metavar="M", help="Length of link 1; default: known.length_1.")
     ] = None,
     inertia: Annotated[
-        float, typer.Option("--inertia", min=0.0, metavar="KG_M2", help="Inertia about its own centre of mass.")
+        float, typer.Option("--inertia", min=0.0, metavar="KG_M2", help="Inertia of the mass about its own centre.")
     ] = 0.0,
     at: Annotated[
         tuple[float, float, float] | None,
@@ -76,7 +76,7 @@ def calibrate(
     from hil.runs.run_folder import RunFolder
 
     if without.resolve() == with_mass.resolve():
-        raise typer.BadParameter(f"{without} is given twice: one run without the mass, one with it.")
+        raise typer.BadParameter(f"{without} is given twice: give one run without the mass and one with it.")
     runs = RunFolder.open(without), RunFolder.open(with_mass)
     with Terminal(quiet=json_only).busy("Calibrating"):
         result = calibrate_runs(*runs, AddedMass(mass, inertia, distance, length, at, joint))

@@ -117,7 +117,7 @@ def estimate(
     all_samples: AllSamples = False,
     json_only: Json = False,
 ) -> None:
-    """Estimate from a run's recording, or from recordings of other tools; write result.json and the report."""
+    """Estimate from a run's recording, or from recordings made with other tools; write result.json and the report."""
     from hil.api.estimate import are_recordings
     from hil.api.estimate import estimate as estimate_arm
     from hil.cli.terminal import Terminal
@@ -129,9 +129,9 @@ def estimate(
         raise typer.BadParameter(str(error)) from error
     elsewhere = elsewhere or paths[0].is_file()  # whose format is then refused by name
     if out is not None and not elsewhere:
-        raise typer.BadParameter("--out is for recordings of other tools; a run's result is written into its folder.")
+        raise typer.BadParameter("--out is for recordings from other tools; a run's result is written into its folder.")
     if config is not None and not elsewhere:
-        raise typer.BadParameter("--config is for recordings of other tools; edit the run's own config.toml instead.")
+        raise typer.BadParameter("--config is for recordings from other tools; edit the run's own config.toml instead.")
     with Terminal(quiet=json_only).following(config) as follow:
         result = estimate_arm(paths, config=config, out=out, all_samples=all_samples, on_progress=follow)
     _show(result, json_only)

@@ -36,7 +36,7 @@ def describe_fake(config: Path, faults: list[str], moves: list[str], seed: int |
     for move in fake.moves:
         end = f"{move.to:g} rad" if move.to is not None else f"{move.ticks} ticks"
         say(console, f"hand: servo {move.servo} to {end} at {move.at:g} s within {move.duration:g} s")
-    print(f"\nTo let any program use it: {command('fake', config, '--pty')}")
+    print(f"\nTo let any program use this arm: {command('fake', config, '--pty')}")
     say(console, f'In Python with pyserial: hil.fakes.register(), then serial_for_url("fake://{config}")')
 
 
@@ -48,7 +48,7 @@ def list_faults() -> None:
 
 
 def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
-    """Move joints of the fake arm served at `device` whose torque is off, or release them. Raises ConfigError."""
+    """Move joints whose torque is off, or release joints, of the fake arm served at `device`. Raises ConfigError."""
     try:
         for servo in release:
             ask_hand(device, f"release {servo}")

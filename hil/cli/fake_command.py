@@ -21,7 +21,9 @@ def fake(
         Path, typer.Argument(metavar="ARM", help="TOML file with a [fake] table, or an arm's name (see above).")
     ],
     pty: Annotated[bool, typer.Option("--pty", help="Serve it on a pseudo-terminal until Ctrl-C or SIGTERM.")] = False,
-    link: Annotated[Path | None, typer.Option(metavar="PATH", help="Symbolic link to that device.")] = None,
+    link: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="Symbolic link to create to the pseudo-terminal.")
+    ] = None,
     fault: Annotated[
         list[str] | None,
         typer.Option(metavar="KIND[:KEY=VALUE,...]", help="Inject this fault; may be repeated. See --list-faults."),
@@ -33,7 +35,7 @@ def fake(
             help="Move this servo's joint by hand while its torque is off (or ID:ticks=POSITION); may be repeated.",
         ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of noise and faults, overriding the file's.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed for noise and faults, overriding the file's.")] = None,
     _: Annotated[
         bool,
         typer.Option("--list-faults", is_eager=True, callback=_list_faults, help="List the fault kinds and exit."),

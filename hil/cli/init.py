@@ -17,7 +17,7 @@ def init(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Ask no questions; accept every default.")] = False,
 ) -> None:
-    """Scan the bus, ask for the rest, and write a commented TOML file. Torque stays off and no setting is changed."""
+    """Scan the bus, ask for other facts, and write a commented TOML file. Torque stays off; no setting is changed."""
     from hil.cli.terminal import Terminal
     from hil.config.fake_url import url_for
     from hil.config.schema import parse_config, port_url
@@ -46,7 +46,7 @@ def init(
     finally:
         opened.close()
     parse_config(arm_toml(answers), out)  # raises if the file would not be valid
-    with terminal.busy("Measuring the rate of the bus"):
+    with terminal.busy("Measuring what rate the bus allows"):
         found, said = measured_bus(answers, out)
     terminal.say(said)
     text = arm_toml(replace(answers, measured=found))

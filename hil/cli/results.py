@@ -60,7 +60,7 @@ def export(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the draws.")] = 1,
 ) -> None:
-    """Write the identified arm or its recording for other tools, and list what a format cannot represent."""
+    """Write the identified arm or its recording in other tools' formats, and list what a format cannot represent."""
     formats = [name.lower() for name in formats]
     if samples is not None:
         from hil.export.posterior import export_samples

@@ -142,5 +142,5 @@ def _would_show(detectable: "Mapping[str, float]") -> list[str]:
         known = "Smallest change of each term that 95 of 100 such pairs of runs would detect"
         lines.append(f"{known}: {', '.join(least)}.")
     if never:
-        lines.append(f"In these, not even a doubling would be detected: {', '.join(never)}.")
+        lines.append(f"For these terms, not even a doubling would be detected: {', '.join(never)}.")
     return lines

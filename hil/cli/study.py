@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def study(
-    study_path: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="What to vary, run and record.")],
+    study_path: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="TOML file: what to vary, run and record.")],
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Output folder; default: studies/NAME.")
     ] = None,

@@ -148,7 +148,7 @@ def _bar(console: Console) -> Progress:
 def rows_below(text: str, width: int) -> str:
     """Return the text; if its table is wider than `width`, each row is split over several lines.
 
-    A row's cells are two spaces or more apart; the first row holds the headings.
+    A row's cells are separated by two or more spaces; the first row holds the headings.
     """
     lines = text.split("\n")
     rows = [re.split(r" {2,}", line.strip()) for line in lines]

@@ -41,12 +41,12 @@ def described_arm(config: "Config") -> ArmDescription:
 
 
 def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
-    """Yield one sentence per described inertia that no mass distribution can have."""
+    """Return one sentence per described inertia that no mass distribution can have."""
     return tuple(f"{arm.path.name}: {doubt}." for doubt in arm.doubts)
 
 
 def doubted_limits(config: "Config") -> Iterator[str]:
-    """Yield one sentence per joint whose limits in the description make no sense or do not contain the paths.
+    """Yield one sentence per joint whose limits in the description make no sense or do not contain its path.
 
     position_limit may exceed the described limits at either end by the margin that a path leaves free: it only serves
     to stop the arm, and some arms rest on a mechanical stop.
@@ -64,7 +64,7 @@ def doubted_limits(config: "Config") -> Iterator[str]:
             continue
         if max(-lower, upper) > _MOST_TURNED_RAD:
             in_rad = f"[{math.radians(lower):.3g}, {math.radians(upper):.3g}]"
-            yield f"{where}: are these degrees? Limits must be in radians, here {in_rad}."
+            yield f"{where}: are these degrees? Limits must be in radians: {in_rad}."
             continue
         low, high = joint.position_limit
         free = POSITION_RESERVE * (high - low)
@@ -163,7 +163,7 @@ def chain_slips(config: "Config") -> Iterator[str]:
             "on its path. Give both, or set experiment.pilot = true, which finds them"
         )
     if config.known is not None:
-        yield "known: only for planar arms; a URDF gives its own masses"
+        yield "known: only for planar arms; a URDF already gives the masses"
     told = [option for option in _OPTIONS if getattr(config.model, option)]
     if told:
         yield f"model.{told[0]} = true: only planar arms support this term so far; remove it"
@@ -189,7 +189,7 @@ def _planar_slips(config: "Config") -> Iterator[str]:
     if config.arm.urdf is None and config.joint_path is not None:
         yield "joint_path: only an arm with arm.urdf follows a path; a planar arm uses experiment.peak_torque"
     if config.model.base_tilt:
-        yield "model.base_tilt: tilting a planar arm acts like a zero error of its first joint: use model.zeros"
+        yield "model.base_tilt: tilting a planar arm acts like a shifted zero of its first joint: use model.zeros"
 
 
 def _path_slips(config: "Config") -> Iterator[str]:

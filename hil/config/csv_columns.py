@@ -166,7 +166,7 @@ class ArmFacts(BaseModel):
 
 
 class RecordingConfig(BaseModel):
-    """The tables of an arm's TOML that a recording made elsewhere needs; all of them are optional."""
+    """The tables of an arm's TOML file that apply to a recording made elsewhere; all of them are optional."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
 

@@ -67,7 +67,7 @@ class ExperimentConfig(Table):
                 raise ValueError(f"band = [{low}, {high}]: {rule}{self._meant(self.band)}")
         for lines in self.lines or []:
             if not lines or len(set(lines)) != len(lines) or min(lines) < 1 or max(lines) > samples / 4:
-                raise ValueError(f"lines: the harmonics in a list must be different and from 1 to {samples // 4:g}")
+                raise ValueError(f"lines: the harmonics in a list must be distinct and from 1 to {samples // 4:g}")
         return self
 
     def _meant(self, band: list[float]) -> str:
@@ -77,7 +77,7 @@ class ExperimentConfig(Table):
 
     @property
     def drift_within(self) -> float:
-        """Limit on the difference between periods for a motion that still drifts slowly after max_settling_periods.
+        """Limit on the difference between periods for motion that is still drifting slowly after max_settling_periods.
 
         Relative to the motion's RMS, like settle_within. Warming grease, for example, makes the motion drift.
         """
@@ -95,7 +95,7 @@ class ExperimentConfig(Table):
 
 
 class PathConfig(Table):
-    """`[joint_path]`: the path that excites a spatial arm. The upper end of the band is its highest frequency."""
+    """`[joint_path]`: the path that excites a spatial arm. The upper end of experiment.band limits its frequency."""
 
     centre: list[Angle] = Field(description="rad per joint: centre of the path")
     swing: list[Annotated[float, Field(gt=0, le=4 * math.pi)]] = Field(

@@ -132,7 +132,7 @@ class JointConfig(Table):
 
     @property
     def torque_spread(self) -> float:
-        """Relative standard deviation of the torque per goal: as configured, otherwise that among servos of one
+        """Relative standard deviation of the torque per goal: as configured, otherwise the spread among servos of one
         model.
         """
         name = "torque_per_volt_std" if self.drive_mode is Mode.PWM else "torque_constant_std"

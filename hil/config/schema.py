@@ -58,7 +58,7 @@ LYING_RAD = 0.25
 """Largest deviation from the rest pose at the start of a spatial arm, unless arm.rest_tolerance is given [rad]."""
 
 SLOW_INTERVAL_S = 0.25
-"""Interval between slow reads [s], which alternate between the servos' clocks and voltage and temperature."""
+"""Interval between slow reads [s]: in turn, the servos' clocks, and their voltages and temperatures."""
 
 
 class PortConfig(Table):
@@ -122,17 +122,19 @@ class SafetyConfig(Table):
     allow_no_watchdog: bool = Field(
         False, description="accept firmware without a Bus Watchdog: if packets cease, nothing then stops the servo"
     )
-    write_current_limit: bool = Field(True, description="lower the servos' own Current Limit for the run, then restore")
+    write_current_limit: bool = Field(True, description="lower each servo's Current Limit for the run, then restore it")
     missing_time: PositiveFloat = Field(0.015, le=2, description="s, time for which a servo may fail to reply")
     late_time: PositiveFloat = Field(0.05, le=2, description="s, time for which deadlines may be missed")
     max_missing: int | None = Field(
-        None, ge=1, le=1000, description="allowed consecutive lost replies, instead of missing_time"
+        None, ge=1, le=1000, description="number of consecutive lost replies allowed, instead of missing_time"
     )
-    max_late: int | None = Field(None, ge=1, le=1000, description="consecutive missed deadlines, instead of late_time")
+    max_late: int | None = Field(
+        None, ge=1, le=1000, description="number of consecutive missed deadlines allowed, instead of late_time"
+    )
     rest_time: float = Field(3.0, gt=0, le=60, description="s, time allowed for coming to rest at the end")
     rest_velocity: PositiveFloat = Field(0.1, le=2, description="rad/s, speed below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, le=1e4, description="A/s (V/s in PWM mode): maximum rate of change of goals")
-    max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C, highest inside a servo")
+    max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C, highest allowed inside a servo")
     min_voltage: float = Field(0.0, ge=0, le=60, description="V; default: the models' factory shutdown thresholds")
     max_voltage: PositiveFloat = Field(30.0, le=60, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s, time for which a current may deviate from its goal")
@@ -278,22 +280,22 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is spatial. Every arm with [arm] urdf is, except a planar arm without [joint_path]."""
+        """Whether the arm is spatial. An arm with [arm] urdf is spatial, except a planar arm without [joint_path]."""
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property
     def rest_tolerance(self) -> float:
         """Largest deviation from the rest pose at the start [rad]: `arm.rest_tolerance`.
 
-        The default for a spatial arm is LYING_RAD: such an arm lies on something, and friction holds it closer to its
-        rest pose than an arm that hangs.
+        The default for a spatial arm is LYING_RAD: such an arm lies on something, and comes to rest closer to its
+        rest pose than a hanging arm does.
         """
         is_given = "rest_tolerance" in self.arm.model_fields_set
         return LYING_RAD if self.is_chain and not is_given else self.arm.rest_tolerance
 
     @property
     def url(self) -> str:
-        """The port's URL; that of a fake arm is completed with the path of the file that describes it."""
+        """The port's URL; for a fake arm, completed with the path of the file that describes it."""
         return url_from(self.port.url, self.path)
 
     @property
@@ -317,7 +319,7 @@ class Config(Table):
 
 
 def load_config(path: str | PathLike[str]) -> Config:
-    """Read and check a TOML file, or the bundled one of that bare name. Raises ConfigError."""
+    """Read and check a TOML file, or the bundled one with that name. Raises ConfigError."""
     path = find_config(Path(path))
     if path.is_dir():
         within = next(iter(sorted(path.glob("*.toml"))), None)

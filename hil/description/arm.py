@@ -88,8 +88,8 @@ class ArmJoint:
     fixed: tuple[str, ...]
     """Names of the links attached to this joint's link by fixed or held joints."""
     movable: Mapping[str, Body] = field(default_factory=dict)
-    """The links of `fixed` that held joints move, in the frame of this joint's link. Each excludes the links attached
-    to it.
+    """Those links of `fixed` that are moved by held joints, in the frame of this joint's link. Each excludes the links
+    attached to it.
     """
 
 

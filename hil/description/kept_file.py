@@ -12,8 +12,8 @@ def kept_bytes(path: Path) -> bytes:
     """The bytes to keep of a URDF or MJCF file. Raises OSError, ArmFileError.
 
     A URDF is kept as it is: without its meshes it still has all inertias. MuJoCo, however, cannot read an MJCF whose
-    meshes, textures or included files are missing. Such a file is kept with everything included, the inertias that
-    MuJoCo computed written out, and the shapes that need another file left out.
+    meshes, textures or included files are missing. Such a file is kept with everything included, the inertias computed
+    by MuJoCo written out, and the shapes that need another file left out.
     """
     if not is_mjcf(path) or not (text := _self_contained(path)):
         return path.read_bytes()

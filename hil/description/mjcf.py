@@ -28,7 +28,7 @@ def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
     """Read the arm formed by these joints, from the base outwards; by default, by all hinges. The base is MuJoCo's
     world.
 
-    Raises ArmFileError as `hil.description.urdf.read_urdf` does, and if MuJoCo is not installed.
+    Raises ArmFileError for the same reasons as `hil.description.urdf.read_urdf`, and if MuJoCo is not installed.
     """
     tree = _Tree(_compiled(path), path)
     names = list(joints) if joints is not None else tree.hinges
@@ -64,7 +64,7 @@ class Geom:
     """A shape of an MJCF file, in the frame of its moving link.
 
     link: 0 for whatever is fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh". size: as in
-    MuJoCo, half edge lengths, or radius and half length [m]; of a mesh and any other shape, those of its bounding box.
+    MuJoCo, half edge lengths, or radius and half length [m]; for a mesh and any other shape, those of its bounding box.
     """
 
     link: int
@@ -161,8 +161,8 @@ class _Tree:
         for name, body, before in zip(names, moved, [WORLD, *moved], strict=False):
             if body not in way:
                 raise ArmFileError(
-                    f'{self.path}: joint "{name}" does not lie between base and "{names[-1]}": the joints must form '
-                    "one branch, from the base outwards"
+                    f'{self.path}: joint "{name}" does not lie between the base and "{names[-1]}": the joints must '
+                    "form one branch, from the base outwards"
                 )
             between = [other for other in self._way(body) if other not in self._way(before) and other != body]
             loose = [other for other in between if self.model.body_jntnum[other]]

@@ -84,7 +84,7 @@ def parse_urdf(path: Path) -> ET.Element:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ArmFileError(f"{path} cannot be read: it is not UTF-8 text; save it with the encoding UTF-8") from error
+        raise ArmFileError(f"{path} cannot be read: it is not UTF-8 text; save it as UTF-8") from error
     except OSError as error:
         raise ArmFileError(f"{path} cannot be read: {error.strerror or error}") from error
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -126,7 +126,7 @@ def _without_inertia(root: ET.Element, links: Container[str | None]) -> Iterator
         if float(mass.get("value", "nan")) > 0.0:
             yield (
                 f'link "{element.get("name")}": it has a mass but no <inertia>, so it counts as a point '
-                "mass; it is used only as an initial guess"
+                "mass; this is used only as an initial guess"
             )
 
 
@@ -275,8 +275,8 @@ def _branch(tree: dict[str, _Joint], base: str, names: list[str], path: Path) ->
         missing = [name for name in names if name not in found]
         if missing:
             raise ArmFileError(
-                f'{path}: joint "{missing[0]}" does not lie between base and "{branch[-1].name}": the joints must form '
-                "one branch"
+                f'{path}: joint "{missing[0]}" does not lie between the base and "{branch[-1].name}": the joints '
+                "must form one branch"
             )
         raise ArmFileError(f"{path}: from the base, the joints are {', '.join(found)}: list them in this order")
     between = [joint for joint in branch if joint.name not in names and joint.kind != "fixed"]

@@ -34,9 +34,9 @@ class AmplitudeOptions:
     close: float = 0.94
     """The limits count as reached once this fraction of them is used at the required probability."""
     over: float = 0.97
-    """Fraction of the limits that the next iteration aims at if the last torque exceeded them."""
+    """Fraction of the limits that the next iteration aims for if the last torque exceeded them."""
     under: float = 0.99
-    """Fraction of the limits that the next iteration aims at if the last torque did not reach them."""
+    """Fraction of the limits that the next iteration aims for if the last torque did not reach them."""
     max_ratio: float = 2.0
     """Maximum ratio of the torques of two successive iterations."""
     damping: float = 0.85
@@ -49,7 +49,7 @@ class AmplitudeOptions:
     polishing_ratio: float = 1.06
     """Factor by which each of the final increases raises a joint's torque."""
     back_off: float = 0.93
-    """Factor on the torque when the check on all arms has failed."""
+    """Factor applied to the torque when the check on all arms has failed."""
     torque_share: float = 0.97
     """Fraction of the current limit that may be used, since clamping would distort the designed wave."""
     initial_share: float = 0.125

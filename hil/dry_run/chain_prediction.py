@@ -26,14 +26,14 @@ LOOKED_AT_HZ = 100.0
 """Rate at which the clearance of a motion is computed [Hz]."""
 
 RAN_AWAY = 1e3
-"""Peak of an arm whose simulation diverges, as a multiple of the limit."""
+"""Peak assigned to an arm whose simulation diverges, as a multiple of the limit."""
 
 
 @dataclass(frozen=True)
 class ChainPrediction:
     """Prediction of a spatial arm's experiment.
 
-    peaks: predicted peaks and their limits. nearest: smallest clearance of all arms, `moment` [s] into the segment
+    peaks: predicted peaks and their limits. nearest: smallest clearance among all arms, `moment` [s] into the segment
     `role`.
     rooms: smallest clearance of each arm minus the required one (arms,) [m]. tracking: median of the arms' largest
     tracking errors (joints,) [rad]. ways: number of samples of the transition at either end of the first segment.
@@ -67,8 +67,8 @@ def predict_chain(
 ) -> ChainPrediction:
     """Simulate `plan` on every arm. Raises ArmFileError, ConfigError.
 
-    tell: called with the number of simulations done and their total. shown: number of motions to store. passed: as in
-    `resting_stops`.
+    tell: called with the number of simulations done and the total number. shown: number of motions to store. passed: as
+    in `resting_stops`.
     """
     space = Space.of(config)
     limits, rest = limits_of(config), np.array(config.arm.rest_pose)

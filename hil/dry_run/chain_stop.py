@@ -1,7 +1,7 @@
 """Simulated stops of a spatial arm, which is lowered if its servos still accept commands, and falls if they do not.
 
 Stops begin at times spread over the planned path, on arms of the ensemble. For each one, the path home is simulated as
-the stream would command it, and the fall without torque until the first collision.
+the stream would command it, and so is the fall without torque, up to the first collision.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ MOMENTS, ARMS = 16, 6
 FALL_S = 1.5
 SATURATED = 0.98
 LAID_DOWN = 0.95
-"""Share of the simulated stops that must end in the rest pose."""
+"""Fraction of the simulated stops that must end in the rest pose."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class ChainStops:
             return (
                 f"too little clearance when a stop lowers the arm, {down.nearest}, at least "
                 f"{1e3 * down.nearest.needed:.0f} mm required. Lower safety.lower_speed, choose a rest_pose farther "
-                "from obstacles, or give the masses more accurately"
+                "from obstacles, or specify the masses more accurately"
             )
         if down.lies < LAID_DOWN:
             return (
@@ -98,7 +98,7 @@ def foreseen_stops(
 ) -> ChainStops:
     """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError.
 
-    tell: called with the number of simulations done and their total. passed: as in `resting_stops`.
+    tell: called with the number of simulations done and the total number. passed: as in `resting_stops`.
     """
     segment = plan.segments[0]
     assert isinstance(segment, PathSegment)
@@ -167,7 +167,7 @@ def _helps(config: Config, at: int, longest: float, used: float, needed: float) 
         first = f"Raise its {joint.goal_limit_name}, {slower}, "
     else:  # what is left is friction, or an error of the masses, against a spring that is soft at a low rate
         first = f"Raise experiment.rate above {config.experiment.rate:g}, which makes its stabiliser stiffer, "
-    return f"{first}choose a rest_pose in which gravity loads it less, or give the masses more accurately"
+    return f"{first}choose a rest_pose in which gravity loads it less, or specify the masses more accurately"
 
 
 def _lowered(

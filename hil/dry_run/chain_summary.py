@@ -175,7 +175,9 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         lines.append(run.on_stops)
     lines += [f"Warning: {doubt}" for doubt in doubts(run.config)]
     if run.share < 1.0:
-        lines.append(f"The pilot would start with {100 * run.share:.0f} % of the designed path, which is shown here.")
+        lines.append(
+            f"The pilot would start with the designed path at {100 * run.share:.0f} % of its amplitude, as shown here."
+        )
     if run.refused == "" and (doubt := run.doubt(run.config)):
         lines.append(
             f"hil identify decides using fewer of these arms. With all {run.arms}, the experiment is not safe: {doubt}."

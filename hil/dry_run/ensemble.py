@@ -69,7 +69,7 @@ def scale_draws(config: Config, count: int, seed: int = 0) -> Array:
 def earlier_result(config: Config, path: Path) -> Result:
     """Read the result of an earlier run on the same planar arm, from a run folder or result.json.
 
-    Raises ResultError, and ConfigError if the result is that of another arm.
+    Raises ResultError, and ConfigError if the result is for another arm.
     """
     result = read_result(path)
     if result.chain is not None:

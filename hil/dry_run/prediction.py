@@ -47,8 +47,8 @@ class Prediction:
     same as fractions of the distance from rest to the limit. limits: limits (quantities, joints). settled_after: number
     of periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over time
     of a few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: samples per
-    second [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at the farther one
-    of rest and centre.
+    second [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at
+    rest or centre, whichever is farther.
     """
 
     values: Array
@@ -79,7 +79,7 @@ class Prediction:
 
     @property
     def stop_chance(self) -> float:
-        """Probability that the guard stops the run: the larger of the observed fraction and the tail estimate."""
+        """Probability that the guard stops the run: the fraction of arms it stops, or the tail estimate if larger."""
         counted = float(np.mean((self.shares[:, :GUARDED] >= 1).any(axis=(1, 2))))
         return max(counted, min(1.0, float(self.limit_chance[:GUARDED].sum())))
 
@@ -117,7 +117,7 @@ class Prediction:
 
 
 def quantities_of(joint: JointConfig) -> tuple[tuple[str, str], ...]:
-    """Names and units of a prediction's rows for one joint; its goal is a voltage if it is driven by PWM."""
+    """Names and units of a prediction's rows for one joint; a goal is a voltage if the joint is driven by PWM."""
     named = tuple(zip(QUANTITIES, UNITS, strict=True))
     if joint.drive_mode is not Mode.PWM:
         return named

@@ -29,7 +29,7 @@ def resting_stops(config: Config, arms: ChainArms, passed: NDArray[np.bool_] | N
 
     A joint is assumed to lie on its stop if its rest pose is near the end of its range, nothing else touches the part
     of the arm that it moves, and gravity does not pull it away from there. A support missing from the description looks
-    the same until the joint has moved beyond its rest pose. passed: on which sides each joint has done so, as
+    the same until the joint has moved beyond its rest pose. passed: on which sides each joint has been beyond it, as
     `passed_rest` returns it (2, joints). Raises ArmFileError.
     """
     rest = np.array(config.arm.rest_pose)
@@ -45,7 +45,7 @@ def resting_stops(config: Config, arms: ChainArms, passed: NDArray[np.bool_] | N
 
 
 def passed_rest(config: Config, position: Array) -> NDArray[np.bool_]:
-    """Whether each joint was below and above its rest pose (2, joints) in a recording (samples, joints) [rad]."""
+    """Whether each joint was ever below (row 0) or above (row 1) its rest pose in a recording (samples, joints)."""
     away = position - np.array(config.arm.rest_pose)
     away = np.where(np.isfinite(away), away, 0.0)
     found: NDArray[np.bool_] = np.stack((away.min(axis=0) < -PASSED_RAD, away.max(axis=0) > PASSED_RAD))

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 class Motion:
     """The simulated motion (joints, samples) [rad, rad/s, N m].
 
-    settled_after: number of periods of the first multisine until the arm settled; 0 if it never did, in which case the
-    experiment ends there.
+    settled_after: number of periods of the first multisine until the arm settled; 0 if it never settled, in which case
+    the experiment ends there.
     """
 
     position: Array

@@ -30,7 +30,7 @@ class FirstRun:
     played: Config
 
     def is_narrowed(self, config: Config) -> bool:
-        """Whether the position limits of this run are closer than those of `config`."""
+        """Whether the position limits of this run are narrower than those of `config`."""
         pairs = zip(self.played.joints, config.joints, strict=True)
         return any(tuple(mine.position_limit) != tuple(whole.position_limit) for mine, whole in pairs)
 
@@ -41,7 +41,7 @@ class DryRun:
 
     source: "prior" or "result". arms: number of simulated arms. asked: prediction for the configured
     experiment.peak_torque, None if not configured. largest: the largest safe torque with its prediction; None if no
-    torque is safe for all arms, so that only a pilot can find it. servos: messages from reading the servos. first: the
+    torque is safe for all arms, so that only a pilot can find one. servos: messages from reading the servos. first: the
     first run of the pilot, None if the torque is configured.
     """
 
@@ -174,7 +174,8 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     stopped = np.maximum(planned[Way.BRAKED], planned[Way.CUT])
     lines = [
         "99 %: in 99 of 100 arms, all peaks stay within these values. Chance: probability that this one quantity of an "
-        "arm exceeds its limit; at a position or velocity limit the guard stops the arm, current is only clamped.",
+        "arm exceeds its limit; at a position or velocity limit the guard stops the arm, whereas "
+        "current is only clamped.",
         settling_text(config, shown),
         f"If stopped at any moment, the arms overshoot their limits by up to {_each(config, stopped)}; if the program "
         f"is killed or the cable unplugged, by up to {_each(config, planned[Way.SILENT])}.",
@@ -214,7 +215,7 @@ def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> 
     limits = "; ".join(
         f"{joint.name} {joint.position_limit[0]:.2f} to {joint.position_limit[1]:.2f}" for joint in first.played.joints
     )
-    closer = f" and with closer position limits ({limits} rad)" if first.is_narrowed(config) else ""
+    closer = f" and with narrower position limits ({limits} rad)" if first.is_narrowed(config) else ""
     if largest is None:
         return [
             *lines,
@@ -224,7 +225,7 @@ def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> 
         ]
     return [
         *lines,
-        f"SAFE: {starts}{closer}: probability of a guard stop: {chance}. The pilot then raises the torque from run to "
+        f"SAFE: {starts}{closer}. Probability of a guard stop: {chance}. The pilot then raises the torque from run to "
         "run.",
     ]
 

@@ -14,7 +14,7 @@ _SHARE = 0.85
 
 
 def within_supply(config: Config) -> Config:
-    """The configuration with each velocity_limit at most what the servo's supply allows [rad/s].
+    """The configuration with each velocity_limit capped at what the servo's supply allows [rad/s].
 
     Nominal supply voltages are assumed. A fake servo whose motor is not limited by its supply has no such limit.
     """

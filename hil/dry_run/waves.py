@@ -19,8 +19,8 @@ _EVERY = 4  # evaluate every fourth sample
 
 
 def roomy_plan(config: Config, physics: Physics) -> Plan:
-    """The configured plan, with the variant of each multisine that uses the most of the arm's position range. physics:
-    parameters of the arm.
+    """The configured plan, with the variant of each multisine that uses the largest part of the arm's position range.
+    physics: parameters of the arm.
 
     The phases determine how evenly an arm swings to both sides. Reversing the sign or time of a wave gives another wave
     with the same lines and peaks at no design cost.
@@ -90,7 +90,7 @@ def designed_plan(config: Config, physics: Physics, names: list[str]) -> Plan:
 
 
 def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> DesignProblem:
-    """Arm and limits in the form that the estimator's experiment design takes."""
+    """Arm and limits in the form that the estimator's experiment design expects."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     velocity = np.array([joint.velocity_limit for joint in config.joints])
     step = np.array([joint.joint.servo.position_unit for joint in config.joints])

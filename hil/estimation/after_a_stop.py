@@ -23,8 +23,8 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
     steps = [step for step in _steps(run.path) if can_be_estimated(step)]
     if steps:
         return [
-            f"The recording of {steps[-1].name} is kept; its motion was smaller than the limits allow. The estimate is "
-            "less accurate than that of a finished run.",
+            f"The recording of {steps[-1].name} is kept; its motion was smaller than the limits allow. An estimate "
+            "from it would be less accurate than one from a finished run.",
             next_step("estimate", steps[-1]),
         ]
     return [f"The recording up to that point is kept in {run.path}; no period had settled.", next_step(command, shown)]

@@ -182,7 +182,7 @@ def calibration_lines(result: CalibrationResult) -> list[str]:
             f"({100 * (found.value / found.supposed - 1):+.1f} % from the assumed {found.supposed:g})"
         )
     worst = float(np.max(result.fit.residual_rms_ticks))
-    lines.append(f"Largest residual of both runs: {worst:.3f} encoder steps RMS; rounding alone gives 0.289.")
+    lines.append(f"Largest residual in either run: {worst:.3f} encoder steps RMS; rounding alone gives 0.289.")
     if not result.fit.reached:
         lines.append(
             "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "

@@ -206,8 +206,8 @@ def _verdict(
         error = float(np.max(held_out))
         joint = config.joints[int(np.argmax(held_out))].name
         sentences.append(
-            f"A held-out path is predicted to within {100 * error:.2f} % of its motion ({joint} worst), excluding "
-            "encoder noise."
+            f"A held-out path is predicted to within {100 * error:.2f} % of its motion (worst joint: {joint}), "
+            "excluding encoder noise."
         )
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
     if estimate.doubtful_zeros:
@@ -220,8 +220,8 @@ def _verdict(
     if still:
         trust = "no"
         sentences.append(
-            f"{', '.join(still)} hardly moved, so the recording says little about its inertia and friction: increase "
-            "joint_path.swing and speed for it, and check that nothing blocks it."
+            f"{', '.join(still)} hardly moved, so the recording says little about inertia and friction there: increase "
+            "joint_path.swing and speed, and check that nothing blocks the motion."
         )
     if estimate.from_prior:
         trust = lowered(trust, "with care")

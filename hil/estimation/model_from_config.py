@@ -28,7 +28,7 @@ def wanted_model(
 
 
 def voltage_driven(config: Config) -> tuple[int, ...]:
-    """The joints, from 1, whose goal is a voltage."""
+    """The joints, numbered from 1, whose goal is a voltage."""
     return tuple(number for number, joint in enumerate(config.joints, start=1) if joint.drive_mode is Mode.PWM)
 
 

@@ -1,4 +1,4 @@
-"""The limit that determined the torque of a pilot. In such a run, advice to raise peak_torque would not help."""
+"""The limit that determined the torque of a pilot. In a pilot's run, advice to raise peak_torque would not help."""
 
 import numpy as np
 from numpy.typing import NDArray

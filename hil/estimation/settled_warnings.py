@@ -31,7 +31,7 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
         if lost > LOST:
             late = _late_share(config, samples)
             remedy = (
-                f"this computer was late in {100 * late:.1f} % of the samples: close other programs, or lower "
+                f"this computer was late for {100 * late:.1f} % of the samples: close other programs, or lower "
                 "experiment.rate."
                 if late > BY_LATENESS * lost
                 else "check cable, baud rate and sampling rate."

@@ -40,7 +40,7 @@ class Driven(Protocol):
 
 
 def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity]) -> str:
-    """Sentences on how the values depend on the torque constants and how well these are known.
+    """Sentences about how the values depend on the torque constants and how well these are known.
 
     extra: the result's terms besides the base parameters. If they include the ratios of the torque constants, only the
     first constant remains uncertain.
@@ -71,7 +71,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
     found = f"{given}. Every value scales only with the torque constant of {first.name}"
     if not first.torque_per_goal_std:
         return f"{found}, whose uncertainty is not given."
-    return f"{found}, known to {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
+    return f"{found}, known to within {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
 
 
 def ratios_of(names: Sequence[str], value: Values, std: Values) -> dict[str, Quantity]:
@@ -94,7 +94,7 @@ def contradictions(
     constants.
 
     joints: names. extra: terms of a result that include the ratios, if there are any. ratio_std: relative standard
-    deviation of the ratio of the torque constants, by parameter, where given; otherwise it is that among servos of one
+    deviation of the ratio of the torque constants, by parameter, where given; otherwise the spread among servos of one
     model. known: contradictions that have sentences of their own.
     """
     said = {each.name for each in known}

@@ -17,7 +17,7 @@ ALLOWED_RAD = 0.1
 
 
 def opposed(joint: Joint) -> str:
-    """Return the question whether a joint's two servos work against each other; "" if it has one servo."""
+    """Return the question of whether a joint's two servos work against each other; "" if it has one servo."""
     if not joint.seconds:
         return ""
     signs = [joint.direction, *(second.direction for second in joint.seconds)]
@@ -38,8 +38,8 @@ class Apart:
         self._first: dict[tuple[int, int], float] = {}
 
     def look(self, apart: Sequence[Sequence[float]]) -> tuple[int, int, float] | None:
-        """Process a sample. If two servos no longer agree, return joint and additional servo (both from 0) and change
-        [rad].
+        """Process a sample. If two servos no longer agree, return the joint, the other servo (both from 0) and the
+        change [rad].
 
         apart: angles of each joint's other servos minus the first's [rad], NaN if one did not reply.
         """

@@ -123,14 +123,14 @@ class ChainWatch:
             since = self._seen_at - WINDOW_S
             recent = [torque[joint] for at, torque in self._commanded if at.time_before_write >= since]
             said = (
-                f"{name} stands still, with {min(recent):+.3f} to {max(recent):+.3f} N m commanded in the last "
-                f"{WINDOW_S:g} s: any arm consistent with the prior and the data so far would move. "
+                f"{name} is not moving, with {min(recent):+.3f} to {max(recent):+.3f} N m commanded in the last "
+                f"{WINDOW_S:g} s: any arm consistent with the prior and the data so far would be moving. "
                 f"{self._blocked_by[joint]}"
             )
         else:
             said = (
                 f"{name} does not move like any arm consistent with the prior and the data so far: "
-                f"{lacking:+.3f} N m of the commanded torque are not reflected in its motion. Its motor or its "
+                f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "
                 "encoder has failed, something pushes or holds it, or the arm is not the one described."
             )
         raise SafetyStop(said, Cause.UNEXPECTED)
@@ -152,7 +152,7 @@ def linear_parameters(arms: ChainArms) -> Array:
     """Base parameters, viscous and dry friction, and offsets of each arm (arms, base + 3 * joints).
 
     They are divided by the torque scale, i.e. in units of the commanded torque. If the scales of the joints differ, a
-    base parameter that affects several joints is divided by that of the first one.
+    base parameter that affects several joints is divided by the first one's scale.
     """
     scale = arms.drive[:, 4]
     owner = np.array([int(name.rpartition("_")[2]) - 1 for name in arms.base.names])

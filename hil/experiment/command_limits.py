@@ -31,7 +31,7 @@ class CommandLimits:
         return self._former
 
     def holding(self, goals: Sequence[float]) -> None:
-        """The goals that the servos have now [A or V]: `clamp` continues from these."""
+        """Set the goals that the servos have now [A or V], from which `clamp` continues."""
         self._former = list(goals)
 
     def _limited(self, goal: float, former: float, limit: float, name: str) -> float:

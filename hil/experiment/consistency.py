@@ -19,7 +19,7 @@ A reading that jumps back and forth, as with a stuck bit, cancels in those memor
 also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
 
 If the reported velocity stays exactly the same, it was the joint's true velocity all that time, except for the last
-`LAG_S` at most. The distance covered before these must therefore equal velocity times time. This detects a velocity
+`LAG_S` at most. The distance covered before that must therefore equal velocity times time. This detects a velocity
 that freezes near its peak sooner than the memories do, in which a lag could explain the difference.
 
 Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to twice the
@@ -203,7 +203,7 @@ def lost(memory: Any) -> None:
 
 
 def moved_at_standstill(states: Iterable[State], joint: int, still: float) -> str:
-    """Describe how far a joint moved while its velocity was reported to be below `still` [rad/s]; "" if it did not.
+    """Describe how far a joint moved while its velocity was reported to be below `still` [rad/s]; "" if not at all.
 
     states: the latest states, the last one first.
     """

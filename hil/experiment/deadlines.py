@@ -74,7 +74,7 @@ class Deadlines:
         self._often = max(0.0, self._often - LATE_SHARE)
         if self._often >= self._most_often:
             raise SafetyStop(
-                f"More than {100 * LATE_SHARE:.0f} % of the deadlines are missed{self._why_often()}", Cause.LATE
+                f"More than {100 * LATE_SHARE:.0f} % of the deadlines have been missed{self._why_often()}", Cause.LATE
             )
 
     def _why_often(self) -> str:

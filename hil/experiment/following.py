@@ -31,7 +31,7 @@ SIGMA_SHARE = 0.1
 """Standard deviation of ordinary sensor and current-loop errors, relative to the planned peak."""
 
 SIGMA_TICKS = 4.0
-"""Lower bound of that standard deviation, in register ticks."""
+"""Lower bound of the standard deviation of current errors, in register ticks."""
 
 LOST_AFTER_S = 0.03
 """Time for which a current must look like zero, at full weight, before it counts as zero [s]."""

@@ -36,7 +36,7 @@ JUMP_FACTOR = 1.5
 """Ratio of the distance a joint may appear to move between two samples to the distance its velocity limit allows."""
 
 EARLY_MOTION_RAD = 0.05
-"""Largest motion allowed while resting before the start [rad]."""
+"""Largest motion allowed while the arm rests before the start [rad]."""
 
 BELOW_VOLTAGE = 0.9
 """If the supply cannot drive the commanded current at some speed, this fraction of that speed is proposed as a
@@ -49,7 +49,7 @@ accept its goals.
 """
 
 NONE_HEARD = "No servo was heard"
-"""Beginning of the message of a stop due to missing replies from all servos."""
+"""Beginning of the message if the arm is stopped because no servo replies."""
 
 
 class Guard:
@@ -106,7 +106,7 @@ class Guard:
         planned = planned or _planned(config)
         interval = 1.0 / rate if interval is None else interval
         self.recent = RecentMotion(config, interval) if recent is None else recent
-        """The latest exchanges, those of a stop included."""
+        """The latest exchanges, including those during a stop."""
         self._silence = Silence(config, interval, patience, lowers_since)
         self._patience = patience or float("inf")
         self._heard_instead = heard_instead
@@ -129,7 +129,7 @@ class Guard:
         return self._commands.clamp(goals)
 
     def holding(self, goals: Sequence[float]) -> None:
-        """The goals that the servos have now [A or V]: `clamp` continues from these."""
+        """Set the goals that the servos have now [A or V], from which `clamp` continues."""
         self._commands.holding(goals)
 
     def woke_up(self, now: float, late: float) -> None:
@@ -251,7 +251,7 @@ class Guard:
                 self._stop(
                     index,
                     Cause.EARLY_MOTION,
-                    f"moves before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
+                    f"moved before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
                     f"is allowed. {self._still_swings()} Otherwise check whether a hand or a cable pushes or holds it, "
                     "or whether its horn slips.",
                 )
@@ -259,9 +259,9 @@ class Guard:
     def _still_swings(self) -> str:
         """What to do where the arm has not come to rest."""
         if not self._left_by_a_run:
-            return "If it still swings, as an arm with little friction does, wait until it is at rest."
+            return "If it is still swinging, as an arm with little friction does, wait until it is at rest."
         longer = f"raise safety.rest_time ({self._safety.rest_time:g} s)"
-        return f"If it still swings after the run before, as an arm with little friction does, {longer}."
+        return f"If it is still swinging after the previous run, as an arm with little friction does, {longer}."
 
     def does_not_repeat(self, index: int, position: float) -> NoReturn:
         """Raise SafetyStop for a joint that is at `position` [rad], not where it was one period ago."""
@@ -270,7 +270,7 @@ class Guard:
             Cause.UNLIKE_BEFORE,
             f"does not repeat its motion: under the same torque it is at {position:.3f} rad, far from where it was one "
             "period ago. Something pushes or holds it, its load has changed, it slips, or its encoder has failed. If "
-            f"none applies, it swings so far that its motion never repeats.{self._lower_torque}",
+            f"none of these applies, it swings so far that its motion never repeats.{self._lower_torque}",
         )
 
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
@@ -333,7 +333,7 @@ class Guard:
         self._stop(
             index,
             Cause.VELOCITY,
-            f"moves at {state.velocity[index]:.2f} rad/s, more than its velocity limit of "
+            f"is moving at {state.velocity[index]:.2f} rad/s, more than its velocity limit of "
             f"{self._joints[index]['fastest']:g} rad/s.{self._lower_torque}",
         )
 
@@ -442,8 +442,8 @@ class Guard:
         self._stop(
             index,
             Cause.WRONG_SIGN,
-            f"moves against its command: its motor has taken {self._joints[index]['found']:.2f} J out of the arm, more "
-            "than friction can account for. Is its direction reversed, or does something else drive the arm?",
+            f"is moving against its command: its motor has taken {self._joints[index]['found']:.2f} J out of the arm, "
+            "more than friction can account for. Is its direction reversed, or does something else drive the arm?",
         )
 
     def _look_slow(self, slow: Slow) -> None:
@@ -462,8 +462,8 @@ class Guard:
                 self._stop(
                     index,
                     Cause.VOLTAGE,
-                    f"has {volt:.1f} V; safety.min_voltage and max_voltage allow {safety.min_voltage:g} to "
-                    f"{safety.max_voltage:g}. Check the supply.",
+                    f"has a supply voltage of {volt:.1f} V; safety.min_voltage and max_voltage allow "
+                    f"{safety.min_voltage:g} to {safety.max_voltage:g}. Check the supply.",
                 )
 
     def _stop(self, index: int, cause: Cause, what: str) -> NoReturn:

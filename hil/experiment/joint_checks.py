@@ -81,8 +81,8 @@ class JointChecks:
         self._check = only_version(_look)
 
     def look(self, state: State, unsure: float) -> int:
-        """Check all joints; none may have missed this reply or the one before. Returns FINE, or CHECKS * joint + check
-        of a fault.
+        """Check all joints; none may have missed this reply or the previous one. Returns FINE, or CHECKS * joint +
+        check of a fault.
 
         unsure: excess duration of the exchange [s]. Joints after the first faulty one are not checked.
         """

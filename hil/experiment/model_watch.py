@@ -34,7 +34,7 @@ _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupli
 _RELATIVE_STD = 0.1
 _FRICTIONS, _FRICTIONS_UNDESCRIBED = 8.0, 3.0
 """Lower bounds on the torque scale, in multiples of the mean dry friction: up to twice that friction must not raise an
-alarm. Without a description, friction is that of typical servos; the bound then only concerns arms whose planned torque
+alarm. Without a description, friction is that of typical servos; the bound then matters only if the planned torque
 hardly exceeds it.
 """
 _TILT_SHARE = 0.2  # standard deviation of gravity perpendicular to the assumed direction, relative to gravity
@@ -240,13 +240,13 @@ class ModelWatch:
             recent = [torque[joint] for at, torque in self._commanded if at.time_before_write >= since]
             low, high = min(recent), max(recent)
             said = (
-                f"{name} stands still, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "
-                f"arm consistent with the prior and the data so far would move. {self._blocked_by[joint]}"
+                f"{name} is not moving, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "
+                f"arm consistent with the prior and the data so far would be moving. {self._blocked_by[joint]}"
             )
         else:
             said = (
                 f"{name} does not move like any arm consistent with the prior and the data so far: "
-                f"{lacking:+.3f} N m of the commanded torque are not reflected in its motion. Its motor or its "
+                f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "
                 "encoder has failed, something pushes or holds it, or the arm is not the one described."
             )
         raise SafetyStop(said, Cause.UNEXPECTED)

@@ -27,7 +27,9 @@ FLOOR_RAD = 0.05
 
 LASTING_S = 0.03
 UNJUDGED_S, _MOST_UNJUDGED = 0.2, 0.25
-"""Time at the end of a period that does not affect the tolerance in the next one [s], and its largest share."""
+"""Time at the end of a period that does not affect the tolerance in the next one [s], and the largest fraction of a
+period that this may be.
+"""
 
 _FEWEST = 2  # samples, however low the rate
 
@@ -54,7 +56,7 @@ sure_squared, sure_pairs: the same for the second half without its end.
 
 
 class Repetition:
-    """Compares the positions of a period of up to `samples` samples with those of the period before.
+    """Compares the positions of a period of up to `samples` samples with the previous period's.
 
     interval: time between samples [s].
     """
@@ -85,7 +87,7 @@ class Repetition:
         self._sums = np.zeros(len(self._sums), _SUMS)
         self._sums["lowest"], self._sums["highest"] = inf, -inf
         self.unlike: int | None = None
-        """Index of a joint that does not repeat the motion of the period before, or None."""
+        """Index of a joint that does not repeat the previous period's motion, or None."""
 
     def add(self, index: int, position: Sequence[float]) -> None:
         """Add sample `index` of the period: positions of all joints [rad], NaN where missing."""

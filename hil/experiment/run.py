@@ -376,7 +376,7 @@ def _check_inside(config: Config, bus: ServoBus) -> None:
         low, high = limited.position_limit
         if not low - MOST_OUTSIDE_RAD <= position <= high + MOST_OUTSIDE_RAD:
             raise ExperimentError(
-                f"{joint} is at {position:.3f} rad, where the previous run's stop left it: its position limit is "
+                f"{joint} is at {position:.3f} rad, where the previous run's stop left it, outside its position limit "
                 f"[{low:g}, {high:g}]. Move it back to arm.rest_pose by hand, then start again."
             )
 

@@ -77,7 +77,7 @@ class Silence:
         long, or None.
 
         refused: whether the servo answered with an error instead of its state; one such answer is enough. alone:
-        whether another servo was heard.
+        whether only this servo is silent, i.e. another one was heard.
         """
         last = self._last_heard[joint]
         if last is None:

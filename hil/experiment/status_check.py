@@ -76,7 +76,7 @@ class StatusCheck:
         self._cycles += 1
 
     def other_goal(self, joint: int) -> float | None:
-        """The goal in the joint's latest status [A or V] if it differs from that sent; otherwise None."""
+        """The goal in the joint's latest status [A or V] if it differs from the one sent; otherwise None."""
         return self._held[joint]
 
     def look(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:

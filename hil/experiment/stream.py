@@ -242,18 +242,18 @@ class Stream:
             differences.append(difference)
             if difference <= self._plan.settle_within:
                 self._note(
-                    f"{segment.role}: period {period} is settled, {difference:.2%} different from the one before"
+                    f"{segment.role}: period {period} has settled, {difference:.2%} different from the previous one"
                 )
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
                     self._check_motion(repetition.moved)
                 return
         if difference <= self._plan.drift_within:
-            self._note(f"{segment.role}: still drifts slowly: {difference:.2%} per period; using the last periods")
+            self._note(f"{segment.role}: still drifting slowly: {difference:.2%} per period; using the last periods")
             return
         raise NotSettled(
-            f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion still "
-            f"drifts: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
+            f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion is still "
+            f"drifting: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
             f"{self._plan.settle_within:.1%} ({self._plan.drift_within:.1%} if it drifts slowly). "
             + self._advice(differences, samples)
         )
@@ -288,7 +288,7 @@ class Stream:
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
                 against = f" Or {opposed(joint)}" if joint.seconds else ""
                 raise DidNotMove(
-                    f"{joint.title} moved by {way:.4f} rad in a whole period: it is stuck, or friction holds it."
+                    f"{joint.title} moved by only {way:.4f} rad in a whole period: it is stuck, or friction holds it."
                     f"{against} Move it by hand with torque off; if it is free, raise experiment.peak_torque."
                 )
 

@@ -15,8 +15,8 @@ import numpy as np
 __all__ = ["MEMORY", "TOLERANCE_RAD", "begin", "look"]
 
 TOLERANCE_RAD = 0.04
-"""A joint's sign is considered wrong if its motor has taken more work than this out of the arm, divided by the joint's
-largest planned torque [rad].
+"""A joint's sign is considered wrong if the work that its motor has taken out of the arm, divided by the joint's
+largest planned torque, exceeds this [rad].
 
 Because of delays, even a healthy motor takes some work out of the arm: up to 0.02 rad with a heavy arm at 20 Hz.
 """
@@ -42,7 +42,7 @@ def look(joints: Any, joint: int, goal: float, moved: float) -> float:
     """Add the work done by the previous goal; return the work taken out of the arm [J] if it is too much, otherwise -1.
 
     joints: records of all joints, with this memory in their field `work`. goal: the new goal [A or V]. moved:
-    displacement since the previous sample [rad], 0 if it is unknown what the servo did meanwhile.
+    displacement since the previous sample [rad], 0 if it is unknown what the servo did in between.
     """
     memory = joints[joint].work
     held, memory.held = memory.held, goal

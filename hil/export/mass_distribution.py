@@ -28,7 +28,9 @@ _UNKNOWN_LENGTH = 0.1  # m, arbitrary length of a pendulum without gravity, whos
 
 @dataclass(frozen=True)
 class LinkMass:
-    """One link: mass [kg], centre of mass along the link from its joint [m], inertia about it [kg m^2], length [m]."""
+    """One link: mass [kg], centre of mass along the link from its joint [m], inertia about that centre [kg m^2],
+    length [m].
+    """
 
     mass: float
     centre: float
@@ -81,7 +83,7 @@ def _share_of_rod(p: Mapping[str, float]) -> float:
         raise ExportError(
             f"inertia_1 * inertia_2 = {p['inertia_1'] * p['inertia_2']:.4g} must be greater than coupling^2 = "
             f"{p['coupling'] ** 2:.4g} kg^2 m^4: no links of positive mass have such inertias. Check the residual in "
-            "the report; excite more, or choose a richer [model] friction."
+            "the report; excite the arm more, or choose a richer [model] friction."
         )
     return max(ROD, 0.5 * (1 + needed))
 

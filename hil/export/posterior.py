@@ -114,7 +114,7 @@ def _nothing_older(formats: Sequence[str], out: Path, samples: int) -> None:
             remaining = sum(int(path.stem[4:]) >= samples for path in older)
             if remaining:
                 raise ExportError(
-                    f"{out} holds {len(older)} arms of an earlier draw, and {remaining} of them would remain: give "
+                    f"{out} holds {len(older)} arms from an earlier draw, and {remaining} of them would remain: give "
                     "another --out, or remove them."
                 )
 

@@ -27,7 +27,7 @@ def export_csv(source: Recorded, path: Path) -> list[str]:
 
 
 def export_parquet(source: Recorded, path: Path) -> list[str]:
-    """Write `path` with the unit in each column's metadata and result.json in the file's. Needs pyarrow."""
+    """Write `path`; its metadata contain the columns' units and result.json. Needs pyarrow."""
     try:
         import pyarrow as pa
         from pyarrow import parquet

@@ -1,4 +1,4 @@
-"""Helpers shared by URDF and MJCF export: numbers without loss of precision, comments, and the comments at the top."""
+"""Helpers shared by URDF and MJCF export: numbers without loss of precision, comments, and the comment header."""
 
 from xml.etree import ElementTree as ET
 

@@ -19,8 +19,8 @@ _VALUE, _LIMITS, _HEALTH = 7, 12, 14  # columns of a value, of a gauge's two lim
 
 @dataclass(frozen=True)
 class Layout:
-    """What fits into the terminal. gauge: columns of a gauge; gauges: how many of the two quantities, position and
-    goal, have a gauge.
+    """What fits into the terminal. gauge: width of a gauge in columns; gauges: how many of the two quantities, position
+    and goal, have a gauge.
     """
 
     gauge: int
@@ -43,7 +43,7 @@ def layout_for(columns: int, name: int) -> Layout:
 class LiveView:
     """Draws progress reports; stores values that are not in every sample: positions, temperatures and voltages.
 
-    Each run of a pilot starts over: its timing is not compared with that of the previous run.
+    Each run of a pilot starts over: its timing is not compared with the previous run's.
     """
 
     def __init__(self, config: Config, columns: int) -> None:

@@ -1,4 +1,4 @@
-"""A running experiment in the Rerun viewer: curves of every joint, and planar arms moving.
+"""A running experiment in the Rerun viewer: curves for every joint, and the motion of planar arms.
 
     hil identify arm.toml --live rerun              # starts the viewer
     hil identify arm.toml --live rerun:watch.rrd    # writes a file, to be opened with `rerun watch.rrd`

@@ -46,7 +46,7 @@ class Change:
 
     @property
     def percent(self) -> float | None:
-        """Change in percent of the value before; None if that is 0."""
+        """Change in percent of the earlier value; None if that is 0."""
         return 100 * (self.after - self.before) / self.before if self.before else None
 
 

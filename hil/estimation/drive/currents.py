@@ -30,7 +30,7 @@ _RECENT = 4
 
 _BEYOND, _BEYOND_OFTEN = 0.25, 0.02
 """A current was not the commanded one if it deviates this much from all recent goals and from 0, relative to the
-largest goal. This is reported if it applies to more than the second value, a fraction of the samples.
+largest goal. This is reported if it applies to more than a fraction of the samples, given by the second value.
 """
 
 _SMALL, _LEAST = 0.5, 0.1
@@ -61,14 +61,14 @@ def current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindin
         if said := said or _clipped(name, goal, measured, lower):
             warnings.append(said)
     disturbance = (
-        f"The current of {' and '.join(names)} was not the commanded one (see the warning), so the values, above all "
+        f"The current of {' and '.join(names)} was not the commanded one (see the warning), so the values, especially "
         "offsets and friction, may be off by more than their standard errors."
     )
     return CurrentFindings(tuple(warnings), (disturbance,) if names else ())
 
 
 def settled_current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindings:
-    """Compare the currents of the periodic samples only, on which a settled estimate is based."""
+    """Like `current_findings`, but only for the periodic samples, on which a settled estimate is based."""
     return current_findings(config, samples[samples["phase"] == Phase.PERIODIC])
 
 
@@ -96,8 +96,8 @@ def _other(name: str, goal: Array, measured: Array) -> str:
     )
     if beyond > _BEYOND_OFTEN:
         return (
-            f"{name} carried a current other than the commanded one in {100 * beyond:.0f} % of the samples, of "
-            f"opposite sign or larger: {why}"
+            f"{name} carried a current opposite to the commanded one, or larger, in {100 * beyond:.0f} % of the "
+            f"samples: {why}"
         )
     part = _short_part(goal, measured)
     if part > OFTEN and _follows_small_goals(goal, measured) < SHORT:

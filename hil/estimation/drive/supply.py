@@ -1,7 +1,7 @@
 """A supply that sags under load: detected from the servos' Present Input Voltage, and its effect on the torque.
 
-A motor at the velocity v draws a supply current with terms in u^2 and u v if it is driven with the voltage u, or in i^2
-and i v if it is driven with the current i. The resistance of the supply turns this current into a voltage drop. The
+A motor at velocity v draws a supply current with terms in u^2 and u v if it is driven with voltage u, or in i^2
+and i v if it is driven with current i. The resistance of the supply turns this current into a voltage drop. The
 register is read only a few times a second, in steps of 0.1 V. A regression of its readings on these products over the
 whole recording nevertheless gives the drop at every sample.
 
@@ -21,7 +21,7 @@ from hil.estimator import linalg
 Array = NDArray[np.float64]
 
 FEWEST = 40
-"""Minimum number of readings of the voltage."""
+"""Minimum number of voltage readings."""
 STEP_V = 0.1  # of the register
 SIGNIFICANT = 6.0
 """Number of standard errors by which the drop at full load must differ from zero."""
@@ -49,7 +49,7 @@ class Sag:
         return self.worst / float(self.volts.min())
 
     def remaining(self, samples: NDArray[np.void]) -> Array:
-        """Voltage relative to that without load (samples, joints)."""
+        """Voltage relative to the voltage without load (samples, joints)."""
         goal, velocity = samples["goal_current"], np.nan_to_num(samples["velocity"])
         drop = goal**2 @ self.by_square + (goal * velocity) @ self.by_product
         return np.asarray(1.0 - np.maximum(drop, 0.0)[:, None] / self.volts)
@@ -104,5 +104,5 @@ def supply_notes(config: Config, sag: Sag | None) -> tuple[str, ...]:
         )
     return (
         f"{found} The servos control their current, so this matters only at high speed: check whether the measured "
-        "current follows. A stronger supply or a shorter, thicker cable helps.",
+        "current follows its goal. A stronger supply or a shorter, thicker cable helps.",
     )

@@ -27,7 +27,7 @@ BETTER = 0.25  # largest sum of squared residuals with a step, relative to that 
 
 @dataclass(frozen=True)
 class Jump:
-    """A jump by `size` [rad] at `time` [s]. joint, recording: its indices, from 0."""
+    """A jump by `size` [rad] at `time` [s]. joint, recording: indices, counted from 0."""
 
     recording: int
     joint: int

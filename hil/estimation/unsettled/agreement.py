@@ -1,4 +1,4 @@
-"""Whether several recordings show the same arm: a load changed between them must not be mistaken for a missing term."""
+"""Whether several recordings show the same arm: a change of load must not be mistaken for a missing term."""
 
 from collections.abc import Sequence
 

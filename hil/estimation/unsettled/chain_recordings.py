@@ -40,8 +40,7 @@ UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "ca
 @dataclass(frozen=True)
 class ChainEstimated:
     """An estimate from recordings. result: complete except for what the caller adds. predicted: positions per recording
-    (joints, samples) [rad]; NaN: no
-    prediction.
+    (joints, samples) [rad]; NaN if there is none.
     """
 
     result: ShootingResult
@@ -190,8 +189,8 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         error, joint = float(foretold.max()), arm.joints[int(np.argmax(foretold))].name
         part = f"the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
         sentences.append(
-            f"Fitted to the rest, the model predicts the torque on {part} to within {100 * error:.1f} % ({joint} "
-            "worst)."
+            f"Fitted to the rest, the model predicts the torque on {part} to within {100 * error:.1f} % of its RMS "
+            f"(worst joint: {joint})."
         )
         trust = "no" if error > TORQUE_WRONG else "with care" if error > TORQUE_FORETOLD else trust
     if found.from_prior:

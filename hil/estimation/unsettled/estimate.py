@@ -49,8 +49,7 @@ NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 @dataclass(frozen=True)
 class Estimated:
     """An estimate from recordings. result: complete except for what the caller adds. predicted: positions per recording
-    (joints, samples) [rad]; NaN: no
-    prediction.
+    (joints, samples) [rad]; NaN if there is none.
     """
 
     result: ShootingResult
@@ -77,7 +76,7 @@ class Given:
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
-    """Estimate from all samples of a run that never became periodic or was stopped before it did."""
+    """Estimate from all samples of a run whose motion never became periodic."""
     config, facts = run.load_config(), run.load_facts()
     only_planar(config, "an estimate from all samples")
     samples = load_samples(run.samples_path, len(config.joints))

@@ -19,7 +19,7 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
     if absolute is not None and _is_clear(*absolute):
         raise CsvError(
             f"{source}: the angle of joint 2 seems to be measured from a fixed direction, such as the horizontal, "
-            f"instead of from link 1. With the difference of both angles, {_unexplained(*absolute)}. Set in "
+            f"instead of from link 1. With the difference between the two angles, {_unexplained(*absolute)}. Set in "
             '[columns] of --config ARM.toml (in Python: config="ARM.toml"): angles = "absolute"'
         )
     order = suspect_order(recordings)

@@ -351,10 +351,10 @@ def test_a_byte_order_mark_is_no_mistake_and_other_encodings_are_named(tmp_path:
     marked.write_text(text, encoding="utf-8-sig")
     assert load_config(marked).joints == load_config(CONFIGS / "first_time.toml").joints
     marked.write_text(text, encoding="utf-16")
-    with pytest.raises(ConfigError, match=r"UTF-16.*encoding UTF-8"):
+    with pytest.raises(ConfigError, match=r"UTF-16.*as UTF-8"):
         load_config(marked)
     marked.write_text(text.replace("[-4.2, 1.06]", "[-4.2, 1,06]"), encoding="utf-8")
-    with pytest.raises(ConfigError, match="The decimal sign is a point"):
+    with pytest.raises(ConfigError, match="The decimal separator is a point"):
         load_config(marked)
 
 

@@ -144,5 +144,5 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(ArmFileError, match=r"none\.urdf cannot be read"):
         read_urdf(tmp_path / "none.urdf")
     (tmp_path / "wide.urdf").write_text(TWO + "</robot>", encoding="utf-16")
-    with pytest.raises(ArmFileError, match="not UTF-8 text; save it with the encoding UTF-8"):
+    with pytest.raises(ArmFileError, match="not UTF-8 text; save it as UTF-8"):
         read_urdf(tmp_path / "wide.urdf")

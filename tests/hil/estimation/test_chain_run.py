@@ -120,7 +120,7 @@ def test_a_current_that_is_not_the_commanded_one_lowers_the_verdict(
     assert found.verdict.trust == "with care"
     (said,) = [each for each in found.verdict.sentences if "was not the commanded one" in each]
     assert said.startswith("The current of joint2 was not")
-    (warning,) = [each for each in found.warnings if "carried a current other than the commanded one" in each]
+    (warning,) = [each for each in found.warnings if "carried a current opposite to the commanded one" in each]
     assert warning.startswith("joint2 ")
 
 

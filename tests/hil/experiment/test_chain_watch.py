@@ -49,18 +49,18 @@ def test_a_joint_on_the_stop_on_which_it_rests_is_not_blocked(config: Config) ->
 
 
 def test_but_it_is_if_a_torque_away_from_that_stop_does_not_move_it(config: Config) -> None:
-    with pytest.raises(SafetyStop, match="stands still, with "):
+    with pytest.raises(SafetyStop, match="is not moving, with "):
         stands(config, 0.02, 2.0)
 
 
 def test_a_joint_that_has_been_on_both_sides_of_its_rest_angle_has_no_stop_there(config: Config) -> None:
-    with pytest.raises(SafetyStop, match="stands still, with "):
+    with pytest.raises(SafetyStop, match="is not moving, with "):
         stands(config, 0.02, -0.9, was_below=True)
 
 
 def test_one_that_never_left_it_is(config: Config) -> None:
     """It is blocked from the start, or its encoder is frozen."""
-    with pytest.raises(SafetyStop, match="stands still, with "):
+    with pytest.raises(SafetyStop, match="is not moving, with "):
         stands(config, 0.02, -2.0, was_away=False)
 
 
@@ -79,12 +79,12 @@ def test_one_that_never_left_its_stop_is_not_blocked_while_nothing_is_commanded(
 
 
 def test_but_it_is_if_it_cannot_be_lifted_from_it() -> None:
-    with pytest.raises(SafetyStop, match=r"joint3.* stands still, with -"):
+    with pytest.raises(SafetyStop, match=r"joint3.* is not moving, with -"):
         falling(-2.0)
 
 
 def test_the_same_joint_elsewhere_is(config: Config) -> None:
-    with pytest.raises(SafetyStop, match="stands still, with "):
+    with pytest.raises(SafetyStop, match="is not moving, with "):
         stands(config, 0.5, -0.9)
 
 
@@ -208,7 +208,7 @@ def test_what_is_said_of_a_joint_at_rest_and_of_one_that_moves(config: Config, w
         sees(config, watch, interval * number, goal_current=(0.01 * number, 0.0, 0.0))
     cast(Any, watch._observer).found = 0
     last = steps + 20
-    with pytest.raises(SafetyStop, match="stands still, with ") as stop:
+    with pytest.raises(SafetyStop, match="is not moving, with ") as stop:
         sees(config, watch, interval * last, velocity=(0.059, 0.0, 0.0))
     least, most = 0.01 * (last - steps) * constant, 0.01 * (last - 1) * constant
     assert f"with {least:+.3f} to {most:+.3f} N m" in str(stop.value) and stop.value.cause is Cause.UNEXPECTED

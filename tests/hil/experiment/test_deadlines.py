@@ -71,7 +71,7 @@ def rows_until_stop(deadlines: Deadlines, missed: int, met: int) -> int:
             for _ in range(met):
                 deadlines.met()
         except SafetyStop as stop:
-            assert "More than 20 % of the deadlines are missed" in str(stop) and "for 400 Hz" in str(stop)
+            assert "More than 20 % of the deadlines have been missed" in str(stop) and "for 400 Hz" in str(stop)
             return row
     return -1
 

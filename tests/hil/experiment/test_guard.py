@@ -294,7 +294,7 @@ def test_late_deadlines_stop_before_a_short_watchdog_acts(arm: Arm) -> None:
 
 def test_deadlines_missed_again_and_again_stop_though_never_many_in_a_row(arm: Arm) -> None:
     guard = Guard(arm())
-    with pytest.raises(SafetyStop, match=r"More than 20 % of the deadlines are missed.*latency") as stop:
+    with pytest.raises(SafetyStop, match=r"More than 20 % of the deadlines have been missed.*latency") as stop:
         for _ in range(40):
             guard.late()
             guard.look(STILL)
@@ -314,12 +314,12 @@ def test_deadlines_missed_again_and_again_stop_though_never_many_in_a_row(arm: A
 
 def test_motion_before_the_start(arm: Arm) -> None:
     for is_left, advice in (
-        (False, "still swings, .* wait until"),
-        (True, r"still swings .* raise safety\.rest_time \(3 s"),
+        (False, "still swinging, .* wait until"),
+        (True, r"still swinging .* raise safety\.rest_time \(3 s"),
     ):
         guard = Guard(arm(), left_by_a_run=is_left)
         guard.look_at_rest(STILL)
-        with pytest.raises(SafetyStop, match=rf"'elbow' \(ID 2.*moves before the start: \+0\.060.*{advice}") as stop:
+        with pytest.raises(SafetyStop, match=rf"'elbow' \(ID 2.*moved before the start: \+0\.060.*{advice}") as stop:
             guard.look_at_rest(STILL._replace(position=(-1.57, 0.06)))
         assert stop.value.cause is Cause.EARLY_MOTION
 

@@ -92,7 +92,11 @@ def stall(ports: list[Any], seconds: float) -> None:
 
 CAUSES: list[tuple[Cause, str, Callable[[list[Any]], None]]] = [
     (Cause.TEMPERATURE, r"'shoulder'.*at 50 degrees C", lambda p: setattr(p[0].bus.servos[1], "temperature_c", 50.0)),
-    (Cause.VOLTAGE, r"'elbow'.*has 10\.5 V", lambda p: setattr(p[0].bus.servos[2], "input_voltage_v", 10.5)),
+    (
+        Cause.VOLTAGE,
+        r"'elbow'.*has a supply voltage of 10\.5 V",
+        lambda p: setattr(p[0].bus.servos[2], "input_voltage_v", 10.5),
+    ),
     (Cause.ALERT, r"'elbow'.*overload", lambda p: fault(p, FaultKind.OVERLOAD, servo=2)),
     (Cause.MISSING, r"'elbow'.*missed 6 replies", lambda p: fault(p, FaultKind.LOST_REPLY, servo=2, duration=0.1)),
     (Cause.LATE, r"deadlines in a row", lambda p: stall(p, 0.06)),
@@ -291,7 +295,7 @@ def test_an_arm_that_is_elsewhere_once_torque_is_on_has_moved_before_the_start(
     monkeypatch.setattr(ServoBus, "_torque_on", shift)
     held = (("[experiment]\n", "[stabiliser]\nstiffness = [0.5, 0.2]\ndamping = [0.05, 0.02]\n\n[experiment]\n"),)
     stop, samples = run_until_stopped(arm(*(held if holds else ())), tmp_path / "run", lambda _: None, plan)
-    assert stop.cause is Cause.EARLY_MOTION and "'elbow'" in str(stop) and "moves before the start: +0.09" in str(stop)
+    assert stop.cause is Cause.EARLY_MOTION and "'elbow'" in str(stop) and "moved before the start: +0.09" in str(stop)
     assert len(samples) <= 2 and not samples["goal_current"].any()
     assert_stopped(ports[0])
 
@@ -311,7 +315,7 @@ def test_a_foreign_goal_just_before_a_stop_is_noted(
     ("happens", "said"),
     [
         (lambda ports: turn_round(ports, 0), "any arm"),
-        (lambda ports: fault(ports, FaultKind.STUCK_JOINT, servo=1), "stands still|any arm"),
+        (lambda ports: fault(ports, FaultKind.STUCK_JOINT, servo=1), "is not moving|any arm"),
     ],
 )
 def test_the_model_alone_stops_a_motor_that_does_not_do_as_told(

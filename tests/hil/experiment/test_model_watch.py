@@ -93,7 +93,7 @@ def test_a_joint_that_stands_still_is_told_with_the_torques_of_the_last_moments(
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     rest = tuple(config.arm.rest_pose)
     with pytest.raises(
-        SafetyStop, match=r"stands still, with [-+]\d\.\d+ to [-+]\d\.\d+ N m commanded in the last 0\.3 s"
+        SafetyStop, match=r"is not moving, with [-+]\d\.\d+ to [-+]\d\.\d+ N m commanded in the last 0\.3 s"
     ) as stop:
         for index in range(4000):
             now = index * interval

@@ -91,6 +91,6 @@ def test_the_command(identified: Path, tmp_path: Path, capsys: pytest.CaptureFix
     assert "3 arms in" in capsys.readouterr().out
     assert sorted(path.name for path in out.iterdir()) == [f"arm_{number:04d}.xml" for number in range(3)]
     assert hil("export", identified, "--format", "mjcf", "--samples", "2", "--out", out) == 2
-    assert "3 arms of an earlier draw, and 1 of them would remain" in capsys.readouterr().err
+    assert "3 arms from an earlier draw, and 1 of them would remain" in capsys.readouterr().err
     assert hil("export", identified, "--format", "csv", "--samples", "3") == 2
     assert "not 'csv'" in capsys.readouterr().err

@@ -333,7 +333,7 @@ def test_a_joint_that_hardly_moves_in_a_period_is_stuck(make: Make, steps: float
         assert settle(stream, [0.01], moved) == [0, 1, 2, 3]
         return
     for since in range(4):
-        with pytest.raises(DidNotMove, match=r"elbow.* moved by 0\.00"):
+        with pytest.raises(DidNotMove, match=r"elbow.* moved by only 0\.00"):
             settle(stream, [0.01], moved, since)
 
 
