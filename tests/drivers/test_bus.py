@@ -194,6 +194,7 @@ def test_a_watchdog_that_has_tripped_is_cleared_before_the_next_start(fake_confi
         # As after a program that was killed.
         bus.port.clock.wait_until(bus.port.clock.now() + 0.2)
         assert all(servo.watchdog_tripped for servo in servos(bus).values())
+        bus.release_held(bus.joints)
         with bus.torque(watchdog=0.1):
             bus.exchange([0.1, 0.0])
             assert all(servo.torque_enabled and not servo.watchdog_tripped for servo in servos(bus).values())

@@ -33,6 +33,7 @@ class Both(Port):
         self.time = 0.0
         self.sent = b""
         self.waiting = answer
+        self.overheard = b""
 
     def now(self) -> float:
         self.time += 1.0

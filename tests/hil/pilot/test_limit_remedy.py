@@ -30,7 +30,7 @@ def peaks(quantity: str, joint: int, typical: float, reached: float, *, torque: 
 def test_a_joint_that_sags_beyond_its_range_needs_a_wider_one_or_better_known_masses() -> None:
     said = limit_remedy(LEG, peaks("highest position", 2, 0.6, 1.4), STIFF)
     high = LEG.joints[2].position_limit[1]
-    assert f"a position_limit of {LEG.joints[2].name!r} whose upper end is {1.48 * high:.2f} rad" in said
+    assert f"a position_limit of {LEG.joints[2].name!r} with its upper end at {1.48 * high:.2f} rad" in said
     assert f"rest_pose {0.48 * high:.2f} rad farther from that end" in said
     assert said.endswith("([arm.prior] spread = 0.15 instead of 0.3)")
     assert "current_limit" not in said and "Hz" not in said

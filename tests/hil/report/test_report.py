@@ -76,7 +76,7 @@ def test_a_run_in_steps_shows_prediction_beside_what_was_seen(identified: Path) 
     result["steps"] = [step, {**step, "name": "full", "within_quantile": False}]
     path.write_text(json.dumps(result), encoding="utf-8")
     page = make_page(RunData.load(identified))
-    assert "In full a peak exceeded" in page
+    assert "In full, a peak exceeded" in page
     assert "pilot, peak torque shoulder 0.2 N m and elbow 0.1 N m" in page
     assert "0.617" in page
 

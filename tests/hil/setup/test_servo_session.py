@@ -154,7 +154,7 @@ def test_torque_that_another_program_switches_on_between_two_runs_is_cut_and_nam
         with servo_session(config):
             pytest.fail("the next run began")
     assert not any(servo.torque_enabled for servo in bench.servos.values())
-    assert "Torque is off on both servos, read back." in stop.value.__notes__
+    assert "Torque is off on both servos, confirmed by reading it back." in stop.value.__notes__
 
 
 def test_a_check_reports_torque_that_came_on_meanwhile_and_leaves_it(
@@ -322,7 +322,7 @@ def test_torque_that_another_program_switches_on_after_it_was_cut_is_cut_again_a
     assert bench.changed() == [] and not list(state_folder.glob("*.json"))
     said = "\n".join((str(ended.value), *ended.value.__notes__))
     assert "Another program switched torque on at joint 'elbow' (ID 2, XM430-W350)" in said
-    assert "Torque is off on both servos, read back." in said and "could not be restored" not in said
+    assert "Torque is off on both servos, confirmed by reading it back." in said and "could not be restored" not in said
     assert stop is None or ended.value is stop
 
 
