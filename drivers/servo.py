@@ -172,7 +172,7 @@ class Servo:
             raise WrongReply(
                 f"{self.title}: {what} failed: the reply is corrupted or does not match the request ({text}). Check "
                 f"its cable and supply, and for a second servo with ID {self.id}. Replies may also have come too late "
-                "because other programs keep this computer busy: then close them and try again."
+                "because other programs keep this computer busy; if so, close them and try again."
             )
         refused = error & ~ALERT
         if refused:

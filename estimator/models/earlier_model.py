@@ -33,8 +33,8 @@ IN_A_ROW = 2
 """Successive lessons for which it must not be explained."""
 
 ELASTIC_RAD = 0.03
-"""Distance after a reversal within which dry friction may differ from that of a sliding joint by as much as it holds at
-standstill [rad]; this share falls exponentially with the distance covered.
+"""Distance after a reversal within which dry friction may differ from that of a joint in sliding friction by as much as
+it holds at standstill [rad]; this share falls exponentially with the distance covered.
 """
 
 _SLOTS = max(BACK)

@@ -56,7 +56,7 @@ class Candidate:
 class Linearised:
     """Quadratic approximation of the weighted sum of squares near an estimate.
 
-    The causes are the parameters, followed by the initial state.
+    The unknowns, to which the shapes refer, are the parameters, followed by the initial state.
     """
 
     names: tuple[str, ...]
@@ -64,9 +64,9 @@ class Linearised:
     value: Array
     """Point of expansion (parameters,) [SI]."""
     normal: Array
-    """J'WJ (causes, causes)."""
+    """J'WJ (unknowns, unknowns)."""
     gradient: Array
-    """J'Wr with r simulated minus measured (causes,)."""
+    """J'Wr with r simulated minus measured (unknowns,)."""
     samples: int
     """Number of valid samples over all joints. Each joint's residual is divided by its RMS, so the sum of squares
     equals this number.
@@ -80,7 +80,7 @@ class Linearised:
 
     @cached_property
     def expected(self) -> Array:
-        """Normal equations of the priors of all causes (causes, causes)."""
+        """Normal equations of the priors of all unknowns (unknowns, unknowns)."""
         expected = np.zeros_like(self.normal)
         count = len(self.names)
         expected[:count, :count] = np.diag(self.precision)
@@ -91,11 +91,11 @@ class Linearised:
 
     @cached_property
     def states(self) -> list[int]:
-        """Indices of the initial state among the causes."""
+        """Indices of the initial state among the unknowns."""
         return list(range(len(self.names), len(self.normal)))
 
     def places(self, names: Sequence[str]) -> list[int]:
-        """Return the indices of parameters among the causes."""
+        """Return the indices of parameters among the unknowns."""
         return [self.names.index(name) for name in names]
 
     def fall(self, names: Sequence[str]) -> tuple[float, Array]:
@@ -128,10 +128,10 @@ def linearised(
     run = simulated_run(used)
     rms = np.sqrt(np.nanmean(estimate.residual**2, axis=1))[:, None]
     weight = np.where(np.isfinite(estimate.residual), 1.0 / np.maximum(rms, 1e-300), 0.0)
-    causes = len(every) + 2 * period.joints
-    normal, gradient = np.zeros((causes, causes)), np.zeros(causes)
+    unknowns = len(every) + 2 * period.joints
+    normal, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
     for part, position, derivative in run.pieces(physics, estimate.start, every):
-        J = (derivative * weight[:, part, None]).reshape(-1, causes)
+        J = (derivative * weight[:, part, None]).reshape(-1, unknowns)
         normal += J.T @ J
         gradient += J.T @ (weight[:, part] * (position - run.measured[:, part])).reshape(-1)
     sizes = _sizes(period, estimate)
@@ -290,10 +290,10 @@ def _sizes(period: SettledPeriod, estimate: Estimate) -> Sizes:
 
 
 def by_parameters(period: SettledPeriod, estimate: Estimate) -> Array:
-    """Return the derivatives of positions with respect to all causes (joints, samples, causes), divided by the
+    """Return the derivatives of positions with respect to all unknowns (joints, samples, unknowns), divided by the
     residual's RMS.
 
-    The causes are the estimate's parameters, followed by the initial state, as in `Linearised`.
+    The unknowns are the estimate's parameters, followed by the initial state, as in `Linearised`.
     """
     used = without_spikes(period)
     rms = np.sqrt(np.nanmean(estimate.residual**2, axis=1))[:, None]
@@ -305,7 +305,7 @@ def by_parameters(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def columns_of(run: Run, physics: Physics, start: Array, names: tuple[str, ...], weight: Array) -> tuple[Array, Array]:
-    """Return weighted derivatives (joints samples, causes) and simulated positions (joints, samples)."""
+    """Return weighted derivatives (joints samples, unknowns) and simulated positions (joints, samples)."""
     pieces = list(run.pieces(physics, start, names))
     derivative = np.concatenate([each for _, _, each in pieces], axis=1) * weight[:, :, None]
     position = np.concatenate([each for _, each, _ in pieces], axis=1)

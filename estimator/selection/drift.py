@@ -69,9 +69,9 @@ def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
     """Return the covariance (parameters, parameters) including the effect of friction that changed during `period`.
 
     The fit assumes constant friction. If friction changes at the rate of `drift`, other parameters absorb part of this
-    slow change of torque. This mainly affects parameters whose effect also varies slowly, such as gravity on an arm
-    that it hardly affects. The motion is assumed to follow the instantaneous friction, which holds if transients decay
-    within a small part of the period.
+    slow change of torque. This mainly concerns parameters whose torque also varies slowly, such as the gravity terms
+    of an arm on which gravity acts only weakly. The motion is assumed to follow the instantaneous friction, which holds
+    if transients decay within a small part of the period.
     """
     about = linearised(period, estimate, (), {})
     derivative = by_parameters(period, estimate)

@@ -69,7 +69,7 @@ def simulate(
     Args:
         physics: physical constants.
         start: state at the first sample (2 or 3, joints): angles [rad], velocities [rad/s] and optionally the torque of
-            the bristles [N m], by default that of sliding joints.
+            the bristles [N m], by default that in steady sliding.
         torque: mean motor torque over each step after each sample (joints, samples, steps) [N m].
         step: length of a step [s].
         max_substeps: maximum number of substeps into which a step is divided when a joint is near standstill.

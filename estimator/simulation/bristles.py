@@ -40,7 +40,7 @@ def has_bristles(physics: Physics) -> bool:
 
 
 def first_bend(physics: Physics, velocity: Array) -> Array:
-    """Return the bristles' torque (joints,) [N m] at the start of a simulation, as for sliding joints.
+    """Return the bristles' torque (joints,) [N m] at the start of a simulation, as in steady sliding.
 
     `velocity` (joints,) [rad/s]. For a joint that hardly moves, the deflection is unknown and assumed to be small.
     """

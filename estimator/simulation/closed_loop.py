@@ -122,7 +122,8 @@ def respond(
 ) -> Response:
     """Simulate the samples of `command` (joints, samples) [N m] at `rate` [1/s] from `state`.
 
-    `state` is as in `Response.state`; without its last row, the bristles are deflected as in sliding joints.
+    `state` is as in `Response.state`. Its last row may be omitted; the bristles then start with their deflection in
+    steady sliding.
     """
     joints, samples = command.shape
     steps = steps_per_sample(rate, integration.max_step)

@@ -54,7 +54,7 @@ def sensitive(physics: Physics) -> "type[Sensitive]":
 
 
 class PreslidingSensitive(Sensitive):
-    """A simulation with derivatives for presliding friction, starting with bristles deflected as in sliding joints."""
+    """A simulation with derivatives for presliding friction, starting with bristles deflected as in steady sliding."""
 
     def __init__(
         self,

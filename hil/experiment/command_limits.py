@@ -37,7 +37,8 @@ class CommandLimits:
     def _limited(self, goal: float, former: float, limit: float, name: str) -> float:
         if not abs(goal) < inf:
             raise SafetyStop(
-                f"{name} would have received a goal current of {goal}, which is not a number.", Cause.NOT_A_NUMBER
+                f"{name} would have received a goal current of {goal}, which is not a finite number.",
+                Cause.NOT_A_NUMBER,
             )
         wanted = limit if goal > limit else -limit if goal < -limit else goal
         change, slew = wanted - former, self._slew

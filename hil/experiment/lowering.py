@@ -34,8 +34,8 @@ LYING_RAD = 0.06
 """An arm within this angle of its rest pose in every joint is already at rest."""
 
 RUNS_AWAY = 0.25
-"""Velocity beyond that of the path home, relative to the velocity limit, at which a joint that gets faster although its
-torque opposes it does not obey.
+"""Velocity beyond that of the path home, relative to the velocity limit. A joint that exceeds it and still speeds up
+although its torque opposes the motion does not obey.
 """
 
 _GROWS_S = 0.015
@@ -172,8 +172,9 @@ class Lowering:
         if runs.any():
             joint = int(np.argmax(runs))
             raise SafetyStop(
-                f"{self._config.joints[joint].joint.title} gets faster, {velocity[joint]:+.2f} rad/s, although its "
-                "torque opposes it: its motor turns the wrong way or has failed, or something drives the joint.",
+                f"{self._config.joints[joint].joint.title} is speeding up (now {velocity[joint]:+.2f} rad/s) "
+                "although its torque opposes the motion: its motor turns the wrong way or has failed, or something is "
+                "pushing the joint.",
                 Cause.WRONG_SIGN,
             )
 

@@ -47,7 +47,7 @@ class Silence:
 
     @property
     def is_busy(self) -> bool:
-        """Whether this computer was late a short time ago."""
+        """Whether this computer counts as busy because this program recently woke up late."""
         return self._asked_at is not None and self._asked_at < self._busy_until
 
     def woke_up(self, now: float, late: float) -> None:

@@ -1,9 +1,9 @@
-"""Whether each joint obeys its motor while an arm is lowered: a motor that turns against its goals must not brake.
+"""Whether each joint obeys its motor while an arm is lowered: a reversed motor must not brake.
 
-A turned motor and something that pushes the joint look alike under one torque: the arm moves as if another torque
-acted on the joint. So the goal of such a joint is taken away for a moment, while the others are held. What the
-joint's own motor did wrong vanishes with its goal, in proportion; a push does not. The moment is short: a limp joint
-gains less speed by gravity than a motor of the wrong sign would give it.
+As long as the torque does not change, a reversed motor and something that pushes the joint look alike: the arm moves as
+if an additional torque acted on the joint. So the goal of such a joint is removed for a moment, while the others are
+held. Unexplained torque that comes from the joint's own motor falls in proportion to its goal; that of a push does not.
+The test is short: in that time a limp joint gains less speed from gravity than a reversed motor would give it.
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ from typing import NamedTuple
 __all__ = ["Obedience", "Residual"]
 
 SUSPECT = 0.5, 5.0
-"""Range of the unexplained torque, relative to the commanded one, that a motor of the wrong sign may cause: ideally 2;
-less right after it has turned round, more where its torque has just changed.
+"""Range of the unexplained torque, relative to the commanded one, that a reversed motor may cause: ideally 2; less
+right after the reversal, more if its torque has just changed.
 """
 
 ENOUGH = 0.45
@@ -23,8 +23,9 @@ ENOUGH = 0.45
 LONGEST_TEST_S = 0.06
 
 TURNED, PUSHED = 1.1, 0.7
-"""Share of a joint's torque that must vanish from the unexplained torque together with its goal: 2 for a turned motor,
-less if it has just turned round, 1 for one without torque, 0 for a push. Between the two, the joint is tested again.
+"""By how much the unexplained torque must fall, relative to the joint's own torque, when its goal is removed: 2 for a
+reversed motor, less right after the reversal, 1 for one without torque, 0 for a push. Between the two limits, the joint
+is tested again.
 """
 
 MOVES_RAD_S = 0.1
@@ -54,7 +55,7 @@ class _Test:
 
 
 class Obedience:
-    """Tests joints whose motion looks as if their motors turned against their goals. joints: their number."""
+    """Tests joints that move as if their motors were reversed. joints: their number."""
 
     def __init__(self, joints: int) -> None:
         self._tests: list[_Test | None] = [None] * joints
@@ -75,7 +76,7 @@ class Obedience:
                 self._tests[joint] = _Test(now, _drives(lacking, velocity[joint]))
 
     def look(self, found: Residual, velocity: Sequence[float], now: float) -> int:
-        """Process an exchange; return a joint whose motor turns against its goals, -1 if there is none."""
+        """Process an exchange; return a joint whose motor is reversed, -1 if there is none."""
         for joint, test in enumerate(self._tests):
             if test is None:
                 continue

@@ -90,8 +90,8 @@ def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: A
     for name, before, after in zip(names, first, second, strict=True):
         if abs(after - before) > _MOVED_TICKS:
             say(
-                f"{name} came to rest {abs(after - before)} steps apart: friction holds it. The midpoint is taken as "
-                "hanging straight down; if it is not, correct zero_ticks in the file."
+                f"{name} came to rest at two positions {abs(after - before)} steps apart, because friction holds it. "
+                "Their midpoint is taken as hanging straight down; if it is not, correct zero_ticks in the file."
             )
     return [round((before + after) / 2) for before, after in zip(first, second, strict=True)]
 

@@ -44,7 +44,8 @@ def compare_chain(run: RunFolder, mujoco: bool) -> tuple[Mapping[str, float] | N
     if mujoco:
         raise ConfigError(
             f"{config.path}: --mujoco is for planar arms: mujoco.sysid differentiates a spatial arm's simulation "
-            "numerically, which takes minutes per recording (benchmarks/chain.py has that comparison). Leave it out."
+            "numerically, which takes minutes per recording (benchmarks/chain.py has that comparison). Leave out "
+            "--mujoco."
         )
     samples = load_samples(run.samples_path, len(config.joints))
     period = settled_period(config, facts, samples, IDENTIFY)

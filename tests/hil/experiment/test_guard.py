@@ -338,7 +338,7 @@ def test_commands_are_clamped_slew_limited_and_never_nan(arm: Arm) -> None:
         last = guard.clamp([5.0, -5.0])
     assert last == pytest.approx([1.2, -0.8])
     for wrong in (nan, inf, -inf):
-        with pytest.raises(SafetyStop, match="is not a number"):
+        with pytest.raises(SafetyStop, match="is not a finite number"):
             guard.clamp([wrong, 0.0])
 
 
