@@ -1,7 +1,8 @@
-"""Detection of motor torques that differ from the torque column: clipped by the drive, or logged with another clock.
+"""Detection of motor torques that differ from the torque column: clipped by the drive, or timestamped by a different
+clock.
 
-As for reversed columns (`hil.estimator.baselines.signs`), the residual of inverse dynamics is compared for the torque
-as given and as changed.
+As in the detection of reversed columns (`hil.estimator.baselines.signs`), the residual of inverse dynamics with the
+torque as given is compared with the residual with a modified torque.
 """
 
 from collections.abc import Sequence

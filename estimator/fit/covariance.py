@@ -192,7 +192,7 @@ def _inverse(information: Array) -> Array:
 
 
 def larger_covariance(robust: Array, white: Array) -> Array:
-    """Return a covariance at least as large as both, along the directions in which they differ."""
+    """Return a covariance that is at least as large as both `robust` and `white` in every direction."""
     size, directions = linalg.eigh(white)
     root = directions * np.sqrt(np.maximum(size, 1e-300))
     ratio = linalg.solve(root, linalg.solve(root, robust).T)

@@ -61,9 +61,10 @@ def wave_peaks(
 
 
 def ranked_cycles(peaks: Mapping[str, Sequence[float]], most: int) -> list[dict[str, float]]:
-    """Return at most `most` choices of cycles from the result of `wave_peaks`, by parameter name, best first.
+    """Return at most `most` combinations of cycles per turn, each by parameter name, best first.
 
-    Later choices take the next number of every wave that has one.
+    The n-th combination takes the n-th best candidate of each wave in `peaks`, the result of `wave_peaks`, or its last
+    one if it has fewer.
     """
     ranks = min(most, max(map(len, peaks.values()), default=0))
     return [{name: each[min(rank, len(each) - 1)] for name, each in peaks.items()} for rank in range(ranks)]

@@ -112,7 +112,7 @@ class Space:
         return bool(self._least(position, needed, False)[0].min() >= 0.0)
 
     def lies(self, position: Array) -> NDArray[np.bool_]:
-        """Whether the arm is at rest in each pose (samples,) of a motion (joints, samples) [rad]."""
+        """Whether each pose (samples,) of a motion (joints, samples) [rad] is within LYING_RAD of the rest pose."""
         near: NDArray[np.bool_] = np.abs(position.T - self.rest).max(axis=1) < LYING_RAD
         return near
 

@@ -32,7 +32,8 @@ def fake(
         list[str] | None,
         typer.Option(
             metavar="ID:to=RAD[,at=S,duration=S]",
-            help="Move this servo's joint by hand while its torque is off (or ID:ticks=POSITION); may be repeated.",
+            help="Let a simulated hand move this servo's joint while its torque is off. ID:ticks=POSITION gives the "
+            "target in encoder ticks. May be repeated.",
         ),
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed for noise and faults, overriding the file's.")] = None,

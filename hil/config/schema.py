@@ -161,7 +161,7 @@ class SafetyConfig(Table):
     def _in_whole_steps(cls, seconds: float) -> float:
         steps = seconds / WATCHDOG_UNIT
         if abs(steps - round(steps)) > 1e-6:
-            raise ValueError(f"must be a multiple of {WATCHDOG_UNIT:g} s, the servos' time step")
+            raise ValueError(f"must be a multiple of {WATCHDOG_UNIT:g} s, the resolution of the servos' Bus Watchdog")
         return seconds
 
 

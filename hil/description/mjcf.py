@@ -188,7 +188,8 @@ class _Tree:
         body = int(self.model.jnt_bodyid[found[0]])
         if self.model.body_jntnum[body] != 1:
             raise ArmFileError(
-                f'{self.path}: body "{self.name(body)}" has several joints: give each a body of its own (without mass)'
+                f'{self.path}: body "{self.name(body)}" has several joints: give each joint a body of its own, each '
+                "with a small <inertial>"
             )
         return body
 

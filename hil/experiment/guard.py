@@ -253,7 +253,7 @@ class Guard:
                     Cause.EARLY_MOTION,
                     f"moved before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
                     f"is allowed. {self._still_swings()} Otherwise check whether a hand or a cable pushes or holds it, "
-                    "or whether its horn slips.",
+                    "whether its horn slips, or whether another program commands it.",
                 )
 
     def _still_swings(self) -> str:

@@ -81,10 +81,10 @@ class JointChecks:
         self._check = only_version(_look)
 
     def look(self, state: State, unsure: float) -> int:
-        """Check all joints; none may have missed this reply or the previous one. Returns FINE, or CHECKS * joint +
-        check of a fault.
+        """Check all joints; none may have missed this reply or the previous one.
 
-        unsure: excess duration of the exchange [s]. Joints after the first faulty one are not checked.
+        Returns FINE, or CHECKS * joint + the number of the failed check for the first joint that fails one; later
+        joints are not checked. unsure: excess duration of the exchange [s].
         """
         self._pack(self._bytes, 0, *state.position, *state.velocity, *state.goal_current, *state.current)
         before, after = state.time_before_write, state.time_after_read

@@ -69,7 +69,7 @@ class Silence:
         self.any_missed = any(self.counts)
 
     def all_heard(self, now: float) -> None:
-        """Record that all joints replied, as they did in the exchange before."""
+        """Record that all joints replied, as they did in the previous exchange."""
         self._last_heard = [now] * len(self.counts)
 
     def missed(self, joint: int, now: float, *, refused: bool = False, alone: bool = True) -> str | None:

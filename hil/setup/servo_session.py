@@ -333,7 +333,7 @@ class ServoSession:
                 self.bus.confirm_later(joint)
                 servo, settings = self.bus.drives[joint], self._wanted[joint]
                 if servo.read_despite_error("Model Number") != servo.table.number:
-                    raise WrongModel(f"{joint.title}: a servo of another model answers at its ID now.")
+                    raise WrongModel(f"{joint.title}: a servo of a different model now answers at this ID.")
                 put_back(servo, settings)
                 possible = attainable(servo, settings)
                 self._cut[joint] = {name: value for name, value in possible.items() if value != settings[name]}

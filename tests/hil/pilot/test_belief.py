@@ -110,8 +110,8 @@ def test_the_search_gives_up_at_the_current_limit_only_and_says_what_it_tried(tm
     held = load_config(path)
     said: list[str] = []
     with pytest.raises(
-        ExperimentError, match=r"Elbow did not move by 26 encoder steps\. Tried: Pilot .*; Pilot 2 "
+        ExperimentError, match=r"Elbow moved by fewer than 26 encoder steps\. Tried: Pilot .*; Pilot 2 "
     ) as error:
         identify_in_steps(held, RunFolder.create(tmp_path / "run", held), path, lambda _: None, said.append)
-    assert "current limits allow" in str(error.value) and "stronger servo" in str(error.value)
+    assert "configured limits allow" in str(error.value) and "stronger servo" in str(error.value)
     assert any("did not move: friction is larger than this torque" in line for line in said)

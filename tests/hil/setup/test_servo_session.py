@@ -391,7 +391,7 @@ def test_what_somebody_set_since_a_kill_stays(arm: Arm, bench: Bench, monkeypatc
 
 def test_settings_are_not_restored_to_a_servo_of_another_model(arm: Arm, bench: Bench) -> None:
     """The IDs may have been exchanged during the run."""
-    said = r"could not be restored\. A servo of another model answers at its ID now"
+    said = r"could not be restored\. A servo of a different model now answers at this ID"
     with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
         bench.servos[2].memory.set("Model Number", 1060)
         bench.eeprom[2].clear()
