@@ -352,10 +352,10 @@ class Search:
         )
         most = ", ".join(f"{torque:.3g}" for torque in most_torque(config))
         raise ExperimentError(
-            f"{_and(still)} moved by fewer than {MOVED_STEPS} encoder steps. Tried: {tried}; the configured "
-            f"limits allow {most} N m. With torque off, move each of these joints by hand. If it moves freely, raise "
-            "its current_limit or voltage_limit, check the supply, widen position_limit, lengthen experiment.period, or use "
-            "a stronger servo."
+            f"{_and(still)} moved by fewer than {MOVED_STEPS} encoder steps. Tried: {tried}; the configured limits "
+            f"allow {most} N m. With torque off, move each of these joints by hand. If it moves freely, raise its "
+            "current_limit or voltage_limit, check the supply, widen position_limit, lengthen experiment.period, or "
+            "use a stronger servo."
         )
 
 
