@@ -149,7 +149,9 @@ def test_friction_that_holds_the_arm_aside_is_read_from_both_sides(arm_file: Arm
         port.close()
     unit = 2 * math.pi / 4096
     assert arm.joints[1].zero_ticks == pytest.approx(2048 + 0.05 / unit, abs=3)
-    assert any(text.startswith("elbow came to rest 19") and "steps apart" in text for text in said), said
+    assert any(text.startswith("elbow came to rest at two positions 19") and "steps apart" in text for text in said), (
+        said
+    )
 
 
 @pytest.mark.parametrize(("sustained", "chosen"), [(52.0, 40), (900.0, 400), (370.0, 300), (23.0, 20), (61.0, 50)])
