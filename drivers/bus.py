@@ -58,7 +58,8 @@ class BusConfig:
     voltage with temperature.
     watchdog_required: reject firmware without Bus Watchdog.
     take_over: what to do if torque is already on: if true, let the arm sink slowly and cut torque; if false, refuse to
-    start. interval: time between two samples [s]; 0 without a fixed rate, in which case the servos' status is not read.
+    start.
+    interval: time between two samples [s]; 0 without a fixed rate, in which case the servos' status is not read.
     """
 
     url: str

@@ -7,6 +7,7 @@ from itertools import islice
 from random import Random
 from typing import NamedTuple
 
+from hil.drivers.others.foreign_values import ForeignValues
 from hil.drivers.packet import ALERT
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
 
@@ -34,9 +35,6 @@ Three of the same value are required for a goal that this program may have writt
 a servo itself may have set. By then, the status has detected lost writes, a tripped watchdog or a reboot; and writes
 that are lost occasionally leave a different goal each time.
 """
-
-_SELDOM, _SELDOM_S = 3, 10.0
-"""The same for foreign values that occur seldom and that this program cannot have written [s]."""
 
 _UNSURE_S = 0.01
 """Minimum time between the first and the last of these three [s], in which the status is read."""
@@ -105,8 +103,8 @@ class ReadBack:
         self._draw = Random(1)
         self._goals_sighted: list[_Sightings] = [deque() for _ in ids]
         self._modes_sighted: list[_Sightings] = [deque() for _ in ids]
-        self._seldom: list[deque[float]] = [deque(maxlen=_SELDOM) for _ in ids]
-        """When values that this program cannot have written were read back, by servo [s]."""
+        self._never_written = [ForeignValues() for _ in ids]
+        """Values that this program cannot have written, by servo."""
         self.is_unexpected = False
         """Whether the latest read-back found anything other than the latest goals or the modes that were set."""
         self.lost: Overruled | None = None
@@ -149,8 +147,10 @@ class ReadBack:
             seen.append((now, value))
             self.sighted = Overruled(place, register, value, written)
             is_ours = not of_modes and (value == 0 or any(value in each for each in sent))
-            if not is_ours and self._is_seldom(place, now):
-                return self.sighted
+            if not is_ours:
+                self._never_written[place].add(now)
+                if self._never_written[place].are_proof(now):
+                    return self.sighted
             times = [when for when, other in seen if other == value or not is_ours]
             most, least_s = (_UNSURE_SIGHTINGS, _UNSURE_S) if is_ours else (_SIGHTINGS, 0.0)
             if len(times) >= most and now - times[0] >= least_s:
@@ -160,12 +160,6 @@ class ReadBack:
         if not is_nearly_sure:
             self._choose_next(now)
         return None
-
-    def _is_seldom(self, place: int, now: float) -> bool:
-        """Whether this servo held a value that this program cannot have written seldom, but too often for chance."""
-        seldom = self._seldom[place]
-        seldom.append(now)
-        return len(seldom) == _SELDOM and now - seldom[0] <= _SELDOM_S
 
     def _choose_next(self, now: float) -> None:
         """Choose what to read next; a change of mode resets the goal, so a foreign goal may be its first sign."""

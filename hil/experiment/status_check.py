@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from itertools import islice
 
 from hil.config.schema import Config
+from hil.drivers.others.foreign_values import ForeignValues
 from hil.drivers.packet import HardwareError
 from hil.drivers.servo import describe_error
 from hil.drivers.servo_model import WATCHDOG_UNIT
@@ -28,11 +29,6 @@ _LEARNT_READINGS = 3
 _STALE_READINGS = 2
 _GOALS_MISSED = 2
 """Consecutive mismatches before a goal counts as lost, because a single packet may be lost."""
-
-_FOREIGN_GOALS, _FOREIGN_S = 3, 10.0
-"""Number of status readings with a goal that this program never sent, and the time in which they prove that goals are
-changed now and then [s]. Noise cannot change a goal, since its checksum would fail.
-"""
 
 _REMEMBERED = 256
 """Number of latest goals that are kept."""
@@ -58,8 +54,8 @@ class StatusCheck:
         self._held: list[float | None] = [None] * len(config.joints)
         self._agreed_at = [0] * len(config.joints)
         self._is_foreign = [False] * len(config.joints)
-        self._foreign_at: list[deque[float]] = [deque(maxlen=_FOREIGN_GOALS) for _ in config.joints]
-        """Times of the latest status readings with a goal that this program never sent, by joint [s]."""
+        self._foreign = [ForeignValues() for _ in config.joints]
+        """Goals in the status that this program never sent, by joint."""
         # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
         self._clock = [(0.0, 0.0, 0, 0)] * len(config.joints)
 
@@ -120,11 +116,11 @@ class StatusCheck:
             self._held[joint], self._agreed_at[joint], self._is_foreign[joint] = None, self._cycles, False
             return None
         self._held[joint] = status.goal
-        foreign_at = self._foreign_at[joint]
+        foreign = self._foreign[joint]
         if self._never_sent(joint, status.goal):
             self._is_foreign[joint] = True
-            foreign_at.append(now)
-        is_repeated = len(foreign_at) == _FOREIGN_GOALS and now - foreign_at[0] <= _FOREIGN_S
+            foreign.add(now)
+        is_repeated = foreign.are_proof(now)
         self._missed[joint] += 1
         if self._missed[joint] < _GOALS_MISSED and not is_repeated:
             return None
