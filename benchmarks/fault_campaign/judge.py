@@ -65,6 +65,9 @@ sent them (`fault_campaign.twin`).
 _TICKS_PER_RAD = 4096 / (2 * np.pi)
 _TICKS_PER_RAD_S = 60 / (2 * np.pi) / 0.229
 
+Numbers = NDArray[np.float64]
+"""A column of a record: with its type stated, checking the types of arithmetic on it takes a tenth of the time."""
+
 
 @dataclass(frozen=True)
 class Story:
@@ -136,7 +139,8 @@ def driving_ms(config: Config, told: "Told", story: Story, undisturbed: Story) -
     longest = 0.0
     for joint, (sent, heard) in enumerate(zip(told.sent, told.heard, strict=True)):
         record = undisturbed.record[:, joint]
-        most = DRIVES_SHARE * np.abs(record["goal"][record["driven"]]).max(initial=1)
+        goal: Numbers = record["goal"]
+        most = DRIVES_SHARE * float(np.abs(goal[record["driven"]]).max(initial=1))
         sent_at = np.array([each[0] for each in sent])
         moved = _visible_motion(sent_at, np.array(heard).reshape(-1, 4))
         along = config.joints[joint].direction * np.array([each[1] for each in sent]) * np.sign(moved)
@@ -338,11 +342,11 @@ class Told:
         if not heard.size:
             return wrong
         at = np.clip(np.searchsorted(time, heard[:, 0]), 0, time.size - 1)
+        true: Numbers = own[what][at]
         if what == "position":
-            false = np.abs(heard[:, 1] - own["position"][at]) > LIE_RAD
+            false = np.abs(heard[:, 1] - true) > LIE_RAD
         else:
-            error = np.abs(heard[:, 2] - own["velocity"][at])
-            false = error > LIE_RAD_S + LIE_SHARE * np.abs(own["velocity"][at])
+            false = np.abs(heard[:, 2] - true) > LIE_RAD_S + LIE_SHARE * np.abs(true)
         steps = round(1.2 * interval / STEP_S) + 1
         for index in at[false]:
             wrong[index : index + steps] = True
@@ -361,7 +365,7 @@ class Told:
             return np.zeros(time.size, bool)
         when = np.array([each[0] for each in self.sent[joint]])
         goals = np.array([each[1] for each in self.sent[joint]])
-        done = np.where(own["torque"], own["goal"], 0)
+        done: Numbers = np.where(own["torque"], own["goal"], 0)
         tolerance = OBEYED * self._largest[joint] + 1
         # While a goal is in transit, the servo may still hold the previous one.
         latest = np.searchsorted(when, time, "right") - 1
@@ -376,8 +380,9 @@ class Told:
 def _beyond(config: Config, joint: int, own: NDArray[Any]) -> NDArray[np.bool_]:
     low, high = config.joints[joint].position_limit
     fastest = config.joints[joint].velocity_limit
-    outside = (own["position"] < low - 1e-3) | (own["position"] > high + 1e-3)
-    return np.asarray(outside | (np.abs(own["velocity"]) > 1.02 * fastest))
+    position: Numbers = own["position"]
+    velocity: Numbers = own["velocity"]
+    return (position < low - 1e-3) | (position > high + 1e-3) | (np.abs(velocity) > 1.02 * fastest)
 
 
 def _astray(
@@ -389,8 +394,10 @@ def _astray(
         return wrong
     if config.stabiliser is None:
         count = _same_plan(own[:count], undisturbed[:count])
-    most = ASTRAY_RAD + ASTRAY_SHARE * float(np.ptp(undisturbed["position"]))
-    wrong[:count] = np.abs(own["position"][:count] - undisturbed["position"][:count]) > most
+    position: Numbers = own["position"]
+    expected: Numbers = undisturbed["position"]
+    most = ASTRAY_RAD + ASTRAY_SHARE * float(np.ptp(expected))
+    wrong[:count] = np.abs(position[:count] - expected[:count]) > most
     return wrong
 
 
@@ -399,8 +406,9 @@ def _same_plan(own: NDArray[Any], undisturbed: NDArray[Any]) -> int:
 
     Later a different plan is run: a disturbed period does not repeat the one before, so one more is needed.
     """
-    largest = np.abs(undisturbed["goal"][undisturbed["driven"]]).max(initial=1)
-    other = np.abs(own["goal"] - undisturbed["goal"]) > OBEYED * largest
+    goal: Numbers = undisturbed["goal"]
+    largest = float(np.abs(goal[undisturbed["driven"]]).max(initial=1))
+    other = np.abs(own["goal"] - goal) > OBEYED * largest
     lasting = np.convolve(other, np.ones(LASTING_MS), "valid") > LASTING_MS - GAP_MS
     return int(np.argmax(lasting)) if lasting.any() else own.size
 
