@@ -84,11 +84,20 @@ def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta:
         least = most = residual
     if is_first or residual < least:
         rest[_LEAST] = torque
-        rest[_SINGLES : _SINGLES + count] = row
+        _keep(rest, _SINGLES, row)
     if is_first or residual > most:
         rest[_MOST] = torque
-        rest[_SINGLES + count :] = row
+        _keep(rest, _SINGLES + count, row)
     return float(residual - least if residual - least >= most - residual else residual - most)
+
+
+def keep(rest: Any, first: int, row: Any) -> None:
+    """Store an equation from column `first` on.
+
+    Element by element: for the assignment of a slice, numba compiles an error message about shapes, which takes 2 s.
+    """
+    for i in range(row.size):
+        rest[first + i] = row[i]
 
 
 def variance(rest: Any, distance: float, row: Any, covariance: Any) -> float:
@@ -133,4 +142,5 @@ def blocked(
 
 _inner: Any = numba.njit(nogil=True, error_model="numpy")
 forget = _forget = _inner(forget)
+keep = _keep = _inner(keep)
 withstood, is_suspect, look, variance, blocked = map(_inner, (withstood, is_suspect, look, variance, blocked))

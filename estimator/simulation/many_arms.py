@@ -241,7 +241,9 @@ def _peaks_loop(
                     found = played
                     left = periods - 1
                 played += 1
-                former[:] = position
+                for joint in range(2):  # assigning a slice takes 2 s to compile
+                    for k in range(position.shape[1]):
+                        former[joint, k] = position[joint, k]
             if segment == 0:
                 settled[arm] = found
             if not found:

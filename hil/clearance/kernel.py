@@ -114,7 +114,8 @@ def _all_loop(chain: Any, shapes: Any, pairs: Any, q: Any, out: Any) -> None:
     rotation, translation, axis = chain
     link, ends, radius, floor, boxes = shapes
     frame, at = np.empty((q.shape[1] + 1, 12)), np.empty(ends.shape)
-    frame[0] = BASE
+    for r in range(BASE.size):  # assigning the row takes 2 s to compile
+        frame[0, r] = BASE[r]
     motion = np.empty((q.shape[1], 6, 6))
     for k in range(q.shape[0]):
         place(rotation, translation, axis, q[k], frame[1:], motion)
@@ -131,7 +132,8 @@ def _least_loop(chain: Any, shapes: Any, pairs: Any, needed: Any, q: Any, room: 
     rotation, translation, axis = chain
     link, ends, radius, floor, boxes = shapes
     frame, at = np.empty((q.shape[1] + 1, 12)), np.empty(ends.shape)
-    frame[0] = BASE
+    for r in range(BASE.size):  # assigning the row takes 2 s to compile
+        frame[0, r] = BASE[r]
     motion = np.empty((q.shape[1], 6, 6))
     middle, half = np.empty((link.size, 3)), np.empty(link.size)
     for k in range(link.size):

@@ -21,6 +21,8 @@ from typing import Any
 import numba
 import numpy as np
 
+from hil.estimator.compiled import compiled
+
 # Rows of the array `motion` by joint, six numbers each.
 AXIS, VELOCITY, ACCELERATION, SWEPT, CARRIED, CARRIED_AGAIN = range(6)
 # Columns of the array `body` by link: mass; first moment; inertia (xx xy xz yy yz zz) about the base's origin; linear
@@ -357,11 +359,11 @@ def invert(matrix: Any, inverse: Any, factor: Any) -> bool:  # noqa: PLR0912
     return True
 
 
-# Functions called only from compiled code need no wrappers for C.
-compiled: Any = numba.njit(  # type: ignore[call-overload]
-    nogil=True, error_model="numpy", fastmath={"contract"}, _nrt=False, no_cfunc_wrapper=True
-)
-_cross, _dot, _push, _carry, _flow, _into = map(compiled, (_cross, _dot, _push, _carry, _flow, _into))
-place, move, accelerate, differentiate, regress, pull, invert = map(
-    compiled, (place, move, accelerate, differentiate, regress, pull, invert)
+# Functions called only from compiled code need no wrappers for C. The large ones are part of several loops and cached,
+# so that a program that needs another of these loops later does not compile them again.
+_PLAIN: dict[str, Any] = {"fastmath": {"contract"}, "_nrt": False, "no_cfunc_wrapper": True}
+_inner: Any = numba.njit(nogil=True, error_model="numpy", **_PLAIN)
+_cross, _dot, _push, _carry, _flow, _into = map(_inner, (_cross, _dot, _push, _carry, _flow, _into))
+place, move, accelerate, differentiate, regress, pull, invert = (
+    compiled(each, **_PLAIN) for each in (place, move, accelerate, differentiate, regress, pull, invert)
 )
