@@ -48,6 +48,9 @@ class AmplitudeOptions:
     """
     polishing_ratio: float = 1.06
     """Factor by which each of the final increases raises a joint's torque."""
+    worst_arms: int = 4
+    """Number of the worst arms, beyond those that may exceed a limit, that are simulated first once a check has failed.
+    """
     back_off: float = 0.93
     """Factor applied to the torque when the check on all arms has failed."""
     torque_share: float = 0.97
@@ -104,11 +107,16 @@ def largest_amplitude(
     most = most_torque(config, options)
     most = most if cap is None else np.minimum(most, cap)
     found = _search(config, base, ensemble.first(options.search_arms), share, pose, most, executor, options)
+    worst: NDArray[np.intp] = np.arange(0)
     for _ in range(options.max_rounds):
         plan = scaled(config, base, found)
-        prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
-        if _chance(prediction, share) <= config.safety.limit_chance:
-            return Amplitude(plan, found, prediction)
+        # The arms that were worst with more torque tell most cheaply that this one is too much as well.
+        if not _too_many(config, plan, ensemble.only(worst), share, pose, ensemble.size):
+            prediction = predict(config, plan, ensemble, pose=pose, executor=executor)
+            if _chance(prediction, share) <= config.safety.limit_chance:
+                return Amplitude(plan, found, prediction)
+            used = prediction.shares[:, :GUARDED].max(axis=(1, 2))
+            worst = np.argsort(used)[-(int(config.safety.limit_chance * ensemble.size) + options.worst_arms) :]
         found = found * options.back_off
     raise NoSafeTorque(
         "No torque was found that keeps the arm within its limits. Widen position_limit and velocity_limit, add values "
@@ -192,10 +200,22 @@ def _reached(config: Config, prediction: Prediction, share: float) -> Array:
     return np.asarray(np.maximum(foreseen, counted) / share)
 
 
+def _too_many(config: Config, plan: Plan, few: Ensemble, share: float, pose: Array | None, count: int) -> bool:
+    """Return whether more of these few arms exceed `share` of a limit than `count` arms may."""
+    if not few.size:
+        return False
+    passed = _passed(predict(config, plan, few, pose=pose), share)
+    return bool(passed.sum() > config.safety.limit_chance * count)
+
+
+def _passed(prediction: Prediction, share: float) -> NDArray[np.bool_]:
+    """Whether each arm exceeds `share` of a limit (arms,)."""
+    return np.asarray((prediction.shares[:, :GUARDED] >= share).any(axis=(1, 2)))
+
+
 def _chance(prediction: Prediction, share: float) -> float:
     """Probability that an arm exceeds `share` of a limit: the larger of the observed fraction and the tail estimate."""
-    counted = float(np.mean((prediction.shares[:, :GUARDED] >= share).any(axis=(1, 2))))
-    return max(counted, prediction.stop_chance)
+    return max(float(np.mean(_passed(prediction, share))), prediction.stop_chance)
 
 
 def most_torque(config: Config, options: AmplitudeOptions = DEFAULTS) -> Array:

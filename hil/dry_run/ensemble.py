@@ -50,6 +50,10 @@ class Ensemble:
         """The first `count` arms as an ensemble."""
         return Ensemble(self.physics[:count], self.torque_scale[:count], self.source)
 
+    def only(self, arms: NDArray[np.intp]) -> "Ensemble":
+        """The arms with these indices as an ensemble."""
+        return Ensemble(tuple(self.physics[arm] for arm in arms), self.torque_scale[arms], self.source)
+
 
 def prior_ensemble(config: Config, count: int, seed: int = 0) -> Ensemble:
     """Draw arms from link lengths and `[arm.prior]`. Raises ConfigError."""

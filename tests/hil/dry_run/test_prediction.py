@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,11 @@ import pytest
 from hil.api.dry_run import dry_run
 from hil.config.schema import Config, load_config, parse_config
 from hil.dry_run import chain_prediction
-from hil.dry_run.amplitude import Amplitude, largest_amplitude
-from hil.dry_run.ensemble import earlier_result, prior_ensemble
+from hil.dry_run.amplitude import Amplitude, AmplitudeOptions, largest_amplitude
+from hil.dry_run.ensemble import Ensemble, earlier_result, prior_ensemble
 from hil.dry_run.prediction import GUARDED, Prediction, predict, quantities_of
-from hil.errors import ConfigError, ResultError
-from hil.plan.plan import make_plan
+from hil.errors import ConfigError, NoSafeTorque, ResultError
+from hil.plan.plan import Plan, make_plan
 from tests.support.command_line import hil
 from tests.support.dry_runs import is_within, prior_study, run_on
 from tests.support.edits import replaced
@@ -49,6 +50,25 @@ def test_an_executor_gives_the_same_prediction(known: Config) -> None:
     assert (here.values == there.values).all() and (here.settled_after == there.settled_after).all()
     found, again = largest_amplitude(known, ensemble), largest_amplitude(known, ensemble, executor=elsewhere)
     assert (found.peak_torque == again.peak_torque).all()
+
+
+def test_too_much_torque_is_refused_by_the_worst_arms_alone(known: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once a check on all arms has failed, each smaller torque is first tried on the arms that were the worst."""
+    simulated: list[int] = []
+
+    def never_safe(
+        config: Config, plan: Plan, ensemble: Ensemble, *, briefly: bool = False, **given: Any
+    ) -> Prediction:
+        if not briefly:
+            simulated.append(ensemble.size)
+        prediction = predict(config, plan, ensemble, briefly=briefly, **given)
+        return replace(prediction, shares=np.maximum(prediction.shares, 0.0 if briefly else 1.0))
+
+    monkeypatch.setattr("hil.dry_run.amplitude.predict", never_safe)
+    options = AmplitudeOptions(max_rounds=5)
+    with pytest.raises(NoSafeTorque):
+        largest_amplitude(known, prior_ensemble(known, 24), options=options)
+    assert simulated == [24, *4 * [options.worst_arms]]
 
 
 def test_the_largest_amplitude_keeps_every_simulated_arm_within_its_limits(known: Config) -> None:
