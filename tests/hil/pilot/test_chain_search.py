@@ -33,6 +33,7 @@ from hil.runs.recording import load_samples
 from tests.support.paths import CONFIGS
 
 LEG = CONFIGS / "leg.toml"
+DESIGNED: dict[str, Paths] = {}
 
 
 @pytest.fixture(scope="module")
@@ -189,8 +190,11 @@ def searching(config: Config, belief: ChainBelief, paths: Paths, say: Say) -> Ch
 
 
 def search_of(config: Config, belief: ChainBelief, said: list[str]) -> ChainSearch:
-    paths = Paths.of(config, ChainBelief.prior(config).torque)
-    return searching(config, belief, paths, said.append)
+    """A search whose first paths, which are immutable, are designed once for all tests of the same configuration."""
+    key = config.model_dump_json()
+    if key not in DESIGNED:
+        DESIGNED[key] = Paths.of(config, ChainBelief.prior(config).torque)
+    return searching(config, belief, DESIGNED[key], said.append)
 
 
 def heavier(belief: ChainBelief, times: float) -> ChainBelief:
