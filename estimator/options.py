@@ -283,7 +283,8 @@ class SelectionOptions:
     wave_evidence: float = 0.05
     """Ripple or cogging is tried if the evidence in the score test is at least this.
 
-    It is lenient because the test only finds the wave's period roughly; a fit that includes the wave explains more.
+    The threshold is lenient because the test only finds the wave's period roughly; a fit that includes the wave
+    explains more.
     """
     prune_levels: tuple[float, ...] = (1e-3, 0.1)
     """Significance levels for removing terms, tried in turn until the reduced model explains the motion as well."""

@@ -26,8 +26,8 @@ MOST_SAMPLES = 30_000  # more would take too long
 
 @dataclass(frozen=True)
 class Clipped:
-    """A joint whose torque seems limited to `level` [N m], although the column exceeds it in the fraction `beyond` of
-    samples.
+    """A joint whose torque seems limited to `level` [N m], although the torque column exceeds it in a fraction `beyond`
+    of the samples.
 
     residual, residual_given: relative RMS residual of its torque, with the limit and as given.
     """

@@ -69,7 +69,7 @@ class Decay:
     further: int
 
     def is_warming(self, correlation: float) -> bool:
-        """Whether it looks like friction that warms up instead of a transient that has not died out.
+        """Whether the change looks like friction warming up rather than a transient that has not died out.
 
         Friction decreases over many periods, and the motion always changes in the same direction. A transient
         oscillates at the arm's own frequencies, or decays faster. correlation: see `correlation_of_changes`.
@@ -83,7 +83,7 @@ def decay_of(differences: Sequence[float], within: float) -> Decay | None:
     None if they do not decrease steadily: a transient only dies out and friction only warms up, whereas backlash, a
     dragging cable or bumps make the differences irregular.
 
-    differences: in the order of time; the first may contain the transient of the ramp, but is not exceeded later.
+    differences: in the order of time; the first may contain the transient of the ramp.
     """
     falling = list(differences[1:])
     if len(falling) < 2 or not all(math.isfinite(each) and each > 0.0 for each in differences):
@@ -98,7 +98,7 @@ def decay_of(differences: Sequence[float], within: float) -> Decay | None:
 
 
 def correlation_of_changes(position: Array) -> float:
-    """Return the correlation of a period's change with the one before; -1 for opposite changes.
+    """Return the correlation of a period's change with the change before it; -1 for opposite changes.
 
     position: the three latest periods (3, joints, samples) [rad]. The joint whose motion changes most, relative to the
     motion, counts. As in `settling_difference`, only the second halves are compared. NaN if nothing can be compared.

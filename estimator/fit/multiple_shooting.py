@@ -304,8 +304,8 @@ def estimate_by_shooting(
         start: initial guess of the base parameters (base parameters,) [SI], such as that of
             `hil.estimator.baselines.idim`.
         length: nominal length of a segment [s].
-        zeros: also estimate the encoders' zero errors, one per joint and recording, for servos that set their zero
-            again at every start. They can only be determined with gravity.
+        zeros: also estimate the encoders' zero errors, one per joint and recording, for servos whose zero changes at
+            every start. They can only be determined with gravity.
         of: which segments of each recording to fit; the others are left for validation.
         near: estimate with another model or other segments of the same recordings, used as the only initial guess.
         options: tolerances and limits.

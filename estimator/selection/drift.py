@@ -49,8 +49,8 @@ class Drift:
         return bool(np.any((np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > LEAST)))
 
     def after_correction(self) -> "Drift":
-        """Return the change that may remain after a correction: the error of the measured change, and its part that is
-        not linear in time.
+        """Return the change that may remain after a correction: the error of the measured change, and the part of the
+        change that is not linear in time.
         """
         return replace(self, change=np.hypot(self.std, UNEVEN * self.change))
 

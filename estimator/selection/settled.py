@@ -66,8 +66,8 @@ def choose(
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
         seconds: time from the middle of `periods` to that of `held_out` [s], if known.
         options: thresholds.
-        executor: a concurrent.futures executor, which starts fits that may turn out not to be needed. It does not
-            change the choice.
+        executor: a concurrent.futures executor, on which fits are started that may turn out not to be needed. It does
+            not change the choice.
 
     Raises:
         ConvergenceError: if no model can be fitted.

@@ -82,7 +82,7 @@ class Space:
     at_rest: Array
     """Distance of each pair in the rest pose (pairs,) [m]."""
     is_touched: NDArray[np.bool_]
-    """Whether anything may touch, in the rest pose, the part of the arm that each joint moves (joints,)."""
+    """Whether, in the rest pose, anything may touch the part of the arm that each joint moves (joints,)."""
     _built: Array
     """Median distance of pairs that are near each other by design, otherwise infinite (pairs,) [m]."""
     _pairs: NDArray[np.int64]

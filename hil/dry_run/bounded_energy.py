@@ -24,7 +24,8 @@ _MARGIN = 0.05
 class Boundary:
     """The position limits of an arm and the lowest potential energy at them.
 
-    low, high: limits (joints,) [rad]. least: that energy [J]; -inf if the arm's energy is not bounded by this model.
+    low, high: limits (joints,) [rad]. least: that lowest energy [J]; -inf if the arm's energy is not bounded by this
+    model.
     """
 
     physics: Physics

@@ -5,7 +5,7 @@ Ostermeier, Evolutionary Computation 9 (2001) 159, with one step size for all) o
 Fourier series of `hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation
 is scaled to the limits of position and speed and then shrunk until `allowed` accepts it.
 
-Friction is treated as unknown too, with a model no more accurate than that of the links. If it were taken as known,
+Friction is treated as unknown too, and its model as no more accurate than that of the links. If it were taken as known,
 slow, creeping motion would seem to identify a light joint, whose torque is mostly friction.
 
 This designer is for the pilot experiment, for which only limits are known: it also chooses the centre and the width of
@@ -167,7 +167,7 @@ class PathDesigner:
                 best = value, centre, lines
         if best is None:
             raise ExcitationError(
-                f"none of {CENTRES} centres has a path that stays within the torque and clearance limits"
+                f"no path about any of the {CENTRES} centres tried stays within the torque and clearance limits"
             )
         return best[1], best[2]
 

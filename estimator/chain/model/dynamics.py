@@ -94,8 +94,8 @@ def _motion(chain: Chain, *motion: Array) -> tuple[Array, ...]:
     shapes = {each.shape for each in motion}
     if len(shapes) != 1 or motion[0].ndim != 2 or motion[0].shape[0] != chain.joints:
         raise ShapeError(
-            f"position, velocity and acceleration are {', '.join(str(each.shape) for each in motion)}: all must be "
-            f"({chain.joints}, samples)"
+            f"position, velocity and acceleration have the shapes {', '.join(str(each.shape) for each in motion)}: "
+            f"all must be ({chain.joints}, samples)"
         )
     return tuple(np.ascontiguousarray(each.T, dtype=np.float64) for each in motion)
 

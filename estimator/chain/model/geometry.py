@@ -43,7 +43,7 @@ class Chain:
         shapes = self.rotation.shape, self.translation.shape, self.axis.shape, self.gravity.shape
         if shapes != ((joints, 3, 3), (joints, 3), (joints, 3), (3,)):
             raise ShapeError(
-                f"rotation, translation, axis and gravity are {', '.join(map(str, shapes))}: they must be "
+                f"rotation, translation, axis and gravity have the shapes {', '.join(map(str, shapes))}: they must be "
                 "(joints, 3, 3), (joints, 3), (joints, 3) and (3,)"
             )
         if not 1 <= joints <= MOST_JOINTS:

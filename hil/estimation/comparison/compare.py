@@ -35,8 +35,8 @@ class MethodResult:
 
     settings_tried: number of settings tried; the best is reported. worst_relative_error: largest relative error of
     inertias, gravity and friction, on a fake arm only. held_out_rms: open-loop prediction error of the held-out
-    multisine relative to its motion, for the worst joint; None if the simulation does not settle or there was no such
-    multisine.
+    multisine relative to the RMS of its motion, for the worst joint; None if the simulation does not settle or there
+    was no such multisine.
     """
 
     parameters: Mapping[str, float]

@@ -119,8 +119,8 @@ def _constant(time: Array, values: Array) -> list[slice]:
 def _frozen(joint: _Joint) -> list[str]:
     return [
         f"The position of {joint.name} stays at {joint.position[part.start]:.4g} rad {_from_to(joint.time, part)}, "
-        "although the rest of the recording says that the joint should move: the reading was frozen, or something held "
-        "the joint. Leave that part out."
+        "although the rest of the recording shows that the joint should move: the reading was frozen, or something "
+        "held the joint. Leave that part out."
         for part in _constant(joint.time, joint.position)
         if joint.is_unexplained(part)
     ]
