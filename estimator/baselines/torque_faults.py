@@ -17,7 +17,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 
 BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
-"""Clipping is tried at the levels that these fractions of the samples exceed."""
+"""Clipping is tried at the torques that these fractions of the samples exceed."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
 EVALUATIONS = 30  # of the search for delay and drift

@@ -78,7 +78,8 @@ class Decay:
 
 
 def decay_of(differences: Sequence[float], within: float) -> Decay | None:
-    """Return how the relative differences of successive periods decrease, and how long until they are `within`.
+    """Return how the relative differences of successive periods decrease, and how long it takes until they are at most
+    `within`.
 
     None if they do not decrease steadily: a transient only dies out and friction only warms up, whereas backlash, a
     dragging cable or bumps make the differences irregular.

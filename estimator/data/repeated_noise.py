@@ -135,7 +135,7 @@ def _beyond_fast(power: Array, slow: int) -> Array:
 
 
 def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:
-    """Return the noise (joints,) [rad] from two upper bounds of it: their mean if they agree, otherwise the smaller
+    """Return the noise (joints,) [rad] from two upper bounds on it: their mean if they agree, otherwise the smaller
     one.
 
     Each bound is the median of a few lines and has an error of its own, so the smaller of two that agree would be too

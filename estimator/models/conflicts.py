@@ -1,4 +1,4 @@
-"""Values that contradict prior knowledge: many standard deviations from the configuration's or from typical ones.
+"""Values that contradict prior knowledge: many standard deviations from configured or typical values.
 
 If the model lacks an effect, such as gear backlash, other parameters of the fit imitate it. Some of these are known
 beforehand, and a value far from the known one reveals the imitation, which standard errors do not.

@@ -194,10 +194,10 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     if run.asked is None:
         return [
             *lines,
-            f"Safe at that torque: probability of a guard stop: {_percent(shown.stop_chance)}; {allowed}.",
+            f"Safe at that torque: the probability of a guard stop is {_percent(shown.stop_chance)}; {allowed}.",
         ]
     word = "SAFE" if run.is_safe(config) else "NOT SAFE as configured"
-    return [*lines, f"{word}: probability of a guard stop: {_percent(shown.stop_chance)}; {allowed}."]
+    return [*lines, f"{word}: the probability of a guard stop is {_percent(shown.stop_chance)}; {allowed}."]
 
 
 def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> list[str]:

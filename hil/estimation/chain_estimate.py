@@ -206,7 +206,7 @@ def _verdict(
         error = float(np.max(held_out))
         joint = config.joints[int(np.argmax(held_out))].name
         sentences.append(
-            f"A held-out path is predicted to within {100 * error:.2f} % of its RMS motion (worst joint: {joint}), "
+            f"A held-out path is predicted to within {100 * error:.2f} % of its motion's RMS (worst joint: {joint}), "
             "excluding encoder noise."
         )
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust

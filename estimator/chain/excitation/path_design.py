@@ -42,7 +42,7 @@ _MEAN_SHARE = 0.1  # weight of the mean log error in the criterion; the worst on
 
 @dataclass(frozen=True)
 class PathLimits:
-    """Limits of angle `low` and `high` [rad] and `speed` [rad/s] (joints,).
+    """Limits of the angles, `low` and `high` [rad], and of the `speed` [rad/s] (joints,).
 
     `allowed` returns whether a path respects the limits of torque and clearance.
     """
@@ -172,10 +172,10 @@ class PathDesigner:
         return best[1], best[2]
 
     def widest(self, centre: Array, seed: int, tries: int = WIDEST_OF) -> Design:
-        """Return the random path about a centre that maximises the range of the joint that moves least, for validation.
+        """Return, out of several random paths about a centre, the one whose least-moving joint moves farthest.
 
-        Validation needs a wide motion, because it cannot resolve prediction errors below encoder rounding. Raises
-        ExcitationError if no path is allowed.
+        It is used for validation, which cannot resolve prediction errors below encoder rounding and therefore needs a
+        wide motion. Raises ExcitationError if no path is allowed.
         """
         random = np.random.default_rng(seed)
         found = [self._finished(centre, self._random_lines(random)) for _ in range(tries)]
