@@ -151,7 +151,7 @@ class ArmModel:
         count = len(self.joints)
         if len(shapes) != 1 or any(not shape or shape[-1] != count for shape in shapes):
             found = ", ".join(f"{name} {values.shape}" for name, values in taken.items())
-            raise ValueError(f"{found}: all must have the same shape (..., {count}), joints on the last axis")
+            raise ValueError(f"{found}: all must have the same shape (..., {count}), with the joints on the last axis")
         return list(taken.values())
 
     def _inverse(self, q: Array, dq: Array, ddq: Array) -> Array:

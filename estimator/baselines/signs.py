@@ -115,8 +115,8 @@ def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | No
 def suspect_order(recordings: Sequence[Recording]) -> tuple[float, float] | None:
     """Return evidence that both the angles and the torques of two joints are in the opposite order.
 
-    See `suspect_swapped` for the result. The zero of the outer joint's angle may be known only after the exchange of
-    columns.
+    See `suspect_swapped` for the result. The outer joint's zero angle may be unknown until the columns have been
+    exchanged.
     """
     if recordings[0].joints != 2:
         return None

@@ -70,9 +70,9 @@ class ChainEstimate(FittedParameters):
     reached: bool
     """Whether the fit has reached its minimum. The standard errors include the distance that remains."""
     from_prior: tuple[str, ...]
-    """Base parameters that the data hardly determine, so that their values come from the prior."""
+    """Base parameters that the data hardly determine, whose values therefore come from the prior."""
     unseen: tuple[str, ...]
-    """Zero errors and tilts that the data hardly determine, so that they are taken as zero."""
+    """Zero errors and tilts that the data hardly determine, which are therefore taken as zero."""
     doubtful_zeros: tuple[tuple[int, float], ...]
     """Joints, from 1, whose encoder zeros the model holds fixed although the recording contradicts them, and their
     errors (true minus measured angle) [rad]. Empty if they were not tested.

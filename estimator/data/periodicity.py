@@ -48,11 +48,11 @@ def period_difference(position: Array) -> Settling:
 
 
 def settling_difference(former: Array, latest: Array) -> float:
-    """Return the RMS difference of a period (joints, samples) [rad] from the previous one, relative to the motion.
+    """Return the RMS difference of a period (joints, samples) [rad] from the previous one, relative to the motion RMS.
 
-    The worst joint counts. Only the second halves are compared. If they agree, the motion had settled before the end of
-    the previous period. The latest one is then settled as a whole, even if the previous one began with the transient of
-    the ramp. This saves a whole period of the experiment.
+    The value is that of the worst joint. Only the second halves are compared. If they agree, the motion had settled
+    before the end of the previous period. The latest one is then settled as a whole, even if the previous one began
+    with the transient of the ramp. This saves a whole period of the experiment.
     """
     half = former.shape[1] // 2
     return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())
@@ -101,8 +101,9 @@ def decay_of(differences: Sequence[float], within: float) -> Decay | None:
 def correlation_of_changes(position: Array) -> float:
     """Return the correlation of a period's change with the change before it; -1 for opposite changes.
 
-    position: the three latest periods (3, joints, samples) [rad]. The joint whose motion changes most, relative to the
-    motion, counts. As in `settling_difference`, only the second halves are compared. NaN if nothing can be compared.
+    position: the three latest periods (3, joints, samples) [rad]. Only the joint whose motion changes most, relative to
+    that motion, is considered. As in `settling_difference`, only the second halves are compared. NaN if nothing can be
+    compared.
     """
     half = position[:, :, position.shape[2] // 2 :]
     changes = np.diff(half, axis=0)

@@ -55,7 +55,7 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
         averaged: number of passes whose mean is the sample.
 
     Returns:
-        The standard deviations; None for fewer than two passes, or short ones.
+        The standard deviations; None for fewer than two passes, or if they are too short.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None

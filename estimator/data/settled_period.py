@@ -193,8 +193,8 @@ def _check_motion(period: SettledPeriod) -> None:
         least = LEAST_MOTION * float(period.position_step[joint])
         if swing <= least:
             raise StandstillError(
-                f"joint {joint + 1} moved by {swing:.2g} rad; at least {least:.2g} rad are needed: "
-                "friction held it; raise its peak torque"
+                f"joint {joint + 1} moved by {swing:.2g} rad, held by friction; at least {least:.2g} rad are needed: "
+                "raise its peak torque"
             )
     filled = period.filled()
     for joint, row in enumerate(filled):

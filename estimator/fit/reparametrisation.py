@@ -246,8 +246,8 @@ class Sizes:
 
 
 def highest_values(names: tuple[str, ...], speeds: Array) -> Array:
-    """Return the upper bounds that `Term.fastest` declares (parameters,), inf for others; speeds: the highest speed of
-    each joint (joints,) [rad/s].
+    """Return the upper bounds that `Term.fastest` declares (parameters,), inf for other parameters; speeds: the highest
+    speed of each joint (joints,) [rad/s].
     """
     times = [(term_of(name).fastest, joint_of(name) or 1) for name in names]
     return np.array([np.inf if most is None else most * float(speeds[joint - 1]) for most, joint in times])

@@ -132,7 +132,7 @@ def keep(past: Any, j: int, mean: float) -> None:
 
 
 def unexplained(past: Any, j: int) -> float:
-    """Return joint `j`'s mean residual torque that has not been explained for long enough [N m], otherwise 0."""
+    """Return joint `j`'s mean residual torque [N m] if it has stayed unexplained for long enough, otherwise 0."""
     return float(past[_SLOTS + 1, _FOUND + j])
 
 

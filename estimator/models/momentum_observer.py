@@ -98,7 +98,8 @@ class MomentumObserver:
     interval: time between two samples [s].
     frictions: `largest` is raised to at least this multiple of dry friction, as far as that is known: near standstill,
     friction behaves differently from the model.
-    hardly_known: whether only the torque is known beforehand; then means are compared with the earlier model, too.
+    hardly_known: whether only the torque is known beforehand; mean torques are then also compared with the earlier
+    model.
     """
 
     def __init__(

@@ -311,7 +311,7 @@ class Selection:
         return richer if self._gain(richer, plainer) > self._worth(richer, plainer) else plainer
 
     def prune(self, best: Trial) -> Trial:
-        """Remove insignificant terms if the motion is explained as well without them."""
+        """Remove insignificant terms if the motion is explained equally well without them."""
         assert best.estimate is not None
         if self._left(best) > self._options.presliding_residual**2:
             return best  # effects of missing terms would be attributed to present ones

@@ -138,7 +138,7 @@ def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
 
 
 def true_chain_parameters(config: Config, known: KnownChain) -> dict[str, float] | None:
-    """True parameters of the fake arm by name [SI]; None for a real arm or another plant."""
+    """True parameters of the fake arm by name [SI]; None for a real arm or another kind of fake arm."""
     chain = None if config.fake is None else config.fake.chain
     if not config.is_fake or chain is None:
         return None

@@ -25,8 +25,8 @@ SMALLEST_STEP = 1e-9  # rad, where readings show no steps: their noise is measur
 class Converted:
     """Recordings in SI units.
 
-    names: one per recording. stepped: whether each joint's encoder resolution is known. columns: including
-    guesses. notes: one sentence per guess or correction.
+    names: one per recording. stepped: whether each joint's encoder resolution is known. columns: their description,
+    including guesses. notes: one sentence per guess or correction.
     """
 
     recordings: tuple[Recording, ...]

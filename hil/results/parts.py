@@ -153,7 +153,7 @@ class Validation:
     RMS (the verdict excludes the noise); if friction has changed since the fitted multisine, the model's friction is
     scaled by one factor per joint, estimated from the held-out motion itself. held_out_as_fitted_rms: the same with
     friction as it was in the fitted multisine; None if it has not changed. free_run_rms: open-loop prediction error of
-    the fitted multisine, likewise relative.
+    the fitted multisine, also relative to the motion's RMS.
     residual_over_floor: residual relative to the measured noise, which is at least the rounding noise. correlated_lags:
     fraction of the residual's autocorrelations that exceed those of white noise. condition: condition number of the
     scaled information matrix.

@@ -101,7 +101,7 @@ class ChainCoordinates:
         """Return the largest possible decrease of each parameter's coordinate, as a negative number or 0
         (parameters,).
 
-        Only widths have a floor; `x` may be followed by other coordinates.
+        Only widths have a floor; other coordinates may follow in `x`.
         """
         least = np.full(len(self.names), -np.inf)
         least[self._widths] = np.minimum(np.log(self._least[self._widths]) - x[self._widths], 0.0)

@@ -50,7 +50,7 @@ def as_moving(base: BaseParameters, parameters: Mapping[str, float]) -> dict[str
 
 
 def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[int, float]:
-    """Return the apparent loss of inertia of each voltage-driven joint (from 0) [kg m^2]."""
+    """Return the apparent loss of inertia of each voltage-driven joint, counted from 0 [kg m^2]."""
     generating = _generating(base.chain.joints, parameters)
     possible = _possible(base, parameters, generating)
     return {joint: possible * share * viscous * late for joint, share, viscous, late in generating}

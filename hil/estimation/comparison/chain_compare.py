@@ -78,7 +78,8 @@ class Judge:
 
 
 def worst_chain_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
-    """Name and largest relative error among the large base parameters and the friction terms.
+    """Return the parameter with the largest relative error and that error, among large base parameters and friction
+    terms.
 
     Offsets are left out, and so are sums that are small compared with others of their kind (see LARGE).
     """

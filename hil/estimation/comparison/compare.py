@@ -145,7 +145,8 @@ def _entry(peer: Peer, held_out: float | None, name: str | None, worst: float | 
 
 
 def worst_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
-    """Name and largest relative error among inertias, gravity, viscous and Coulomb friction.
+    """Return the parameter with the largest relative error and that error, among inertias, gravity, viscous and Coulomb
+    friction.
 
     Offsets are left out: they are near zero, so a relative error is meaningless. A parameter that the method does not
     estimate counts as 0, a relative error of 1.

@@ -69,7 +69,7 @@ def local_defects(
 def local_residual(
     recordings: Sequence[Recording], names: Sequence[str], predicted: Sequence[Array], window: float
 ) -> tuple[str, ...]:
-    """One sentence for each joint whose residual is far above the usual one in a few places; arguments as in
+    """One sentence for each joint whose residual is far above its usual value in a few places; arguments as in
     `local_defects`.
     """
     return tuple(said for each in _joints(recordings, names, predicted, window) for said in _windows(each, window))
