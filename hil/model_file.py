@@ -58,7 +58,7 @@ def _no_result(folder: Path) -> str:
     below = sorted(each.parent for each in folder.glob("*/result.json"))
     if below:
         listed = command("runs", folder)
-        return f"{folder} is not a run folder but contains some: did you mean {below[-1]}? List them: {listed}"
+        return f"{folder} is not a run folder but contains run folders: did you mean {below[-1]}? List them: {listed}"
     return (
         f"{folder} is not a run folder: it has neither a result nor a recording. {command('identify', 'ARM.toml')} "
         f"creates one; to list existing runs: {command('runs')}"

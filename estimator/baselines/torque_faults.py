@@ -41,7 +41,7 @@ class Clipped:
 
 @dataclass(frozen=True)
 class ClockDrift:
-    """A delay of the torque that changes steadily from `start` to `end` [s] in the course of the longest recording.
+    """A delay of the torque that changes steadily from `start` to `end` [s] during the longest recording.
 
     residual, residual_given: relative RMS of the worst joint's torque residual, with this drift and with the best
     constant delay.

@@ -24,7 +24,7 @@ from hil.estimator.models.conflicts import Conflict
 
 EXPLAINED_RESIDUAL = 1.06
 """A motion counts as explained if the RMS residual of the worst joint, relative to the noise of its angle, is below
-this.
+this value.
 """
 
 SYSTEMATIC = 1.1

@@ -138,8 +138,8 @@ def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:
     """Return the noise (joints,) [rad] from two upper bounds on it: their mean if they agree, otherwise the smaller
     one.
 
-    Each bound is the median of a few lines and has an error of its own, so the smaller of two that agree would be too
-    small.
+    Each bound is the median of a few lines and has an error of its own, so taking the smaller of two that agree would
+    underestimate the noise.
 
     Args:
         white: bound from the fastest lines of a period of `samples` samples (joints,) [rad].

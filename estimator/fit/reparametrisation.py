@@ -36,7 +36,7 @@ class Coordinates:
     options: CoordinateOptions
     resolved: Array | None = None
     """Lower bound of each width, 0 for other parameters (parameters,) [rad/s]: the larger of this and `width_floor`
-    counts.
+    applies.
     """
     highest: Array | None = None
     """Upper bounds, from `highest_values` (parameters,) [its unit]; by default none."""
@@ -89,7 +89,7 @@ class Coordinates:
             most[index] = min(most[index], room if self._floors[index] else np.log1p(room))
 
     def undisguised(self, x: Array) -> Array:
-        """Return `x`, Stribeck rises that never fall turned into Coulomb friction; other coordinates may follow in `x`.
+        """Return `x` with constant Stribeck rises turned into Coulomb friction; other coordinates may follow in `x`.
 
         Where the Stribeck velocity is beyond all speeds of the motion, only the sum of rise and Coulomb friction is
         determined, and a fit that has drifted there hardly finds its way back.

@@ -85,10 +85,8 @@ class Term:
     """Description for users."""
     _: KW_ONLY
     part: str
-    """The part of a model that includes this term.
-
-    "base" (part of the linear regression, always present), a law of FRICTIONS, one of OPTIONS, a drive's term, or
-    "voltage" (joints driven by voltage).
+    """The part of a model that includes this term: "base" (part of the linear regression, always present), a law of
+    FRICTIONS, one of OPTIONS, a drive's term, or "voltage" (joints driven by voltage).
     """
     scope: Scope = "joint"
     first_joint: int = 1

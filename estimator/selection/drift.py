@@ -116,7 +116,7 @@ class TorqueChange:
     left: float
     """Sum of squares of the residual that the torque does not explain, in units of the noise."""
     noticed: Array
-    """Smallest constant torque that matters, for each joint (joints,) [N m]."""
+    """Smallest constant torque of each joint that matters (joints,) [N m]."""
 
     @property
     def is_seen(self) -> Mask:

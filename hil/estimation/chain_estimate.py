@@ -248,8 +248,8 @@ def _verdict(
     sentences += conflict_sentences(estimate.conflicts, explained)
     if estimate.unseen:
         sentences.append(
-            f"Not identifiable from gravity in this motion: {', '.join(estimate.unseen)} (assumed to be zero within "
-            "the standard error)."
+            f"Not identifiable from gravity in this motion: {', '.join(estimate.unseen)} (taken as zero, to within "
+            "their standard errors)."
         )
     return Verdict(trust, weakest, tuple(sentences))
 

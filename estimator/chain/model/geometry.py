@@ -12,9 +12,8 @@ LINK_TERMS = (
     *("mass", "moment_x", "moment_y", "moment_z"),
     *("inertia_xx", "inertia_xy", "inertia_xz", "inertia_yy", "inertia_yz", "inertia_zz"),
 )
-"""Inertial parameters of a link in its own frame.
-
-Mass [kg], mass times centre of mass [kg m], inertia about the frame's origin [kg m^2].
+"""Inertial parameters of a link in its own frame: mass [kg], mass times centre of mass [kg m], inertia about the
+frame's origin [kg m^2].
 """
 UNITS = {"mass": "kg", "moment": "kg m", "inertia": "kg m^2", "armature": "kg m^2"}
 
