@@ -179,9 +179,9 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
         settling_text(config, shown),
         f"If stopped at any moment, the arms overshoot their limits by up to {_each(config, stopped)}; if the program "
         f"is killed or the cable unplugged, by up to {_each(config, planned[Way.SILENT])}.",
-        "If something drives an arm past a limit at these speeds, it overshoots the limit by up to the following. "
-        f"Braked: {_each(config, passed[Way.BRAKED])}. With torque cut: {_each(config, passed[Way.CUT])}. Keep that "
-        "much space clear.",
+        "If something drives an arm past a limit at these speeds, it overshoots the limit by up to "
+        f"{_each(config, passed[Way.BRAKED])} when braked, and by up to {_each(config, passed[Way.CUT])} when torque "
+        "is cut. Keep that much space clear.",
         *(
             []
             if run.largest is None

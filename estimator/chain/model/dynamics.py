@@ -73,8 +73,8 @@ def regressor(
 
 
 def places(joints: int, chosen: Columns) -> Columns:
-    """Return the index of each link's parameters among the chosen ones (joints, 11). The index of any other parameter
-    is the number of chosen ones.
+    """Return the index of each link's parameters among the chosen ones (joints, 11). A parameter that was not chosen
+    has the number of chosen ones as its index.
     """
     column = np.full(TERMS * joints, chosen.size)
     column[chosen] = np.arange(chosen.size)

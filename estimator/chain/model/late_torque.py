@@ -19,7 +19,7 @@ from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
 """Meanings of the kinds of parameters that only chains have."""
 PART = 0.1
-"""`limited` names a joint only if its part in the motion that loses the most inertia exceeds this fraction."""
+"""Smallest share of a joint in the motion that loses the most inertia for `limited` to name the joint's back-EMF."""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
 _ARMATURE = 10  # of a link's parameters
@@ -80,8 +80,8 @@ def rotor(base: BaseParameters, joint: int) -> Array:
 
 
 Losses = list[tuple[Array, dict[int, float]]]
-"""For each voltage-driven joint: its rotor (base parameters,), and by how much its inertia [kg m^2] decreases per unit
-of each parameter on which its lagging back-EMF depends, by the index of that parameter.
+"""For each voltage-driven joint: its rotor (base parameters,), and the decrease of its inertia [kg m^2] per unit of
+each parameter that its lagging back-EMF depends on, by that parameter's index.
 """
 
 
