@@ -169,7 +169,7 @@ def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int
 
 
 def largest_ratio(one: Array, other: Array) -> float:
-    """Return the largest ratio of two vectors of standard errors, element by element; infinite if no element is finite.
+    """Return the largest element-by-element ratio of two vectors of standard errors; infinite if no element is finite.
 
     The largest ratio is used, not the median, because an effect that the model lacks may act in one joint alone.
     """

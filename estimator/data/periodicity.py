@@ -48,7 +48,8 @@ def period_difference(position: Array) -> Settling:
 
 
 def settling_difference(former: Array, latest: Array) -> float:
-    """Return the RMS difference of a period (joints, samples) [rad] from the previous one, relative to the motion RMS.
+    """Return the RMS difference of a period (joints, samples) [rad] from the previous one, relative to the motion's
+    RMS.
 
     The value is that of the worst joint. Only the second halves are compared. If they agree, the motion had settled
     before the end of the previous period. The latest one is then settled as a whole, even if the previous one began

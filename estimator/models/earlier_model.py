@@ -22,7 +22,7 @@ BACK = (5, 10, 20)
 """Numbers of lessons (updates of the model) over which the mean is taken."""
 
 TIMES = 3.5
-"""Standard deviations beyond which the mean residual torque is not explained by the earlier model."""
+"""Number of standard deviations beyond which the earlier model does not explain the mean residual torque."""
 
 RELATIVE_STD = 0.1
 """Relative standard deviation of each term of the mean (inertia, gravity, friction), since a model that fits one motion

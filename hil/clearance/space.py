@@ -39,7 +39,7 @@ AT_REST_INSIDE = 0.02
 """Largest accepted overlap in the rest pose [m]: capsules are larger than the parts they enclose."""
 
 LYING_RAD = 0.12
-"""An arm within this angle of its rest pose in every joint counts as at rest; the user declares that pose safe."""
+"""An arm within this angle of its rest pose in every joint counts as at rest; the user has declared that pose safe."""
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -
 
 
 def rotor(base: BaseParameters, joint: int) -> Array:
-    """Return the base parameters of a unit rotor inertia of a joint, counted from 0 (base parameters,)."""
+    """Return what a rotor inertia of 1 kg m^2 at `joint` (from 0) adds to the base parameters (base parameters,)."""
     column: Array = base.grouping[:, TERMS * joint + _ARMATURE]
     return column
 
