@@ -52,7 +52,7 @@ class KnownMass:
     """Length of link 1 from joint to joint [m]; only needed for an arm of two joints."""
 
     def change(self, gravity: float, joints: int) -> dict[str, float]:
-        """Return the change of the base parameters [SI]; raises ModelError for impossible values."""
+        """Return the change in the base parameters [SI]; raises ModelError for impossible values."""
         if not (self.mass > 0.0 and self.distance > 0.0 and self.inertia >= 0.0):
             raise ModelError(
                 f"a mass of {self.mass:g} kg at {self.distance:g} m with inertia {self.inertia:g} kg m^2: mass and "

@@ -53,7 +53,7 @@ class UnidentifiableError(EstimationError):
 
 
 class ConvergenceError(EstimationError):
-    """The iterations ended without a minimum of the likelihood: model or initial guess is too far from the data."""
+    """No minimum of the likelihood was found: the model or the initial guess is too far from the data."""
 
 
 class PeriodicityError(EstimationError):

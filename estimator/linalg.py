@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 NOT_FINITE = re.compile(r"not finite|infs or NaNs")
-"""What scipy's ValueErrors about values that are not finite say; others are mistakes of the caller."""
+"""Text of scipy's ValueErrors about values that are not finite; other ValueErrors are the caller's mistakes."""
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")

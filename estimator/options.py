@@ -76,7 +76,7 @@ class LinearOptions:
     """Options of stage 1, the regression on Fourier lines."""
 
     coulomb_width: float = 0.05
-    """Width of the smoothed Coulomb step [rad/s], about the velocity error of a sticking joint due to omitted lines."""
+    """Width of the smoothed Coulomb step [rad/s], about a sticking joint's velocity error due to omitted lines."""
     max_condition: float = 1e8
 
 
@@ -283,7 +283,9 @@ class SelectionOptions:
     wave_evidence: float = 0.05
     """Ripple or cogging is tried if the evidence in the score test is at least this.
 
-    It is lenient because the test only finds the wave's period roughly; a fit that includes the wave explains more.
+    The threshold is lenient because the test only finds the wave's period roughly; a fit that includes the wave
+    explains more.
     """
     prune_levels: tuple[float, ...] = (1e-3, 0.1)
-    """Significance levels for removing terms, tried in turn until the reduced model explains the motion as well."""
+    """Significance levels for removing terms, tried in turn until the reduced model explains the motion equally well.
+    """

@@ -5,8 +5,8 @@
     result = hil.identify("fake_two_link")
     result.parameters["inertia_1"].value
 
-Each function does the same as the command of the same name. The functions are loaded on first use, so that `import hil`
-takes almost no time.
+A function with the name of a command does the same as that command. The functions are loaded on first use, so that
+`import hil` takes almost no time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """An identified arm as a model: inverse and forward dynamics, gravity and friction. Needs numpy only.
 
-Equations and names are as in docs/model.md. The last axis of every array is the joints; any axes may come before it,
-so a single pose, a trajectory and a batch of trajectories are all accepted.
+Equations and names are as in docs/model.md. The last axis of every array runs over the joints; any axes may come before
+it, so a single pose, a trajectory and a batch of trajectories are all accepted.
 """
 
 from collections.abc import Mapping
@@ -151,7 +151,7 @@ class ArmModel:
         count = len(self.joints)
         if len(shapes) != 1 or any(not shape or shape[-1] != count for shape in shapes):
             found = ", ".join(f"{name} {values.shape}" for name, values in taken.items())
-            raise ValueError(f"{found}: all must have the same shape (..., {count}), joints on the last axis")
+            raise ValueError(f"{found}: all must have the same shape (..., {count}), with the joints on the last axis")
         return list(taken.values())
 
     def _inverse(self, q: Array, dq: Array, ddq: Array) -> Array:

@@ -83,7 +83,7 @@ class Cause(Enum):
         """Whether the servos still accept commands, so that an arm may be lowered under supervision.
 
         A servo that has lost its watchdog still obeys; if the watchdog had tripped, the loss of torque would be
-        detected during lowering. Missing replies may return: the arm is driven on without them for a moment.
+        detected during lowering. Missing replies may return: the arm continues without them for a moment.
         """
         others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
         others.add(Cause.MISSING)

@@ -40,7 +40,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise ResultError(f"{file} is not a result file of hil: it has no schema.")
     if result["schema"] != SCHEMA:
         raise ResultError(
-            f"{file}: schema is {result['schema']!r}, but this version of hil reads {SCHEMA}; it was written by "
+            f"{file}: schema is {result['schema']!r}, but this version of hil reads {SCHEMA}; the file was written by "
             f"{'a newer' if _newer(result['schema']) else 'another'} version. Install that version, or estimate again."
         )
     return result
@@ -58,7 +58,7 @@ def _no_result(folder: Path) -> str:
     below = sorted(each.parent for each in folder.glob("*/result.json"))
     if below:
         listed = command("runs", folder)
-        return f"{folder} is not a run folder but contains some: did you mean {below[-1]}? List them: {listed}"
+        return f"{folder} is not a run folder but contains run folders: did you mean {below[-1]}? List them: {listed}"
     return (
         f"{folder} is not a run folder: it has neither a result nor a recording. {command('identify', 'ARM.toml')} "
         f"creates one; to list existing runs: {command('runs')}"
@@ -78,7 +78,7 @@ def read_settled_result(path: Path) -> SettledResult:
     result = read_result(path)
     if not isinstance(result, SettledResult):
         raise ResultError(
-            f"{path}: was estimated by multiple shooting without a settled period; this command needs one."
+            f"{path} was estimated by multiple shooting without a settled period; this command needs one."
         )
     return result
 
@@ -97,7 +97,7 @@ def read_usable_result(path: Path) -> Result:
     result = read_result(path)
     if result.arm is None:
         raise ResultError(
-            f"{path}: was estimated by multiple shooting without a settled period; this command needs one."
+            f"{path} was estimated by multiple shooting without a settled period; this command needs one."
         )
     return result
 

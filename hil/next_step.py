@@ -19,7 +19,7 @@ def command(*words: object) -> str:
 
 
 def steps_of(path: Path) -> list[Path]:
-    """Folders of the pilot's and the later steps in a run folder, if its identification stopped before the full run."""
+    """Folders of the pilot and the later steps in a run folder, if its identification stopped before the full run."""
     if (path / "samples.npy").is_file() or not (path / "config.toml").is_file():
         return []
     return sorted((each.parent for each in path.glob("*/samples.npy")), key=lambda each: each.stat().st_mtime)

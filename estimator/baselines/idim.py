@@ -101,7 +101,7 @@ def fit_inverse_dynamics(
     delay: float = 0.0,
     position_cutoff: float | None = None,
 ) -> InverseDynamics:
-    """Fit all `recordings` by IDIM-LS, weighting each joint by its torque residual in the previous solution.
+    """Fit all `recordings` by IDIM-LS, weighting each joint according to its torque residual in the previous solution.
 
     cutoff: cut-off frequency for regressors and torques [Hz].
     coulomb_width: width of the smoothed Coulomb step [rad/s].

@@ -1,4 +1,4 @@
-"""The seed paper's method on its own arm: as printed, and by maximum likelihood on the same Fourier coefficients.
+"""The method of Zhu et al. on their own arm: as printed, and by maximum likelihood on the same Fourier coefficients.
 
 Zhu, Man, Cao, Zheng, Wang, "Parameter Estimation for Robotic Manipulator Systems", Machines 10 (2022) 392. Numbers in
 parentheses are its equations; docs/paper.md explains them and lists the errors in print.
@@ -42,14 +42,17 @@ class PaperArm:
     """Friction of each joint [N m s/rad]; the paper's model has none."""
 
     def mass_matrix(self) -> Array:
-        """Return D (2, 2) of (3) at q2 = 0, including J1 and J2, which are missing from (14) and (15) [kg m^2]."""
+        """Return D (2, 2) [kg m^2] of equation (3) at q2 = 0, with J1 and J2, which equations (14) and (15) omit."""
         alpha = (self.mass_1 + self.mass_2) * self.length_1**2 + self.inertia_1
         beta = self.mass_2 * self.length_1 * self.length_2
         delta = self.mass_2 * self.length_2**2
         return np.array([[alpha + delta + 2.0 * beta, delta + beta], [delta + beta, delta + self.inertia_2]])
 
     def stiffness(self) -> Array:
-        """Return K (2, 2): gravity, (7) with cos q1 in its first term, linearised about the hanging pose [N m/rad]."""
+        """Return K (2, 2) [N m/rad]: gravity linearised about the hanging pose.
+
+        This is equation (7), with cos q1 in its first term.
+        """
         first = (self.mass_1 + self.mass_2) * self.length_1 * self.gravity
         second = self.mass_2 * self.length_2 * self.gravity
         return np.array([[first + second, second], [second, second]])
@@ -73,9 +76,9 @@ class Excitation:
 def own_lines() -> Excitation:
     """Return the lines of Table 2 for joint 1, and the same amplitudes one harmonic higher for joint 2.
 
-    As printed in (19), both joints have the same torque on the same lines, so only sums of the two columns of the
-    transfer function can be observed and A1 of (33) is singular. A shift by one harmonic is the smallest change that
-    resolves this.
+    As printed in equation (19), both joints have the same torque on the same lines, so only sums of the two columns of
+    the transfer function can be observed and A1 of equation (33) is singular. A shift by one harmonic is the smallest
+    change that resolves this.
     """
     lines, amplitude = np.array(LINES), np.array(AMPLITUDES)
     nothing = np.zeros_like(amplitude)
@@ -89,7 +92,7 @@ def printed_lines() -> Excitation:
 
 
 def response(arm: PaperArm, excitation: Excitation, order: Order) -> Complex:
-    """Return the complex amplitudes of the joint angles on the lines (2, lines) [rad], (30)."""
+    """Return the complex amplitudes of the joint angles on the lines (2, lines) [rad], equation (30)."""
     s = 1j * excitation.frequency
     D, K, F = arm.mass_matrix(), arm.stiffness(), np.eye(2) * arm.viscous
     terms = (s * D[:, :, None] if order == 1 else s * s * D[:, :, None] + s * F[:, :, None]) + K[:, :, None]
@@ -106,8 +109,9 @@ def record(arm: PaperArm, excitation: Excitation, order: Order, rate: float, see
 
 
 def coefficients(position: Array, excitation: Excitation) -> Complex:
-    """Return the complex Fourier coefficients on the lines (2, lines) of one period (2, samples), (48) and (60).
+    """Return the complex Fourier coefficients on the lines (2, lines) of one period (2, samples).
 
+    They are those of equations (48) and (60).
     The mean of the noise, NOISE / 2, only affects line 0, which is not used. Raises ShapeError.
     """
     if position.ndim != 2 or position.shape[0] != 2 or position.shape[1] <= 2 * excitation.lines.max():
@@ -130,7 +134,7 @@ def fit_as_printed(coefficient: Complex, excitation: Excitation, known: PaperArm
 
     `known` provides lengths and inertias; its masses only set the scale. Noise in the regressors biases the
     coefficients towards zero, however much data there is. Raises ModelError if both joints use the same lines, since
-    the columns of (33) then coincide.
+    the columns of equation (33) then coincide.
     """
     s = 1j * excitation.frequency
     u1, u2 = excitation.torque

@@ -1,4 +1,4 @@
-"""The seed paper's approach on a servo arm's settled period: linear response at each Fourier line, about the hanging
+"""The approach of Zhu et al. on a servo arm's settled period: linear response at each Fourier line, about the hanging
 pose.
 
 This is its corrected form, second order with damping: (s^2 D + s F + K) q = tau on every line, with D and K of the arm

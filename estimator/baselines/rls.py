@@ -25,8 +25,8 @@ WARM_UP = 2.0  # cycles of the cut-off frequency until the filters' initial tran
 def fit_recursively(
     recordings: Sequence[Recording], cutoff: float, coulomb_width: float, delay: float = 0.0
 ) -> InverseDynamics:
-    """Fit all `recordings`, one after the other, by RLS, using all joints' torques at every sample, weighted by their
-    residuals.
+    """Fit all `recordings`, one after the other, by RLS, using all joints' torques at every sample, weighted according
+    to their residuals.
 
     `cutoff` [Hz], `coulomb_width` [rad/s] and `delay` [s] are as in
     `hil.estimator.baselines.idim.fit_inverse_dynamics`. The weights come from a first pass over the data, an advantage

@@ -1,4 +1,5 @@
-"""Detection of reversed columns: torques or positions with the wrong sign, by inverse dynamics for each combination.
+"""Detection of reversed columns: torques or positions with the wrong sign, by inverse dynamics for each combination of
+signs.
 
 Angles that are measured from a fixed direction instead of from the previous link are detected in the same way.
 
@@ -86,8 +87,8 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
 def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | None:
     """Return evidence that joint 2's angle is measured from a fixed direction instead of from link 1.
 
-    This is the relative RMS of the worst joint's torque residual, with angle 2 minus angle 1 and with the angles as
-    given; None if the difference does not explain the recordings much better.
+    The result is the relative RMS of the worst joint's torque residual, first with angle 2 minus angle 1, then with the
+    angles as given; None if the difference does not explain the recordings much better.
     """
     if recordings[0].joints != 2:
         return None
@@ -103,8 +104,8 @@ def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | N
 def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | None:
     """Return evidence that the torques of two joints are swapped.
 
-    This is the relative RMS of the worst joint's torque residual, with the torques swapped and as given; None if
-    swapping them does not explain the recordings much better.
+    The result is the relative RMS of the worst joint's torque residual, first with the torques swapped, then as given;
+    None if swapping them does not explain the recordings much better.
     """
     if recordings[0].joints != 2:
         return None
@@ -114,8 +115,8 @@ def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | No
 def suspect_order(recordings: Sequence[Recording]) -> tuple[float, float] | None:
     """Return evidence that both the angles and the torques of two joints are in the opposite order.
 
-    See `suspect_swapped` for the result. The zero of the outer joint's angle may be known only after the exchange of
-    columns.
+    See `suspect_swapped` for the result. The outer joint's zero angle may be unknown until the columns have been
+    exchanged.
     """
     if recordings[0].joints != 2:
         return None

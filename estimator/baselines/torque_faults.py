@@ -17,7 +17,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 
 BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
-"""Clipping is tried at the levels that these fractions of the samples exceed."""
+"""Clipping is tried at the torques that these fractions of the samples exceed."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
 EVALUATIONS = 30  # of the search for delay and drift
@@ -26,8 +26,8 @@ MOST_SAMPLES = 30_000  # more would take too long
 
 @dataclass(frozen=True)
 class Clipped:
-    """A joint whose torque seems limited to `level` [N m], although the column exceeds it in the fraction `beyond` of
-    samples.
+    """A joint whose torque seems limited to `level` [N m], although the torque column exceeds it in a fraction `beyond`
+    of the samples.
 
     residual, residual_given: relative RMS residual of its torque, with the limit and as given.
     """
@@ -41,7 +41,7 @@ class Clipped:
 
 @dataclass(frozen=True)
 class ClockDrift:
-    """A delay of the torque that changes steadily from `start` to `end` [s] in the course of the longest recording.
+    """A delay of the torque that changes steadily from `start` to `end` [s] during the longest recording.
 
     residual, residual_given: relative RMS of the worst joint's torque residual, with this drift and with the best
     constant delay.

@@ -35,7 +35,7 @@ class MassOnLink:
     """Inertia about its own centre [kg m^2]."""
 
     def added(self, base: BaseParameters) -> Array:
-        """Return the change of the base parameters (base parameters,) [SI]; raises ModelError for impossible values."""
+        """Return the change in the base parameters (base parameters,) [SI]; raises ModelError for impossible values."""
         if not (self.mass > 0.0 and self.inertia >= 0.0 and 0 <= self.link < base.chain.joints):
             raise ModelError(
                 f"a mass of {self.mass:g} kg with inertia {self.inertia:g} kg m^2 on link {self.link + 1} of "

@@ -46,7 +46,7 @@ class ChainTrial:
 
 @dataclass(frozen=True)
 class ChainChoice:
-    """The best supported estimate, and the models that were tried, in order; the first is the simplest."""
+    """The best-supported estimate, and the models that were tried, in order; the first is the simplest."""
 
     estimate: ChainEstimate
     trials: tuple[ChainTrial, ...]

@@ -24,7 +24,7 @@ from hil.estimator.models.conflicts import Conflict
 
 EXPLAINED_RESIDUAL = 1.06
 """A motion counts as explained if the RMS residual of the worst joint, relative to the noise of its angle, is below
-this.
+this value.
 """
 
 SYSTEMATIC = 1.1
@@ -70,9 +70,9 @@ class ChainEstimate(FittedParameters):
     reached: bool
     """Whether the fit has reached its minimum. The standard errors include the distance that remains."""
     from_prior: tuple[str, ...]
-    """Base parameters that the data hardly determine, so that their values come from the prior."""
+    """Base parameters that the data hardly determine, whose values therefore come from the prior."""
     unseen: tuple[str, ...]
-    """Zero errors and tilts that the data hardly determine, so that they are taken as zero."""
+    """Zero errors and tilts that the data hardly determine, which are therefore taken as zero."""
     doubtful_zeros: tuple[tuple[int, float], ...]
     """Joints, from 1, whose encoder zeros the model holds fixed although the recording contradicts them, and their
     errors (true minus measured angle) [rad]. Empty if they were not tested.
@@ -169,7 +169,7 @@ def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int
 
 
 def largest_ratio(one: Array, other: Array) -> float:
-    """Return the largest ratio of two vectors of standard errors, element by element; infinite if no element is finite.
+    """Return the largest element-by-element ratio of two vectors of standard errors; infinite if no element is finite.
 
     The largest ratio is used, not the median, because an effect that the model lacks may act in one joint alone.
     """

@@ -71,7 +71,7 @@ def without_jump(position: Array) -> Array:
 
 
 def slow_part(position: Array, lines: int) -> Array:
-    """Return the first `lines` Fourier lines of a period (joints, samples), as samples."""
+    """Return the part of a period (joints, samples) that its first `lines` Fourier lines describe, as samples."""
     kept = np.fft.rfft(position, axis=1)
     kept[:, lines:] = 0.0
     return np.asarray(np.fft.irfft(kept, position.shape[1], axis=1))

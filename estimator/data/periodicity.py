@@ -48,11 +48,12 @@ def period_difference(position: Array) -> Settling:
 
 
 def settling_difference(former: Array, latest: Array) -> float:
-    """Return the RMS difference of a period (joints, samples) [rad] from the previous one, relative to the motion.
+    """Return the RMS difference of a period (joints, samples) [rad] from the previous one, relative to the motion's
+    RMS.
 
-    The worst joint counts. Only the second halves are compared. If they agree, the motion had settled before the end of
-    the previous period. The latest one is then settled as a whole, even if the previous one began with the transient of
-    the ramp. This saves a whole period of the experiment.
+    The value is that of the worst joint. Only the second halves are compared. If they agree, the motion had settled
+    before the end of the previous period. The latest one is then settled as a whole, even if the previous one began
+    with the transient of the ramp. This saves a whole period of the experiment.
     """
     half = former.shape[1] // 2
     return float(period_difference(np.stack([former, latest])[:, :, half:]).relative.max())
@@ -69,7 +70,7 @@ class Decay:
     further: int
 
     def is_warming(self, correlation: float) -> bool:
-        """Whether it looks like friction that warms up instead of a transient that has not died out.
+        """Whether the change looks like friction warming up rather than a transient that has not died out.
 
         Friction decreases over many periods, and the motion always changes in the same direction. A transient
         oscillates at the arm's own frequencies, or decays faster. correlation: see `correlation_of_changes`.
@@ -78,12 +79,13 @@ class Decay:
 
 
 def decay_of(differences: Sequence[float], within: float) -> Decay | None:
-    """Return how the relative differences of successive periods decrease, and how long until they are `within`.
+    """Return how the relative differences of successive periods decrease, and how long it takes until they are at most
+    `within`.
 
     None if they do not decrease steadily: a transient only dies out and friction only warms up, whereas backlash, a
     dragging cable or bumps make the differences irregular.
 
-    differences: in the order of time; the first may contain the transient of the ramp, but is not exceeded later.
+    differences: in the order of time; the first may contain the transient of the ramp.
     """
     falling = list(differences[1:])
     if len(falling) < 2 or not all(math.isfinite(each) and each > 0.0 for each in differences):
@@ -98,10 +100,11 @@ def decay_of(differences: Sequence[float], within: float) -> Decay | None:
 
 
 def correlation_of_changes(position: Array) -> float:
-    """Return the correlation of a period's change with the one before; -1 for opposite changes.
+    """Return the correlation of a period's change with the change before it; -1 for opposite changes.
 
-    position: the three latest periods (3, joints, samples) [rad]. The joint whose motion changes most, relative to the
-    motion, counts. As in `settling_difference`, only the second halves are compared. NaN if nothing can be compared.
+    position: the three latest periods (3, joints, samples) [rad]. Only the joint whose motion changes most, relative to
+    that motion, is considered. As in `settling_difference`, only the second halves are compared. NaN if nothing can be
+    compared.
     """
     half = position[:, :, position.shape[2] // 2 :]
     changes = np.diff(half, axis=0)

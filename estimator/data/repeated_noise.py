@@ -55,7 +55,7 @@ def repeated_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
         averaged: number of passes whose mean is the sample.
 
     Returns:
-        The standard deviations; None for fewer than two passes, or short ones.
+        The standard deviations; None for fewer than two passes, or if they are too short.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None
@@ -135,11 +135,11 @@ def _beyond_fast(power: Array, slow: int) -> Array:
 
 
 def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:
-    """Return the noise (joints,) [rad] from two upper bounds of it: their mean if they agree, otherwise the smaller
+    """Return the noise (joints,) [rad] from two upper bounds on it: their mean if they agree, otherwise the smaller
     one.
 
-    Each bound is the median of a few lines and has an error of its own, so the smaller of two that agree would be too
-    small.
+    Each bound is the median of a few lines and has an error of its own, so taking the smaller of two that agree would
+    underestimate the noise.
 
     Args:
         white: bound from the fastest lines of a period of `samples` samples (joints,) [rad].

@@ -117,8 +117,8 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
     Two distances of a reading are computed: from the median of itself and two neighbours on either side, and from a
     cubic through its neighbours. It is an outlier if both exceed SPIKE encoder steps and SPIKE times the typical
     distance from the median. At a low sampling rate, the median alone would take every fast reversal for an outlier,
-    since most readings of a steadily moving joint are the median themselves. If the fraction of such readings exceeds
-    MOST_SPIKES, they are not outliers: the joint moves fast compared with the sample rate.
+    since most readings of a steadily moving joint are the median themselves. If more than the fraction MOST_SPIKES of
+    the readings would be outliers, none is: the joint moves fast compared with the sample rate.
     """
     from scipy.ndimage import median_filter
 
@@ -154,7 +154,10 @@ def _bridged(row: Array, places: Indices, kept: Indices) -> Array:
 
 def _check_shapes(period: SettledPeriod) -> None:
     if period.position.ndim != 2 or period.torque.shape != period.position.shape:
-        raise ShapeError(f"torque {period.torque.shape} and position {period.position.shape} must be (joints, samples)")
+        raise ShapeError(
+            f"torque has shape {period.torque.shape} and position {period.position.shape}; "
+            "both must be (joints, samples)"
+        )
     per_joint = (period.position.shape[0],)
     if period.position_step.shape != per_joint:
         raise ShapeError(f"position_step has shape {period.position_step.shape}; it must be {per_joint}: one per joint")
@@ -190,8 +193,8 @@ def _check_motion(period: SettledPeriod) -> None:
         least = LEAST_MOTION * float(period.position_step[joint])
         if swing <= least:
             raise StandstillError(
-                f"joint {joint + 1} moved by {swing:.2g} rad; at least {least:.2g} rad are needed: "
-                "friction held it; raise its peak torque"
+                f"joint {joint + 1} moved by {swing:.2g} rad, held by friction; at least {least:.2g} rad are needed: "
+                "raise its peak torque"
             )
     filled = period.filled()
     for joint, row in enumerate(filled):

@@ -60,7 +60,7 @@ class Multisine:
 
     @property
     def crest_factor(self) -> Array:
-        """Peak value relative to RMS of each joint's samples (joints,)."""
+        """Peak value of each joint's samples relative to their RMS (joints,)."""
         peak: Array = np.abs(self.torque).max(axis=1) / np.sqrt(np.mean(self.torque**2, axis=1))
         return peak
 

@@ -120,7 +120,9 @@ class DesignProblem:
         return np.nan_to_num(share, nan=1e3, posinf=1e3)
 
     def scaled(self, wave: Multisine, target: Array) -> Multisine:
-        """Return `wave` with each joint's torque scaled to use at most `target` (joints,) of its limits."""
+        """Return `wave` with each joint's torque scaled to use at most the fraction `target` (joints,) of its
+        limits.
+        """
         most = 0.999 * self.limits.torque / np.abs(wave.torque).max(axis=1)
         factor = 0.3 * most
         best, reached = _times(wave, 0.05 * most), 0.0

@@ -72,7 +72,7 @@ def minimise(
         damping: initial damping; by default `options.initial_damping`.
         at: the sum of squares at `start`, if known.
         cost: returns the sum of squares alone, the same as `evaluate` except for rounding; by default `evaluate` is
-        used.
+            used.
         move: applies a step to coordinates.
         limits: returns the minimum and maximum change of each coordinate in a step; by default +-`options.max_step`.
         options: limits of the iteration.

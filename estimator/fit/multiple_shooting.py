@@ -1,10 +1,10 @@
 """Multiple shooting: maximum likelihood on any recording, cut into segments with unknown initial states.
 
 Open-loop simulation accumulates errors: on a long recording, model errors or the chaos of a tumbling arm mask the
-parameters' influence. On a segment of a second they do not. Source: Bock, "Recent advances in parameter identification
-techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical Treatment of Inverse Problems (1983). The segments are
-not joined, since effects that a rigid arm does not have, such as backlash and flexing, may change the state between
-them.
+parameters' influence. On a segment of one second they do not. Source: Bock, "Recent advances in parameter
+identification techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical Treatment of Inverse Problems (1983).
+The segments are not joined, since effects that a rigid arm does not have, such as backlash and flexing, may change the
+state between them.
 
 Short segments are fitted first, since they converge even from a poor initial guess; a subset of them suffices to get
 close to the minimum. Longer segments then refine the result, first with coarse integration steps. A segment whose
@@ -53,7 +53,7 @@ class ShootingEstimate:
     covariance: Array
     """Covariance (parameters, parameters), robust to model errors: see `Segmented.covariance`."""
     zeros: Array
-    """True minus measured angle for each recording (recordings, joints) [rad]; (0, joints) if taken as known."""
+    """True minus measured angle for each recording (recordings, joints) [rad]; (0, joints) if not estimated."""
     zeros_std: Array
     """Standard errors of `zeros`, with the same shape."""
     residual_rms: Array
@@ -304,8 +304,8 @@ def estimate_by_shooting(
         start: initial guess of the base parameters (base parameters,) [SI], such as that of
             `hil.estimator.baselines.idim`.
         length: nominal length of a segment [s].
-        zeros: also estimate the encoders' zero errors, one per joint and recording, for servos that set their zero
-            again at every start. They can only be determined with gravity.
+        zeros: also estimate the encoders' zero errors, one per joint and recording, for servos whose zero changes at
+            every start. They can only be determined with gravity.
         of: which segments of each recording to fit; the others are left for validation.
         near: estimate with another model or other segments of the same recordings, used as the only initial guess.
         options: tolerances and limits.

@@ -13,7 +13,7 @@ __all__ = ["noise_weights"]
 def noise_weights(
     periods: Sequence[SettledPeriod], positions: Sequence[Array], threshold: float
 ) -> tuple[tuple[Array, ...], int]:
-    """Estimate the noise level of each joint from its residuals and weight the samples by it.
+    """Estimate the noise level of each joint from its residuals and weight the samples accordingly.
 
     Args:
         periods: the measured periods.

@@ -36,7 +36,7 @@ class Coordinates:
     options: CoordinateOptions
     resolved: Array | None = None
     """Lower bound of each width, 0 for other parameters (parameters,) [rad/s]: the larger of this and `width_floor`
-    counts.
+    applies.
     """
     highest: Array | None = None
     """Upper bounds, from `highest_values` (parameters,) [its unit]; by default none."""
@@ -60,7 +60,7 @@ class Coordinates:
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
-        """Return the point reached by `step` (coordinates,) from `x`; both may be followed by unrelated coordinates.
+        """Return the point reached by `step` (coordinates,) from `x`; other coordinates may follow in both arrays.
 
         A step changes a width linearly rather than its logarithm, since the motion depends linearly on it. With
         exponential steps it would never reach its floor, and the parameters that compensate for it would overshoot.
@@ -89,10 +89,10 @@ class Coordinates:
             most[index] = min(most[index], room if self._floors[index] else np.log1p(room))
 
     def undisguised(self, x: Array) -> Array:
-        """Return `x`, which other coordinates may follow, with Stribeck rises that never fall as Coulomb friction.
+        """Return `x` with constant Stribeck rises turned into Coulomb friction; other coordinates may follow in `x`.
 
-        Where the Stribeck velocity is beyond all speeds of the motion, only the sum of both is determined, and a fit
-        that has drifted there hardly finds its way back.
+        Where the Stribeck velocity is beyond all speeds of the motion, only the sum of rise and Coulomb friction is
+        determined, and a fit that has drifted there hardly finds its way back.
         """
         changed = x.copy()
         for index, name in enumerate(self.names):
@@ -246,8 +246,8 @@ class Sizes:
 
 
 def highest_values(names: tuple[str, ...], speeds: Array) -> Array:
-    """Return the upper bounds that `Term.fastest` declares (parameters,), inf for others; speeds: the highest speed of
-    each joint (joints,) [rad/s].
+    """Return the upper bounds that `Term.fastest` declares (parameters,), inf for other parameters; speeds: the highest
+    speed of each joint (joints,) [rad/s].
     """
     times = [(term_of(name).fastest, joint_of(name) or 1) for name in names]
     return np.array([np.inf if most is None else most * float(speeds[joint - 1]) for most, joint in times])

@@ -43,8 +43,8 @@ class Expected:
     weight: float = 1.0
     """Mean square of the residual in units of the noise.
 
-    If the residual is larger than the noise, the data carry correspondingly less information, so the prior is given the
-    same factor.
+    If the residual is larger than the noise, the data carry correspondingly less information, so the prior is weighted
+    by this factor.
     """
 
     @classmethod

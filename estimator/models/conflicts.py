@@ -1,4 +1,4 @@
-"""Values that contradict prior knowledge: many standard deviations from the configuration's or from typical ones.
+"""Values that contradict prior knowledge: many standard deviations from configured or typical values.
 
 If the model lacks an effect, such as gear backlash, other parameters of the fit imitate it. Some of these are known
 beforehand, and a value far from the known one reveals the imitation, which standard errors do not.
@@ -15,7 +15,7 @@ from hil.estimator.models.terms import kind_of, term_of
 
 FAR = 4.0  # standard deviations
 LARGE_RATIO, LARGE_ANGLE = 0.35, 0.3
-"""Relative and absolute deviation [1, rad] from a configured value that is too large to be due to a magnet's
+"""Relative and absolute deviations [1, rad] from a configured value that are too large to be due to a magnet's
 temperature, a tolerance, or a horn fitted one tooth off.
 """
 LARGE_SPREAD = 0.3  # standard deviation of a logarithm that is printed as a factor

@@ -2,13 +2,13 @@
 
 A push or grip that begins while the arm is still being learnt changes what is learnt: sample by sample, parameters and
 noise follow it, and no residual stands out. The model from before the disturbance does not follow. Its prediction for
-all samples since then is therefore compared with the mean torque over that time: over the last 5, 10 and 20 lessons,
-which are 0.1, 0.2 and 0.4 s. In the mean, effects that alternate with the motion (noise, play, ripple) cancel, and a
-push does not. Where the joint has hardly moved in that time, friction may have held it back: a gear gives way
-elastically before it slides.
+all samples since then is therefore compared with the mean torque over that time: over the last 5, 10 and 20 lessons
+(updates of the model), which are 0.1, 0.2 and 0.4 s. In the mean, effects that alternate with the motion (noise, play,
+ripple) cancel, and a push does not. Where the joint has hardly moved in that time, friction may have held it back: a
+gear gives way elastically before it slides.
 
-What a joint's equation, `torque - row theta`, contributes is summed over time, so that the mean over any two of the
-stored moments takes one subtraction. These functions are part of compiled loops.
+What a joint's equation, `torque - row theta`, contributes is summed over time, so that the mean between any two stored
+moments takes one subtraction. These functions are part of compiled loops.
 """
 
 from typing import Any
@@ -19,22 +19,22 @@ import numpy as np
 from hil.estimator.arrays import Array
 
 BACK = (5, 10, 20)
-"""Numbers of lessons over which the mean is taken."""
+"""Numbers of lessons (updates of the model) over which the mean is taken."""
 
 TIMES = 3.5
-"""Standard deviations beyond which the mean residual torque is not explained by the earlier model."""
+"""Number of standard deviations beyond which the earlier model does not explain the mean residual torque."""
 
 RELATIVE_STD = 0.1
-"""Relative standard deviation of each term of the mean (inertia, gravity, friction), as a model that fits one motion is
-not exact in the next one: in a fast swing, terms several times as large as the commanded torque cancel.
+"""Relative standard deviation of each term of the mean (inertia, gravity, friction), since a model that fits one motion
+is not exact in the next one: in a fast swing, terms several times as large as the commanded torque cancel.
 """
 
 IN_A_ROW = 2
-"""Successive lessons for which it must not be explained."""
+"""Number of successive lessons after which a mean residual torque that stays unexplained is reported."""
 
 ELASTIC_RAD = 0.03
-"""Distance after a reversal within which dry friction may differ from that of a joint in sliding friction by as much as
-it holds at standstill [rad]; this share falls exponentially with the distance covered.
+"""Distance from a reversal over which dry friction approaches that of a sliding joint [rad]: it may first differ by as
+much as it can hold at standstill; the difference falls exponentially with the distance covered.
 """
 
 _SLOTS = max(BACK)
@@ -73,7 +73,7 @@ def add(past: Any, j: int, torque: float, stands: float, velocity: float, row: A
 
 
 def describe(past: Any, j: int, count: int, noise: float, friction: float) -> None:
-    """Set joint `j`'s variance of the noise and its static friction [N m], which are stored with the next moment."""
+    """Set joint `j`'s noise variance and static friction [N m], which are stored with the next moment."""
     at = 1 + 2 * (_ROW + count)
     past[_SLOTS, at + j], past[_SLOTS, at + 2 + j] = noise, friction
 
@@ -132,7 +132,7 @@ def keep(past: Any, j: int, mean: float) -> None:
 
 
 def unexplained(past: Any, j: int) -> float:
-    """Return joint `j`'s mean residual torque that has not been explained for long enough [N m], otherwise 0."""
+    """Return joint `j`'s mean residual torque [N m] if it has stayed unexplained for long enough, otherwise 0."""
     return float(past[_SLOTS + 1, _FOUND + j])
 
 

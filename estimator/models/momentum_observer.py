@@ -19,7 +19,7 @@ widen the admissible range. A deviation that may become an alarm enters that est
 alarm; otherwise a joint that is held for a long time would widen the range until nothing exceeded it. While a joint
 stands still, its noise is lower, since most of the noise only arises in motion.
 
-What friction can hold includes the viscous friction at the speeds of the usual motion: over a small motion, in which
+What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which
 the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once the joint has
 stopped.
 
@@ -98,7 +98,8 @@ class MomentumObserver:
     interval: time between two samples [s].
     frictions: `largest` is raised to at least this multiple of dry friction, as far as that is known: near standstill,
     friction behaves differently from the model.
-    hardly_known: whether only the torque is known beforehand; then means are compared with the earlier model, too.
+    hardly_known: whether only the torque is known beforehand; mean torques are then also compared with the earlier
+    model.
     """
 
     def __init__(
@@ -113,7 +114,9 @@ class MomentumObserver:
     ) -> None:
         joints = len(largest)
         if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
-            raise ValueError(f"{joints} joints, covariance {covariance.shape}: 1 or 2 joints and (14, 14) are needed")
+            raise ValueError(
+                f"{joints} joints and a covariance of shape {covariance.shape}: 1 or 2 joints and (14, 14) are needed"
+            )
         self._joints = joints
         self._memory = np.zeros((_PENDING + 1, _COUNT))
         self._memory[_THETA] = [mean.get(name, 0.0) for name in NAMES]

@@ -140,7 +140,10 @@ def _check(known: Mapping[str, Known], joints: int) -> None:
             raise ModelError(f"known.{name}: an arm of {joints} joints has only {', '.join(QUANTITIES[joints])}")
         positive = name.startswith(("length", "mass_1", "mass_2"))
         if not np.isfinite(item.value) or item.std < 0.0 or (positive and item.value <= 0.0):
-            raise ModelError(f"known.{name} = {item.value:g}, std {item.std:g}: must be a positive number in SI units")
+            raise ModelError(
+                f"known.{name} = {item.value:g}, std {item.std:g}: lengths and masses must be positive, "
+                "and no std negative"
+            )
 
 
 def _guess(name: str, base: Mapping[str, float], known: Mapping[str, Known], gravity: float) -> float:

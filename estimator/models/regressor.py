@@ -35,8 +35,8 @@ def regressor(position: Array, velocity: Array, acceleration: Array, coulomb_wid
     """
     if not position.shape == velocity.shape == acceleration.shape:
         raise ShapeError(
-            f"position {position.shape}, velocity {velocity.shape} and acceleration {acceleration.shape} "
-            "must all have the shape (joints, samples)"
+            f"position, velocity and acceleration have the shapes {position.shape}, {velocity.shape} and "
+            f"{acceleration.shape}; all must be (joints, samples)"
         )
     joints, samples = position.shape
     Y = np.zeros((joints, samples, len(base_names(joints))))

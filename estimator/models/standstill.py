@@ -60,7 +60,7 @@ def forget(rest: Any) -> None:
 
 
 def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta: Any) -> float:
-    """Process a sample; return its distance from the farthest residual since the joint came to rest [N m].
+    """Process a sample; return its residual's distance from the farthest one since the joint came to rest [N m].
 
     It is positive if the smallest residual is the farthest, negative if the largest is, and 0 while the joint moves.
 

@@ -70,7 +70,7 @@ OPTIONS: dict[Option, str] = {
 }
 """Optional parts of a model and their descriptions; also keys of `[model]`."""
 BEYOND_SPEEDS = 3.0
-"""Multiple of a joint's highest speed at which a Stribeck rise falls by no more than a tenth."""
+"""Stribeck velocity, as a multiple of a joint's highest speed, at which the rise falls by no more than a tenth."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,8 @@ class Term:
     """Description for users."""
     _: KW_ONLY
     part: str
-    """The part of a model that includes this term.
-
-    "base" (part of the linear regression, always present), a law of FRICTIONS, one of OPTIONS, a drive's term, or
-    "voltage" (joints driven by voltage).
+    """The part of a model that includes this term: "base" (part of the linear regression, always present), a law of
+    FRICTIONS, one of OPTIONS, a drive's term, or "voltage" (joints driven by voltage).
     """
     scope: Scope = "joint"
     first_joint: int = 1
@@ -113,7 +111,7 @@ class Term:
     """Upper bound of a speed, as a multiple of the joint's highest speed; None for no bound.
 
     A term that hardly changes over all speeds of the motion is another term in disguise: a Stribeck rise that never
-    falls is Coulomb friction, a Coulomb step that is never complete viscous friction.
+    falls is Coulomb friction, a Coulomb step that is never complete is viscous friction.
     """
     max_step: float | None = None
     """Maximum change of its coordinate (for positive terms, of the logarithm) per iteration; None: the fit's limit."""

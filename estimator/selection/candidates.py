@@ -196,7 +196,7 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
     ruled out.
 
     Each such parameter is described by its prior and the information from the motion, as if it were fitted as well.
-    Since its value actually stays unchanged, the resulting shift of the other parameters is added.
+    Since it is not fitted, the change that fitting it would make counts as an error, too.
     """
     left_out = unruled(estimate.model)
     if not left_out:

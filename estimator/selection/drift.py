@@ -49,8 +49,8 @@ class Drift:
         return bool(np.any((np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > LEAST)))
 
     def after_correction(self) -> "Drift":
-        """Return the change that may remain after a correction: the error of the measured change, and its part that is
-        not linear in time.
+        """Return the change that may remain after a correction: the error of the measured change, and the part of the
+        change that is not linear in time.
         """
         return replace(self, change=np.hypot(self.std, UNEVEN * self.change))
 
@@ -116,7 +116,7 @@ class TorqueChange:
     left: float
     """Sum of squares of the residual that the torque does not explain, in units of the noise."""
     noticed: Array
-    """Smallest torque of each joint that matters (joints,) [N m]."""
+    """Smallest constant torque of each joint that matters (joints,) [N m]."""
 
     @property
     def is_seen(self) -> Mask:

@@ -66,8 +66,8 @@ def choose(
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
         seconds: time from the middle of `periods` to that of `held_out` [s], if known.
         options: thresholds.
-        executor: a concurrent.futures executor, which starts fits that may turn out not to be needed. It does not
-            change the choice.
+        executor: a concurrent.futures executor, on which fits are started that may turn out not to be needed. It does
+            not change the choice.
 
     Raises:
         ConvergenceError: if no model can be fitted.
@@ -311,7 +311,7 @@ class Selection:
         return richer if self._gain(richer, plainer) > self._worth(richer, plainer) else plainer
 
     def prune(self, best: Trial) -> Trial:
-        """Remove insignificant terms if the motion is explained as well without them."""
+        """Remove insignificant terms if the motion is explained equally well without them."""
         assert best.estimate is not None
         if self._left(best) > self._options.presliding_residual**2:
             return best  # effects of missing terms would be attributed to present ones

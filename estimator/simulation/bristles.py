@@ -6,13 +6,13 @@ with the sign of the velocity v and the level of `hil.estimator.simulation.arm`:
 Astrom and P. Lischinsky, "A new model for control of systems with friction", IEEE Transactions on Automatic Control 40
 (1995) 419. Here b is the bristles' torque. Viscous friction is added as usual.
 
-A step of the arm is split (Strang, SIAM Journal on Numerical Analysis 5 (1968) 506). The bristles deflect for the first
-half at the velocity at its start, exactly; the arm moves with their torque as an additional offset and their damping as
-additional viscous friction; and they deflect for the second half at the velocity at its end. The arm's own step is the
-same as for every other friction law. The level is evaluated at the velocity in the middle of the step; for the first
-half, that velocity is predicted with the last step's acceleration. Once the bristles slip, friction equals the level,
-which would otherwise be half a step late. Compared with a hundred steps per sample, three at 400 Hz are accurate to
-0.03 encoder steps RMS for 5 to 1000 N m/rad.
+A step of the arm is split (Strang, SIAM Journal on Numerical Analysis 5 (1968) 506). In the first half, the bristles
+deflect at the step's initial velocity, which is solved exactly; then the arm moves with their torque as an additional
+offset and their damping as additional viscous friction; in the second half, they deflect at the final velocity. The
+arm's own step is the same as for every other friction law. The level is evaluated at the velocity in the middle of the
+step; for the first half, that velocity is predicted with the last step's acceleration. Once the bristles slip, friction
+equals the level, which would otherwise be half a step late. Compared with a hundred steps per sample, three at 400 Hz
+are accurate to 0.03 encoder steps RMS for 5 to 1000 N m/rad.
 """
 
 import math

@@ -49,7 +49,7 @@ from hil.estimator.simulation.sensitivity import (
 
 
 def sensitive(physics: Physics) -> "type[Sensitive]":
-    """Return the class that simulates these physics with derivatives."""
+    """Return the class that simulates an arm with these constants, with derivatives."""
     return PreslidingSensitive if has_bristles(physics) else Sensitive
 
 

@@ -10,7 +10,7 @@ A parameter only enters through the residuals of W k = f, of M' a = f' and of th
 e changes the new velocity by A r + B g + C e, where A, B and C are two-by-two matrices common to all parameters.
 Therefore one more parameter costs a few dozen operations per step instead of one more simulation.
 
-A processor handles several parameters at once if its compiler knows that no rows of derivatives overlap: rows are WIDE
+A processor handles several parameters at once if the compiler knows that no rows of derivatives overlap: rows are WIDE
 apart in one-dimensional arrays. They are processed one step behind the rest, since values that were just written one by
 one cannot be read several at a time without a stall.
 """

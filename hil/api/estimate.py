@@ -39,7 +39,7 @@ def estimate(
         recording: a run folder or a `Run` (its result.json is rewritten), or one or more recordings of one arm made
             with other tools: CSV, Parquet or MCAP files, LeRobot datasets, ROS 2 bags.
         config: for recordings from other tools, a TOML file whose [columns] table describes them; without it, the
-            column names must be clear enough.
+            columns must be recognisable by their names.
         out: for recordings from other tools, the folder for the result, which must be new or empty; by default
             runs/TIME-NAME.
         all_samples: use every sample of a run, by multiple shooting; no settled period is needed.

@@ -110,8 +110,8 @@ def record(
         checked = _taking_over(checked)
     if checked.experiment.pilot:
         raise ConfigError(
-            f"{shown}: experiment.pilot = true: each step's torque depends on the previous step's estimate, which only "
-            "`hil identify` makes. To record only, set experiment.peak_torque and pilot = false."
+            f"{shown}: with experiment.pilot = true, each step's torque depends on the previous step's estimate, which "
+            "only `hil identify` makes. To record only, set experiment.peak_torque and pilot = false."
         )
     run = new_run_folder(checked, shown, out)
     tell = forgiving(on_progress)

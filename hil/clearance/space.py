@@ -39,7 +39,7 @@ AT_REST_INSIDE = 0.02
 """Largest accepted overlap in the rest pose [m]: capsules are larger than the parts they enclose."""
 
 LYING_RAD = 0.12
-"""An arm within this angle of its rest pose in every joint counts as at rest; the user declares that pose safe."""
+"""An arm within this angle of its rest pose in every joint counts as at rest; the user has declared that pose safe."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Space:
     at_rest: Array
     """Distance of each pair in the rest pose (pairs,) [m]."""
     is_touched: NDArray[np.bool_]
-    """Whether anything may touch, in the rest pose, the part of the arm that each joint moves (joints,)."""
+    """Whether, in the rest pose, anything may touch the part of the arm that each joint moves (joints,)."""
     _built: Array
     """Median distance of pairs that are near each other by design, otherwise infinite (pairs,) [m]."""
     _pairs: NDArray[np.int64]

@@ -48,8 +48,8 @@ def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
 def doubted_limits(config: "Config") -> Iterator[str]:
     """Yield one sentence per joint whose limits in the description make no sense or do not contain its path.
 
-    position_limit may exceed the described limits at either end by the margin that a path leaves free: it only serves
-    to stop the arm, and some arms rest on a mechanical stop.
+    position_limit may exceed the described limits at either end by the margin that a path leaves free, since it only
+    serves to stop the arm and some arms rest on a mechanical stop.
     """
     arm = described_arm(config)
     wanted = config.joint_path
@@ -202,7 +202,7 @@ def _path_slips(config: "Config") -> Iterator[str]:
     if config.experiment.period * high < _HARMONICS - 1e-9:
         yield (
             f"experiment.period = {config.experiment.period:g} s: a path needs at least {_HARMONICS} harmonics below "
-            f"the upper end of its band, {high:g} Hz: set period to at least {_HARMONICS / high:.3g} s; 8 to 10 s are "
+            f"the upper end of its band, {high:g} Hz: set period to at least {_HARMONICS / high:.3g} s; 8 to 10 s is "
             "usual"
         )
     if config.joint_path is None:

@@ -18,7 +18,9 @@ class ExperimentConfig(Table):
 
     rate: float = Field(ge=20, le=4000, description="samples per second")
     period: float = Field(gt=0, le=1000, description="s")
-    band: Range | None = Field(None, description="Hz: frequencies of the excitation, divided among the joints")
+    band: Range | None = Field(
+        None, description="Hz: lowest and highest frequency; the lines between are divided among the joints"
+    )
     lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
     detection: bool = Field(
         False, description="excite only some of the odd lines: the others reveal nonlinear distortion"
@@ -40,7 +42,7 @@ class ExperimentConfig(Table):
         0.01, lt=1, description="largest RMS difference between settled periods, relative to the motion's RMS"
     )
     max_settling_periods: int = Field(5, ge=1, le=100)
-    periods: int = Field(1, ge=1, le=1000, description="number of settled periods recorded")
+    periods: int = Field(1, ge=1, le=1000, description="number of settled periods to record")
     held_out: bool = Field(True, description="run a second multisine with other phases to validate the model")
     seed: int = Field(1, ge=0, le=2**63 - 1)
 

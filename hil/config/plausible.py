@@ -1,4 +1,4 @@
-"""Detection of unit errors, such as degrees for radians, mm for m, or mA for A: a file with one is valid but dangerous.
+"""Detection of unit errors, such as degrees for radians, mm for m, or mA for A, which leave a file valid but dangerous.
 
 Every physical quantity is compared, with a wide margin, with what a servo of that model could move: external gears,
 light plastic links and heavy test rigs pass; a factor due to a wrong unit does not.

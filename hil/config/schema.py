@@ -55,10 +55,10 @@ __all__ = [
 ]
 
 LYING_RAD = 0.25
-"""Largest deviation from the rest pose at the start of a spatial arm, unless arm.rest_tolerance is given [rad]."""
+"""Largest deviation of a spatial arm from its rest pose at the start, unless arm.rest_tolerance is given [rad]."""
 
 SLOW_INTERVAL_S = 0.25
-"""Interval between slow reads [s]: in turn, the servos' clocks, and their voltages and temperatures."""
+"""Interval between slow reads [s]: alternately of the servos' clocks and of their voltages and temperatures."""
 
 
 class PortConfig(Table):

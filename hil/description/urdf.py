@@ -97,8 +97,8 @@ def parse_urdf(path: Path) -> ET.Element:
         raise ArmFileError(f"{path}: its root is <{root.tag}>, not <robot>: it is not a URDF")
     if "<xacro:" in text:
         raise ArmFileError(
-            f"{path} contains xacro macros: expand them into another file first, xacro {path.name} > "
-            f"{path.stem}_expanded.urdf, and name that file"
+            f"{path} contains xacro macros: expand them into another file first (xacro {path.name} > "
+            f"{path.stem}_expanded.urdf), and name that file"
         )
     return root
 

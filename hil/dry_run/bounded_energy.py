@@ -1,7 +1,8 @@
 """Whether an arm without torque has too little energy to leave its position limits.
 
-Friction only dissipates, so an unpowered arm cannot reach a pose with more potential energy than its total energy. If
-every pose on the boundary of the permitted range has more, the arm stays inside, and its swing need not be simulated.
+Friction only dissipates energy, so an unpowered arm cannot reach a pose with more potential energy than its total
+energy. If every pose on the boundary of the permitted range has more, the arm stays inside, and its swing need not be
+simulated.
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,8 @@ _MARGIN = 0.05
 class Boundary:
     """The position limits of an arm and the lowest potential energy at them.
 
-    low, high: limits (joints,) [rad]. least: that energy [J]; -inf if the arm's energy is not bounded by this model.
+    low, high: limits (joints,) [rad]. least: that lowest energy [J]; -inf if the arm's energy is not bounded by this
+    model.
     """
 
     physics: Physics

@@ -76,8 +76,8 @@ class ChainStops:
         down = self.lowering
         if down.nearest.room < 0.0:
             return (
-                f"too little clearance when a stop lowers the arm, {down.nearest}, at least "
-                f"{1e3 * down.nearest.needed:.0f} mm required. Lower safety.lower_speed, choose a rest_pose farther "
+                f"too little clearance when a stop lowers the arm ({down.nearest}; at least "
+                f"{1e3 * down.nearest.needed:.0f} mm required). Lower safety.lower_speed, choose a rest_pose farther "
                 "from obstacles, or specify the masses more accurately"
             )
         if down.lies < LAID_DOWN:

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 MODEL_SPREAD = 0.005
 """Relative standard deviation added to every identified parameter for model error, which the covariance omits.
 
-It is multiplied by the ratio of the simulated range of motion to the identified one.
+It is multiplied by the ratio of the simulated range of motion to the range used for identification.
 """
 
 _LEAST_SHARE = 0.05  # smallest allowed fraction of a positive parameter's nominal value

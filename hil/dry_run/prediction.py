@@ -30,7 +30,7 @@ QUANTITIES = ("lowest position", "highest position", "velocity", "current", "tor
 UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")
 GUARDED = 3
 """Number of quantities, counted from the first, at whose limits the guard stops the arm. Current is clamped instead;
-the others follow from it.
+torque and power follow from the other quantities.
 """
 
 QUANTILE = 0.99
@@ -70,7 +70,7 @@ class Prediction:
     def quantile(self) -> Array:
         """Bounds that contain all peaks of 99 out of 100 arms (quantities, joints).
 
-        All bounds are the same number of deviations above their medians, so that they change smoothly with the
+        All bounds are the same number of standard deviations above their medians, so that they change smoothly with the
         amplitude.
         """
         shares = self.share_at(self._simultaneous())
@@ -90,7 +90,7 @@ class Prediction:
         return np.asarray([[0.5 * erfc(z / sqrt(2)) for z in row] for row in ((1 - middle) / spread).tolist()])
 
     def share_at(self, deviations: float) -> Array:
-        """Fractions of the limits (quantities, joints) at this number of deviations above the median."""
+        """Fractions of the limits (quantities, joints) at this number of standard deviations above the median."""
         middle, spread = self._middle()
         return np.asarray(middle + deviations * spread)
 

@@ -179,9 +179,9 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
         settling_text(config, shown),
         f"If stopped at any moment, the arms overshoot their limits by up to {_each(config, stopped)}; if the program "
         f"is killed or the cable unplugged, by up to {_each(config, planned[Way.SILENT])}.",
-        "If something drives an arm past a limit at these speeds, it overshoots the limit by up to the following. "
-        f"Braked: {_each(config, passed[Way.BRAKED])}. With torque cut: {_each(config, passed[Way.CUT])}. Keep that "
-        "much space clear.",
+        "If something drives an arm past a limit at these speeds, it overshoots the limit by up to "
+        f"{_each(config, passed[Way.BRAKED])} when braked, and by up to {_each(config, passed[Way.CUT])} when torque "
+        "is cut. Keep that much space clear.",
         *(
             []
             if run.largest is None
@@ -194,10 +194,10 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     if run.asked is None:
         return [
             *lines,
-            f"Safe at that torque: probability of a guard stop: {_percent(shown.stop_chance)}; {allowed}.",
+            f"Safe at that torque: the probability of a guard stop is {_percent(shown.stop_chance)}; {allowed}.",
         ]
     word = "SAFE" if run.is_safe(config) else "NOT SAFE as configured"
-    return [*lines, f"{word}: probability of a guard stop: {_percent(shown.stop_chance)}; {allowed}."]
+    return [*lines, f"{word}: the probability of a guard stop is {_percent(shown.stop_chance)}; {allowed}."]
 
 
 def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> list[str]:

@@ -37,8 +37,8 @@ def lowered(before: Config, after: Config) -> tuple[str, ...]:
     if not now:
         return ()
     return (
-        f"At higher speeds the supply cannot drive the commanded current, so this speed limit applies instead of "
-        f"velocity_limit: {', '.join(now)} rad/s.",
+        "At higher speeds the supply cannot drive the commanded current, so velocity_limit is lowered: "
+        f"{', '.join(now)} rad/s.",
     )
 
 

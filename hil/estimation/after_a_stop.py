@@ -12,7 +12,7 @@ from hil.runs.run_folder import RunFolder
 
 
 def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
-    """Sentences about what is kept; the last one is the next command.
+    """Sentences about what is kept; the last one gives the next command.
 
     command: the subcommand that was stopped. shown: the configuration's path as the user wrote it.
     """
@@ -31,7 +31,7 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
 
 
 def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
-    """Sentences about what is kept after the guard or a failed servo stopped a run; the last one is the next
+    """Sentences about what is kept after the guard or a failed servo stopped a run; the last one gives the next
     command.
     """
     if can_be_estimated(run.path):

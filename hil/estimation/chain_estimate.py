@@ -138,7 +138,7 @@ def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
 
 
 def true_chain_parameters(config: Config, known: KnownChain) -> dict[str, float] | None:
-    """True parameters of the fake arm by name [SI]; None for a real arm or another plant."""
+    """True parameters of the fake arm by name [SI]; None for a real arm or another kind of fake arm."""
     chain = None if config.fake is None else config.fake.chain
     if not config.is_fake or chain is None:
         return None
@@ -206,7 +206,7 @@ def _verdict(
         error = float(np.max(held_out))
         joint = config.joints[int(np.argmax(held_out))].name
         sentences.append(
-            f"A held-out path is predicted to within {100 * error:.2f} % of its motion (worst joint: {joint}), "
+            f"A held-out path is predicted to within {100 * error:.2f} % of its motion's RMS (worst joint: {joint}), "
             "excluding encoder noise."
         )
         trust = "no" if error > WRONG else "with care" if error > PREDICTED else trust
@@ -248,8 +248,8 @@ def _verdict(
     sentences += conflict_sentences(estimate.conflicts, explained)
     if estimate.unseen:
         sentences.append(
-            f"Not identifiable from gravity in this motion: {', '.join(estimate.unseen)} (assumed to be zero within "
-            "the standard error)."
+            f"Not identifiable from gravity in this motion: {', '.join(estimate.unseen)} (taken as zero, to within "
+            "their standard errors)."
         )
     return Verdict(trust, weakest, tuple(sentences))
 

@@ -27,7 +27,7 @@ _DETERMINED = 0.02
 
 
 def true_parameters(config: Config, time: float = math.inf) -> dict[str, float] | None:
-    """The base parameters by name [SI]; None for a real arm, empty for a plant that does not state them.
+    """The base parameters by name [SI]; None for a real arm, empty for a fake arm that does not state them.
 
     time: time since the arm was switched on [s], for drives whose friction changes as they warm up. The back-EMF of a
     voltage-driven joint counts as viscous friction.
@@ -44,7 +44,7 @@ def true_parameters(config: Config, time: float = math.inf) -> dict[str, float] 
 
 
 def back_emf(config: Config, fake: FakeArm, drives: Sequence[Drive]) -> dict[str, float]:
-    """Back-EMF of each voltage-driven joint as viscous friction [N m s/rad], by the name of that parameter."""
+    """Back-EMF of each voltage-driven joint as viscous friction [N m s/rad], by the name of the friction parameter."""
     found: dict[str, float] = {}
     for servo, moved in zip(fake.servos, fake.joints, strict=True):
         if config.joints[moved].drive_mode is Mode.PWM:

@@ -50,7 +50,7 @@ def export_chain_urdf(source: Source, model: ChainArmModel, path: Path) -> list[
         if share < 1.0:
             reduced.append(
                 f"the full inertia that the description gives {', '.join(joint.movable)}; the file has "
-                f"{100 * share:.2g} % of it, because more would leave no possible body for {joint.link}"
+                f"{100 * share:.2g} % of it, because more would leave no physically possible body for {joint.link}"
             )
             for name in apart:
                 _scale_inertial(links[name], share)

@@ -19,7 +19,7 @@ def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:
 def chain_left_out(model: ChainArmModel, carried: tuple[str, ...] = ()) -> list[str]:
     """One sentence per parameter of a spatial arm that the format cannot represent, except those in `carried`.
 
-    Links represent all base parameters.
+    The links in the file represent all base parameters.
     """
     elsewhere = {*_SAID_ELSEWHERE, *carried}
     names = [name for name in model.values if name not in model.groups and kind_of(name) not in elsewhere]

@@ -23,7 +23,7 @@ PLANAR_RADIUS = 0.1
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of a link, which turns about `axis` (3,) of its joint.
+    """The frame of a link, which turns about its joint's `axis` (3,).
 
     rotation, translation: pose of the frame in `parent` at angle zero (3, 3), (3,) [m]. joint: index of the angle; None
     for the base, which is fixed.

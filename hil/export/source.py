@@ -40,7 +40,7 @@ class Source:
 class Recorded:
     """A recording, whether or not it has been estimated.
 
-    joints: their names. result: what was estimated from it, None if nothing was.
+    joints: names of the joints. result: what was estimated from the recording, None if nothing was.
     """
 
     run: Path
@@ -55,7 +55,7 @@ class Recorded:
         if is_recording_folder(run):
             raise RunFolderError(
                 f"{run} is an estimate from another tool's recording: the samples are in that tool's files. Export the "
-                "arm: urdf, mjcf, toml or json."
+                "arm instead: urdf, mjcf, toml or json."
             )
         folder = RunFolder.open(run)
         result = read_usable_result(run) if (folder.path / "result.json").is_file() else None

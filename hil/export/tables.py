@@ -27,7 +27,7 @@ def export_csv(source: Recorded, path: Path) -> list[str]:
 
 
 def export_parquet(source: Recorded, path: Path) -> list[str]:
-    """Write `path`; its metadata contain the columns' units and result.json. Needs pyarrow."""
+    """Write `path`; its metadata contains the columns' units and result.json. Needs pyarrow."""
     try:
         import pyarrow as pa
         from pyarrow import parquet

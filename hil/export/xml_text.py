@@ -7,7 +7,7 @@ from hil.arm_model import ArmModel
 
 
 def numbers(*values: float) -> str:
-    """Format numbers as an attribute, without loss of precision."""
+    """Format numbers as the text of an XML attribute, without loss of precision."""
     return " ".join(repr(float(value)) for value in values)
 
 

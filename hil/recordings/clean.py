@@ -87,7 +87,7 @@ def _unrepeated(source: str, rows: Rows) -> Rows:
         return rows
     if count > FEW * rows.time.size:
         percent = f"{100 * count / rows.time.size:.0f} %"
-        share = f"{source}: {percent} of the times repeat the previous one, with different data"
+        share = f"{source}: {percent} of the time stamps repeat the previous one, with different data"
         if encoder_step(rows.time) is None:
             raise CsvError(
                 f"{share}, although they have many digits: the rows were stamped when they arrived, in bursts, not "

@@ -25,8 +25,8 @@ SMALLEST_STEP = 1e-9  # rad, where readings show no steps: their noise is measur
 class Converted:
     """Recordings in SI units.
 
-    names: one per recording. stepped: whether each joint's encoder resolution is known. columns: including
-    guesses. notes: one sentence per guess or correction.
+    names: one per recording. stepped: whether each joint's encoder resolution is known. columns: their description,
+    including guesses. notes: one sentence per guess or correction.
     """
 
     recordings: tuple[Recording, ...]
@@ -144,8 +144,8 @@ def _unit(table: Table, name: str, kind: str, stated: str | None, given: str | N
             return next(iter(possible)) if kind != "pwm" else "1"
         if read is None or read not in possible:
             raise CsvError(
-                f"{table.source}: column {name!r} states the unit {stated!r}, which is none of {', '.join(possible)}: "
-                f"convert it, or set columns.{kind}_unit."
+                f"{table.source}: column {name!r} states the unit {stated!r}, which is not one of "
+                f"{', '.join(possible)}: convert it, or set columns.{kind}_unit."
             )
         return read
     if read is not None and read != given:

@@ -55,7 +55,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Covariance:
-    """Joint covariance of all parameters, in the order of `names` and in the parameters' units."""
+    """Covariance of all parameters together, in the order of `names` and in the parameters' units."""
 
     names: tuple[str, ...]
     matrix: tuple[tuple[Spread, ...], ...]
@@ -121,7 +121,7 @@ class Levels:
 
 @dataclass(frozen=True)
 class LineGroup:
-    """Spectral lines of one kind: their number, and RMS motion and residual of one line per joint, in encoder steps."""
+    """Spectral lines of one kind: their number, and RMS of motion and residual per line and joint, in encoder steps."""
 
     lines: int
     motion: PerJoint
@@ -130,7 +130,7 @@ class LineGroup:
 
 @dataclass(frozen=True)
 class LineLevels:
-    """RMS of one spectral line in encoder steps, by kind of line; None for kinds that the multisine does not have."""
+    """RMS per spectral line in encoder steps, by kind of line; None for kinds that the multisine does not have."""
 
     noise: PerJoint
     excited: LineGroup | None = None
@@ -153,7 +153,7 @@ class Validation:
     RMS (the verdict excludes the noise); if friction has changed since the fitted multisine, the model's friction is
     scaled by one factor per joint, estimated from the held-out motion itself. held_out_as_fitted_rms: the same with
     friction as it was in the fitted multisine; None if it has not changed. free_run_rms: open-loop prediction error of
-    the fitted multisine, likewise relative.
+    the fitted multisine, also relative to the motion's RMS.
     residual_over_floor: residual relative to the measured noise, which is at least the rounding noise. correlated_lags:
     fraction of the residual's autocorrelations that exceed those of white noise. condition: condition number of the
     scaled information matrix.

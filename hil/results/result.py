@@ -11,8 +11,8 @@ verdict      whether to trust the result, the weakest parameter, and the reasons
 warnings     problems of the recording, as sentences
 model_choice with friction = "auto": the models tried, the one chosen, its gain and cost
 timing       how well the stream kept its deadlines, and the duration of the estimation
-arm          facts needed to use the model: gravity, rest pose, and per joint name, servo, mode, limits, torque per
-             goal [N m/A, or N m/V in pwm mode]
+arm          facts needed to use the model: gravity, rest pose, and, for each joint, name, servo, mode, limits, torque
+             per goal [N m/A, or N m/V in pwm mode]
 chain        only for a spatial arm: its geometry, and the combination that each base parameter stands for
 truth        only on a fake arm: the base parameters it was built with, in N m of its own motors
 truth_scaled the same in the unit of `parameters`, only if the file's torque constants are not those of the motors

@@ -52,7 +52,7 @@ class RunSummary:
 
 
 def find_runs(folder: Path) -> list[RunSummary]:
-    """The runs in `folder`, or `folder` itself if it is a run, oldest first; pilot steps belong to their run.
+    """The runs in `folder`, or `folder` itself if it is a run, oldest first; pilot steps count as part of their run.
 
     Raises RunFolderError if the folder does not exist.
     """

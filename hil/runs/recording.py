@@ -48,10 +48,10 @@ class Phase(IntEnum):
 def sample_type(joints: int) -> np.dtype[np.void]:
     """The type of one row.
 
-    It contains times [s], the position in the plan, and per joint goal and measured current [A], velocity [rad/s],
-    position [rad], the servo's error byte and whether its reply is missing (the measured values are then NaN).
-    Alternately, a few times a second, it also contains the servo's clock [s], supply voltage [V] and temperature
-    [degrees C], which are NaN otherwise.
+    It contains times [s], the position in the plan, and, for each joint, goal and measured current [A], velocity
+    [rad/s], position [rad], the servo's error byte and whether its reply is missing (the measured values are then NaN).
+    A few times a second, it also contains either the servo's clock [s] or its supply voltage [V] and temperature
+    [degrees C], in turn; these are NaN in all other rows.
     """
     each = (joints,)
     return np.dtype(
@@ -242,7 +242,7 @@ def missed(goal_current: Sequence[float], now: float) -> State:
 
 
 def load_samples(path: Path, joints: int) -> NDArray[np.void]:
-    """The recorded rows of a `samples.npy`, even if its process was killed. Raises RunFolderError."""
+    """The recorded rows of a `samples.npy`, even if the process that wrote it was killed. Raises RunFolderError."""
     try:
         check_array(path)
         samples = np.load(path, allow_pickle=False, mmap_mode="r")

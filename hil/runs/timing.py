@@ -18,7 +18,7 @@ _EDGES_US = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0
 
 
 def timing(samples: NDArray[np.void], rate: float) -> StreamTiming:
-    """Held rate, lateness, round trips, missed ticks, lost replies and clock drifts of a recording."""
+    """Achieved rate, lateness, round trips, missed ticks, lost replies and clock drifts of a recording."""
     sent = _sent(samples)
     lateness_us = _lateness_us(sent)
     round_trip_us = 1e6 * (sent["time_after_read"] - sent["time_before_write"])

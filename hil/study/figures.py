@@ -50,7 +50,8 @@ class Spread:
 class Figures:
     """Figures of a complete study.
 
-    done: rate of successful runs. categories: per text column, the rate of each value. failures: count of each message.
+    done: rate of successful runs. categories: for each text column, the rate of each value. failures: count of each
+    message.
     spreads: quantiles of each numeric column.
     """
 

@@ -57,7 +57,7 @@ def run_study(
 ) -> Dataset:
     """Perform all runs that have no row yet.
 
-    Raises ConfigError and RunFolderError before anything runs, MissingExtra, and SchedulerLost.
+    Raises MissingExtra and SchedulerLost and, before anything runs, ConfigError and RunFolderError.
     """
     runs = check_study(study, out)
     with opened(study, out, runs, resume=resume) as dataset:

@@ -83,7 +83,8 @@ def lost_row(spec: Spec, error: BaseException | None) -> Row:
     why = RuntimeError("no worker finished it") if error is None else error
     if type(error).__name__ == "KilledWorker":
         why = MemoryError(
-            "every worker that attempted it died: it crashes, or needs more memory than engine.worker_memory_gib"
+            "every worker that attempted this run died: the run crashes, or needs more memory than "
+            "engine.worker_memory_gib"
         )
     return _row_of(spec) | _failure(why) | {"seconds": None, "cpu_seconds": None, "worker": None}
 

@@ -2,9 +2,9 @@
 
 The arm is driven with the torque that an approximate model requires for the path, plus that of a software spring and
 damper. The series is optimised for what the result is used for: predicting the torque of other motions in the same
-range. The worst joint counts. The criterion includes all unknowns of the regression, friction and offsets too. If a
-joint moves little, its gravity torque cannot be distinguished from an offset; a criterion on inertial parameters alone
-would miss this.
+range. The criterion is that of the worst joint and includes all unknowns of the regression, friction and offsets too.
+If a joint moves little, its gravity torque cannot be distinguished from an offset; a criterion on inertial parameters
+alone would miss this.
 
 This designer is for a box of angles and speeds that the user has chosen ([joint_path]); nothing else limits the path.
 If the box itself is to be found, within limits of torque and clearance, `path_design` chooses it.

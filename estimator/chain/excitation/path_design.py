@@ -5,7 +5,7 @@ Ostermeier, Evolutionary Computation 9 (2001) 159, with one step size for all) o
 Fourier series of `hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation
 is scaled to the limits of position and speed and then shrunk until `allowed` accepts it.
 
-Friction is treated as unknown too, with a model no more accurate than that of the links. If it were taken as known,
+Friction is treated as unknown too, and its model as no more accurate than that of the links. If it were taken as known,
 slow, creeping motion would seem to identify a light joint, whose torque is mostly friction.
 
 This designer is for the pilot experiment, for which only limits are known: it also chooses the centre and the width of
@@ -42,7 +42,7 @@ _MEAN_SHARE = 0.1  # weight of the mean log error in the criterion; the worst on
 
 @dataclass(frozen=True)
 class PathLimits:
-    """Limits of angle `low` and `high` [rad] and `speed` [rad/s] (joints,).
+    """Limits of the angles, `low` and `high` [rad], and of the `speed` [rad/s] (joints,).
 
     `allowed` returns whether a path respects the limits of torque and clearance.
     """
@@ -147,7 +147,7 @@ class PathDesigner:
         return Path(centre + share * (path.position - centre), share * path.velocity, share * path.acceleration)
 
     def worth(self, path: Path) -> tuple[float, float]:
-        """Return the worst and the median relative standard error of the base parameters after a path."""
+        """Return the worst and the median relative standard error of the base parameters that a path leaves."""
         errors = self._errors(path, max(1, path.position.shape[1] // LOOKED_AT))
         return float(errors.max()), float(np.median(errors))
 
@@ -167,15 +167,15 @@ class PathDesigner:
                 best = value, centre, lines
         if best is None:
             raise ExcitationError(
-                f"none of {CENTRES} centres has a path that stays within the torque and clearance limits"
+                f"no path about any of the {CENTRES} centres tried stays within the torque and clearance limits"
             )
         return best[1], best[2]
 
     def widest(self, centre: Array, seed: int, tries: int = WIDEST_OF) -> Design:
-        """Return the random path about a centre that maximises the range of the joint that moves least, for validation.
+        """Return, out of several random paths about a centre, the one whose least-moving joint moves farthest.
 
-        Validation needs a wide motion, because it cannot resolve prediction errors below encoder rounding. Raises
-        ExcitationError if no path is allowed.
+        It is used for validation, which cannot resolve prediction errors below encoder rounding and therefore needs a
+        wide motion. Raises ExcitationError if no path is allowed.
         """
         random = np.random.default_rng(seed)
         found = [self._finished(centre, self._random_lines(random)) for _ in range(tries)]

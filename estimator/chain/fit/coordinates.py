@@ -1,4 +1,4 @@
-"""Unconstrained coordinates of a chain's parameters: logarithms of positive ones, linear for the others.
+"""Unconstrained coordinates of a chain's parameters: logarithmic for positive ones, linear for the others.
 
 A base parameter is a sum that may have either sign, so the fit itself must keep the mass matrix positive definite.
 """
@@ -77,7 +77,7 @@ class ChainCoordinates:
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
-        """Return the point reached by `step` from `x`; both may be followed by other coordinates.
+        """Return the point reached by `step` from `x`; other coordinates may follow in both arrays.
 
         If a recording hardly determines the torque of some joints relative to that of the first, their torque scales
         and all parameters of their links can change by a common factor. The scales are exponentials of their
@@ -92,7 +92,7 @@ class ChainCoordinates:
         return y
 
     def raised(self, x: Array) -> Array:
-        """Return `x`, which other coordinates may follow, with every width raised to its floor."""
+        """Return `x` with every width raised to its floor; other coordinates may follow in `x`."""
         y = x.copy()
         y[self._widths] = np.maximum(x[self._widths], np.log(self._least[self._widths]))
         return y
@@ -101,7 +101,7 @@ class ChainCoordinates:
         """Return the largest possible decrease of each parameter's coordinate, as a negative number or 0
         (parameters,).
 
-        Only widths have a floor; `x` may be followed by other coordinates.
+        Only widths have a floor; other coordinates may follow in `x`.
         """
         least = np.full(len(self.names), -np.inf)
         least[self._widths] = np.minimum(np.log(self._least[self._widths]) - x[self._widths], 0.0)
@@ -115,7 +115,8 @@ class ChainCoordinates:
     def limit(self, x: Array, reach: float, least: Array, most: Array) -> None:
         """Set the bounds `least` and `most` on the change of each coordinate in one step from `x`, in place.
 
-        Friction-shape parameters may change by the fraction `reach` of their maximum. No width falls below its floor.
+        Friction-shape parameters may change by the fraction `reach` of their usual maximum step. No width falls below
+        its floor.
         """
         count = len(self.names)
         bound = np.where([kind in SHAPES for kind in self._kinds], reach * RESHAPING, LONGEST)

@@ -136,7 +136,7 @@ class ChainProblem:
         """Return the problem with the prior's weight raised in proportion to the excess of the residual at `x` over the
         assumed noise, and the sum of squares at `x`.
 
-        Repeated readings count as one, as they do in the sum of squares.
+        Repeated readings have the same reduced weight as in the sum of squares.
         """
         data = self._of_data(x)
         problem = replace(self, prior_weight=max(1.0, data.cost / self.counted))
@@ -144,7 +144,7 @@ class ChainProblem:
 
     @property
     def counted(self) -> float:
-        """Number of samples compared; repeated readings count as in the sum of squares."""
+        """Number of samples compared; repeated readings have the same reduced weight as in the sum of squares."""
         counted = (
             np.square(weight * period.noise)[:: self.every]
             for weight, period in zip(self.weights, self.periods, strict=True)

@@ -1,4 +1,4 @@
-"""Distance from the point where a fit stopped to its minimum."""
+"""Distance from the point where a fit stopped to the minimum."""
 
 import numpy as np
 

@@ -76,8 +76,8 @@ class ChainFit:
     at_bound: tuple[str, ...] = ()
     """Parameters at a bound although the data favour values beyond it; empty unless this affects base parameters."""
     held_zeros: HeldZeros | None = None
-    """Result of the test of the encoder zeros that the model holds fixed; None if it fits them, has one joint, or no
-    test was requested.
+    """Result of the test of the encoder zeros that the model holds fixed; None if the model fits them or has one joint,
+    or if no test was requested.
     """
 
     @property

@@ -199,7 +199,7 @@ def _minimised(problem: ChainProblem, x: Array, ftol: float) -> tuple[Minimum, C
 
 
 def towards_prior(problem: ChainProblem, x: Array, options: ChainOptions) -> Array:
-    """Return stage 1's point, moved towards the prior until the arm can be simulated.
+    """Return stage 1's estimate, moved towards the prior until the arm can be simulated.
 
     If the data hardly determine some inertias, the estimates may be unphysical, with an indefinite mass matrix.
     """

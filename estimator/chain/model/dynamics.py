@@ -73,8 +73,8 @@ def regressor(
 
 
 def places(joints: int, chosen: Columns) -> Columns:
-    """Return the index of each link's parameters among the chosen ones (joints, 11). The index of any other parameter
-    is the number of chosen ones.
+    """Return the index of each link's parameters among the chosen ones (joints, 11). A parameter that was not chosen
+    has the number of chosen ones as its index.
     """
     column = np.full(TERMS * joints, chosen.size)
     column[chosen] = np.arange(chosen.size)
@@ -94,8 +94,8 @@ def _motion(chain: Chain, *motion: Array) -> tuple[Array, ...]:
     shapes = {each.shape for each in motion}
     if len(shapes) != 1 or motion[0].ndim != 2 or motion[0].shape[0] != chain.joints:
         raise ShapeError(
-            f"position, velocity and acceleration are {', '.join(str(each.shape) for each in motion)}: all must be "
-            f"({chain.joints}, samples)"
+            f"position, velocity and acceleration have the shapes {', '.join(str(each.shape) for each in motion)}: "
+            f"all must be ({chain.joints}, samples)"
         )
     return tuple(np.ascontiguousarray(each.T, dtype=np.float64) for each in motion)
 

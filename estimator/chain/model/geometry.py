@@ -12,9 +12,8 @@ LINK_TERMS = (
     *("mass", "moment_x", "moment_y", "moment_z"),
     *("inertia_xx", "inertia_xy", "inertia_xz", "inertia_yy", "inertia_yz", "inertia_zz"),
 )
-"""Inertial parameters of a link in its own frame.
-
-Mass [kg], mass times centre of mass [kg m], inertia about the frame's origin [kg m^2].
+"""Inertial parameters of a link in its own frame: mass [kg], mass times centre of mass [kg m], inertia about the
+frame's origin [kg m^2].
 """
 UNITS = {"mass": "kg", "moment": "kg m", "inertia": "kg m^2", "armature": "kg m^2"}
 
@@ -43,7 +42,7 @@ class Chain:
         shapes = self.rotation.shape, self.translation.shape, self.axis.shape, self.gravity.shape
         if shapes != ((joints, 3, 3), (joints, 3), (joints, 3), (3,)):
             raise ShapeError(
-                f"rotation, translation, axis and gravity are {', '.join(map(str, shapes))}: they must be "
+                f"rotation, translation, axis and gravity have the shapes {', '.join(map(str, shapes))}: they must be "
                 "(joints, 3, 3), (joints, 3), (joints, 3) and (3,)"
             )
         if not 1 <= joints <= MOST_JOINTS:

@@ -305,7 +305,8 @@ def regress(column: Any, a: Any, room: Any, Y: Any) -> None:
 def pull(gravity: Any, room: Any, column: int, out: Any) -> None:
     """Set a column of `out` (joints, columns) to the torques that hold all links still under this gravity alone.
 
-    Call `move` first. The torques are linear in gravity, so a change of gravity gives the change of the torques.
+    Call `move` first. The torques are linear in gravity, so passing a change of gravity yields the change of the
+    torques.
     """
     motion, body = room[1], room[2]
     x, y, z = -gravity[0], -gravity[1], -gravity[2]

@@ -4,7 +4,7 @@ The back-EMF passes through the same lag as the voltage, so that a joint moves l
 product of its back-EMF and its lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous
 friction is due to it. The lag of a winding makes a joint lighter by at most half of its inertia, where the poles of the
 equivalent motor meet. Far from the minimum of a fit, parameters may imply a greater loss, which is then limited to this
-one.
+value.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
 """Meanings of the kinds of parameters that only chains have."""
 PART = 0.1
-"""`limited` names a joint only if its part in the motion that loses the most inertia exceeds this fraction."""
+"""Smallest share of a joint in the motion that loses the most inertia for `limited` to name the joint's back-EMF."""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
 _ARMATURE = 10  # of a link's parameters
@@ -50,7 +50,7 @@ def as_moving(base: BaseParameters, parameters: Mapping[str, float]) -> dict[str
 
 
 def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[int, float]:
-    """Return the apparent loss of inertia of each voltage-driven joint (from 0) [kg m^2]."""
+    """Return the apparent loss of inertia of each voltage-driven joint, counted from 0 [kg m^2]."""
     generating = _generating(base.chain.joints, parameters)
     possible = _possible(base, parameters, generating)
     return {joint: possible * share * viscous * late for joint, share, viscous, late in generating}
@@ -74,14 +74,14 @@ def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -
 
 
 def rotor(base: BaseParameters, joint: int) -> Array:
-    """Return the base parameters of a unit rotor inertia of a joint, counted from 0 (base parameters,)."""
+    """Return what a rotor inertia of 1 kg m^2 at `joint` (from 0) adds to the base parameters (base parameters,)."""
     column: Array = base.grouping[:, TERMS * joint + _ARMATURE]
     return column
 
 
 Losses = list[tuple[Array, dict[int, float]]]
-"""For each voltage-driven joint: its rotor (base parameters,), and by how much its inertia [kg m^2] decreases per unit
-of each parameter on which its lagging back-EMF depends, by the index of that parameter.
+"""For each voltage-driven joint: its rotor (base parameters,), and the decrease of its inertia [kg m^2] per unit of
+each parameter that its lagging back-EMF depends on, by that parameter's index.
 """
 
 

@@ -79,8 +79,8 @@ class ChainObserver:
         count = base.count + 3 * n
         if mean.shape != (count,) or covariance.shape != (count, count) or largest.shape != (n,):
             raise ValueError(
-                f"mean {mean.shape}, covariance {covariance.shape} and largest {largest.shape} must be "
-                f"{(count,)}, {(count, count)} and {(n,)}"
+                f"mean, covariance and largest have the shapes {mean.shape}, {covariance.shape} and {largest.shape}; "
+                f"they must be {(count,)}, {(count, count)} and {(n,)}"
             )
         self._theta, self._covariance = np.array(mean), np.array(covariance)
         self._memory = np.zeros((TIMES_OF_ALL + 1, max(n, 2)))
@@ -136,7 +136,7 @@ class ChainObserver:
 
     @property
     def is_beyond(self) -> list[bool]:
-        """Whether the latest residual of each joint exceeds what may be normal (joints,)."""
+        """Whether the latest residual of each joint exceeds the normal range (joints,)."""
         return [bool(value > 0.0) for value in self._memory[SAMPLES, : self._joints]]
 
     @property

@@ -75,7 +75,7 @@ class Loop:
     rate: samples per second.
     goal: torques (samples, joints) [N m].
     stiffness, damping: gains of the spring [N m/rad] and damper [N m s/rad] towards `pose` (joints,).
-    pose: rest pose (joints,) [rad], on a surface that stops joints from being moved further down by gravity.
+    pose: rest pose (joints,) [rad], on a surface that keeps gravity from moving joints further down.
     limit: largest commanded torque (joints,) [N m].
     stops: side on which a joint lies on its own stop in the rest pose (joints,), -1, 1, or 0 if it does not; None if
     none does. A stop supports its joint instead of the surface, whatever the angles of the other joints. Nothing

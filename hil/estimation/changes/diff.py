@@ -77,8 +77,8 @@ class Difference:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Warnings: sentences on joints whose descriptions differ, and on each model of the two runs that should not
-        be trusted without reservation.
+        """Warnings: sentences on joints whose descriptions differ, and on each of the two models that should not be
+        trusted without reservation.
         """
         untrusted = tuple(
             f"{name}: trust this model: {trust}. Its values may be biased by more than their standard errors, so a "

@@ -1,9 +1,9 @@
-"""Whether one joint's friction changed between two runs, tested with the joint covariance of its parameters.
+"""Whether one joint's friction changed between two runs, tested with the full covariance of its parameters.
 
-Coulomb friction, its rise at low speed and the speed at which it falls are known far better jointly than individually:
-a change of one of them by 10 % may be less than its own standard error and still be obvious. Let d be the difference of
-the joint's friction parameters between the runs, and S the sum of their covariances in both. Two kinds of question are
-asked.
+Coulomb friction, its rise at low speed and the speed at which it falls are known far better in combination than
+individually: a change of one of them by 10 % may be less than its own standard error and still be obvious. Let d be the
+difference of the joint's friction parameters between the runs, and S the sum of their covariances in both. Two kinds of
+question are asked.
 
 one term alone    Did only term i change? The most powerful test is z_i = (S^-1 d)_i / sqrt((S^-1)_ii), and
                   (S^-1 d)_i / (S^-1)_ii is the change that this implies (generalised least squares).

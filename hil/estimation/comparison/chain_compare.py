@@ -64,7 +64,7 @@ class Judge:
         self._held_out = held_out
 
     def error(self, parameters: Mapping[str, float], period: SettledPeriod | None = None) -> float | None:
-        """Prediction error relative to the motion, for the worst joint; None if nothing was held out or if the
+        """Prediction error relative to the motion's RMS, for the worst joint; None if nothing was held out or if the
         simulated arm diverges. period: the one to predict, by default the held-out one.
         """
         shown = self._held_out if period is None else period
@@ -78,7 +78,8 @@ class Judge:
 
 
 def worst_chain_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
-    """Name and largest relative error among the large base parameters and the friction terms.
+    """Return the parameter with the largest relative error and that error, among large base parameters and friction
+    terms.
 
     Offsets are left out, and so are sums that are small compared with others of their kind (see LARGE).
     """

@@ -35,8 +35,8 @@ class MethodResult:
 
     settings_tried: number of settings tried; the best is reported. worst_relative_error: largest relative error of
     inertias, gravity and friction, on a fake arm only. held_out_rms: open-loop prediction error of the held-out
-    multisine relative to its motion, for the worst joint; None if the simulation does not settle or there was no such
-    multisine.
+    multisine relative to the RMS of its motion, for the worst joint; None if the simulation does not settle or there
+    was no such multisine.
     """
 
     parameters: Mapping[str, float]
@@ -145,7 +145,8 @@ def _entry(peer: Peer, held_out: float | None, name: str | None, worst: float | 
 
 
 def worst_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
-    """Name and largest relative error among inertias, gravity, viscous and Coulomb friction.
+    """Return the parameter with the largest relative error and that error, among inertias, gravity, viscous and Coulomb
+    friction.
 
     Offsets are left out: they are near zero, so a relative error is meaningless. A parameter that the method does not
     estimate counts as 0, a relative error of 1.

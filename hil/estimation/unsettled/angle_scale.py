@@ -1,10 +1,10 @@
-"""Detection of angles in a wrong scale: an encoder's resolution, a belt or a gear ratio other than stated.
+"""Detection of angles with a wrong scale: an encoder's resolution, a belt or a gear ratio other than stated.
 
 A joint's equation is linear in its angle except for gravity, so only gravity reveals the scale. Near the angle at which
 the joint hangs, g sin(x / s) is almost g / s^3 sin x + (g / s - g / s^3) x, a weaker gravity and a spring: with a
-spring, an offset and an encoder zero, a fit explains angles in a wrong scale s down to the noise, with wrong values. So
-if a fit found a spring, the motion is also fitted in the scale that would imitate it, without the spring and with the
-encoder zeros as given.
+spring, an offset and an encoder zero, a fit explains angles with a wrong scale s down to the noise, but with wrong
+values. So if a fit found a spring, the motion is also fitted with the scale that would imitate it, without the spring
+and with the encoder zeros as given.
 """
 
 import math
@@ -44,7 +44,7 @@ class _Scale:
 def angle_scale(
     recordings: Sequence[Recording], estimate: ShootingEstimate, origin: Sequence[float] = ()
 ) -> tuple[str, ...]:
-    """A sentence if the spring and the encoder zero of joint 1 may be a wrong scale of its angle.
+    """A sentence if the spring and the encoder zero of joint 1 may be due to a wrong scale of its angle.
 
     origin: the angles of the recordings at which their columns are 0 [rad], by default 0.
     """
@@ -139,7 +139,7 @@ def _said(scale: _Scale, found: ShootingEstimate, estimate: ShootingEstimate) ->
     )
     given, other = estimate.parameters["gravity_1"], found.parameters["gravity_1"]
     return (
-        f"The angle of joint 1 seems to be {scale.factor:.4g} times the true one: divided by that, it is explained as "
-        f"well without {instead}, and gravity_1 is {other:.4g} instead of {given:.4g} N m. Check the unit, the ticks "
-        f"per turn and the belt or gear ratio between encoder and joint 1.{cause}"
+        f"The angle of joint 1 seems to be {scale.factor:.4g} times the true one: divided by that, it is explained "
+        f"equally well without {instead}, and gravity_1 is {other:.4g} instead of {given:.4g} N m. Check the unit, the "
+        f"ticks per turn and the belt or gear ratio between encoder and joint 1.{cause}"
     )

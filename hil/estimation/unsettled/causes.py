@@ -38,8 +38,8 @@ def _drifting(recordings: Sequence[Recording]) -> tuple[str, ...]:
     if drift is None:
         return ()
     return (
-        f"The delay of the torque drifts from {1e3 * drift.start:+.3g} ms to {1e3 * drift.end:+.3g} ms in the course "
-        f"of the recording ({1e6 * drift.relative:+.0f} ppm): with this drift, inverse dynamics leaves "
+        f"The delay of the torque drifts from {1e3 * drift.start:+.3g} ms to {1e3 * drift.end:+.3g} ms over the "
+        f"recording ({1e6 * drift.relative:+.0f} ppm): with this drift, inverse dynamics leaves "
         f"{100 * drift.residual:.2g} % of the torque unexplained instead of {100 * drift.residual_given:.2g} %. Torque "
         "and position were timed by different clocks: correct the times of one, or log both with the same clock.",
     )

@@ -69,7 +69,7 @@ def local_defects(
 def local_residual(
     recordings: Sequence[Recording], names: Sequence[str], predicted: Sequence[Array], window: float
 ) -> tuple[str, ...]:
-    """One sentence for each joint whose residual is far above the usual one in a few places; arguments as in
+    """One sentence for each joint whose residual is far above its usual value in a few places; arguments as in
     `local_defects`.
     """
     return tuple(said for each in _joints(recordings, names, predicted, window) for said in _windows(each, window))
@@ -119,8 +119,8 @@ def _constant(time: Array, values: Array) -> list[slice]:
 def _frozen(joint: _Joint) -> list[str]:
     return [
         f"The position of {joint.name} stays at {joint.position[part.start]:.4g} rad {_from_to(joint.time, part)}, "
-        "although the rest of the recording says that the joint should move: the reading was frozen, or something held "
-        "the joint. Leave that part out."
+        "although the rest of the recording shows that the joint should move: the reading was frozen, or something "
+        "held the joint. Leave that part out."
         for part in _constant(joint.time, joint.position)
         if joint.is_unexplained(part)
     ]

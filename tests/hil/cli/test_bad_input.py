@@ -280,7 +280,7 @@ CASES: list[tuple[str, int, str]] = [
         "joints[1].current_limit = 1200: must be at most 30.0. If it is in mA, write 1.2.",
     ),
     ("export no_result --format mjcf", 2, "hil estimate no_result"),
-    ("export .. --format mjcf", 2, ".. is not a run folder but contains some: did you mean ../here?"),
+    ("export .. --format mjcf", 2, ".. is not a run folder but contains run folders: did you mean ../here?"),
     ("export nothing --format mjcf", 2, "nothing is not a run folder: it has neither a result nor a recording."),
     ("calibrate run run --mass -1", 2, "--mass"),
     ("pose arm.toml", 2, "arm.urdf is missing"),
