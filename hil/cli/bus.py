@@ -26,7 +26,7 @@ def scan(
     baud: Annotated[list[int] | None, typer.Option("--baud", help="Scan only this baud rate; may be repeated.")] = None,
     json_only: Json = False,
 ) -> None:
-    """Find servos at every baud rate and ID, with model, firmware, voltage, temperature and errors."""
+    """Find servos at every baud rate and ID; show their model, firmware, voltage, temperature and errors."""
     from hil.cli.terminal import Terminal
     from hil.cli.views.setup_view import print_ports, print_scan, scanned
     from hil.config.schema import port_url

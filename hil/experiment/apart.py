@@ -2,9 +2,9 @@
 
 Two servos on one joint are coupled by their horns. A horn that slips, a loose screw or a broken gear lets one of them
 turn without the other. The joint's angle is taken from the first servo and does not show this. The difference between
-their angles is compared with what it was at the first sample, because horns are mounted at any angle. If the configured
-direction of one servo is wrong, the servos work against each other. The joint then does not turn at all, as if an
-obstacle held it.
+their angles is compared with what it was at the first sample, because horns may be mounted at any angle. If the
+configured direction of one servo is wrong, the servos work against each other. The joint then does not turn at all, as
+if an obstacle held it.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ ALLOWED_RAD = 0.1
 
 
 def opposed(joint: Joint) -> str:
-    """Return the question of whether a joint's two servos work against each other; "" if it has one servo."""
+    """Return a question to the user: do the joint's two servos work against each other? "" if it has one servo."""
     if not joint.seconds:
         return ""
     signs = [joint.direction, *(second.direction for second in joint.seconds)]

@@ -74,8 +74,8 @@ STEPS, STEPS_S = 4, 0.5
 """Number of jumps that counts as a fault, and the longest time between them [s]."""
 
 BLOCK_S = 0.0099
-"""Shortest interval between two notes of the distance covered under an unchanged velocity [s]. The latest three notes
-reach back by `LAG_S`.
+"""Shortest interval between two stored values of the distance covered under an unchanged velocity [s]. The latest three
+values reach back by `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
@@ -121,8 +121,8 @@ _SAME = np.dtype(
 )
 """Motion since the velocity last changed.
 
-seconds, moved, unknown: time, change of position and its uncertainty [s, rad, rad]. since: time since the last note
-[s]. count: number of notes. d1, t1 to d3, t3: the latest three notes of `moved` and `seconds`.
+seconds, moved, unknown: time, change of position and its uncertainty [s, rad, rad]. since: time since values were last
+stored [s]. count: how often they were. d1, t1 to d3, t3: the latest three stored values of `moved` and `seconds`.
 """
 
 MEMORY = np.dtype(
@@ -148,7 +148,7 @@ accepted values [s, 1].
 
 
 def begin(memory: Any) -> None:
-    """Initialise a record of zeros."""
+    """Initialise a zero-filled record."""
     memory["position"] = np.nan
     memory["lag"], memory["scale"] = LAG_S, SCALE
 

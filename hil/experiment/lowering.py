@@ -6,7 +6,7 @@ experiment. It is aborted and torque is cut after an alert, if a current does no
 path, or if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities that agree with
 the positions.
 
-Replies may be missing for a moment, also at the beginning: joints that are not heard get the feed-forward torque alone.
+Replies may be missing for a moment, even at the beginning: joints that are not heard get the feed-forward torque alone.
 """
 
 from collections import deque
@@ -94,10 +94,11 @@ class Lowering:
         return away
 
     def begin(self, state: State, goal: list[float], recent: RecentMotion, watch: ChainWatch | None = None) -> int:
-        """Start lowering from this sample, the latest that all servos answered; return the number of samples it takes.
+        """Start lowering from this sample, the latest that all servos answered; return the number of samples that
+        lowering takes.
 
         goal: latest goals [A or V]. recent: the latest exchanges. watch: the model's check, which has seen the motion
-        so far; without one, motors that turn against their goals are only found once their joints run away.
+        so far; without one, motors that turn against their goals are detected only once their joints run away.
         """
         self._recent, self._watch = recent, watch
         position, velocity = np.array(state.position), np.array(recent.until(state).believed(state))
@@ -157,7 +158,7 @@ class Lowering:
         if turned >= 0:
             raise SafetyStop(
                 f"{self._config.joints[turned].joint.title} moves against its command: torque that its motion "
-                "contradicted vanished when its goal was taken away for a moment. Its motor turns the wrong way: check "
+                "contradicted vanished when its goal was removed for a moment. Its motor turns the wrong way: check "
                 "its direction and its wiring, and whether another program has changed its Drive Mode.",
                 Cause.WRONG_SIGN,
             )

@@ -110,8 +110,8 @@ class Jolts:
         self.forget()
 
     def look(self, velocity: Sequence[float], seconds: float, now: float) -> tuple[int, float] | None:
-        """Process velocities [rad/s], `seconds` after the previous ones [s]; return a jolt's joint and change
-        [rad/s].
+        """Process velocities [rad/s], `seconds` after the previous ones [s]; return the joint that jolted and its
+        change of velocity [rad/s], or None.
         """
         self._pack(self._bytes, 0, *velocity)
         joint = self._jolting(self._joints, self._former, self._velocity, seconds, now, self._least)
@@ -247,7 +247,7 @@ class ModelWatch:
             said = (
                 f"{name} does not move like any arm consistent with the prior and the data so far: "
                 f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "
-                "encoder has failed, something pushes or holds it, or the arm is not the one described."
+                "encoder has failed, something is pushing or holding it, or the arm is not the one described."
             )
         raise SafetyStop(said, Cause.UNEXPECTED)
 

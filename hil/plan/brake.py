@@ -18,7 +18,7 @@ from hil.plan.recent_motion import RecentMotion
 FULL_AT = 0.5
 """Fraction of the velocity limit at which the brake uses the full current limit.
 
-A stronger brake hardly stops sooner, and throws the arm back much farther if the connection is lost during braking.
+A stronger brake hardly stops the arm sooner, and throws it back much farther if the connection is lost during braking.
 """
 
 LIGHTEST = 0.5

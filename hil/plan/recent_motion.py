@@ -89,7 +89,7 @@ class RecentMotion:
         return found
 
     def contradicts(self, joint: int, velocity: float) -> bool:
-        """Whether a velocity cannot be the joint's. Either no known change of its position allows it, or no change is
+        """Whether a velocity cannot be the joint's: either no known change of its position allows it, or no change is
         known and no servo turns that fast.
         """
         travels = self.travels(joint)

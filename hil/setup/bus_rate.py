@@ -1,7 +1,8 @@
 """The sample rate that a bus can sustain, measured with torque off for every exchange mode.
 
-The rate is a property of servos, wire and adapter. A computer that other programs keep busy delays single exchanges,
-which an experiment tolerates (`hil.experiment.deadlines`): such outliers are reported, but do not limit the rate.
+The rate is a property of servos, wire and adapter. A computer that other programs keep busy delays occasional
+exchanges, which an experiment tolerates (`hil.experiment.deadlines`): such outliers are reported, but do not limit the
+rate.
 """
 
 from collections.abc import Sequence
@@ -18,7 +19,7 @@ from hil.setup.realtime import on_time
 CYCLES = 200
 SLOW_EVERY = 10
 USUAL = 0.9
-"""Fraction of the exchanges that are fast enough for the reported rate; an experiment needs four fifths on time."""
+"""Fraction of the exchanges that must be fast enough for a reported rate; an experiment needs four fifths on time."""
 PATIENCE_S = 0.05
 """Time after which a reply counts as lost [s]; on a busy computer the kernel may deliver a reply 10 to 20 ms late."""
 AGAIN_AFTER_S = 0.5
@@ -34,7 +35,7 @@ class ExchangeMode:
     """Measured timing of one exchange mode.
 
     median_s, longest_s: round trips [s]. usual_s: time within which 90 % of the exchanges with the slowest kind of read
-    return [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
+    complete [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
     """
 
     one_write: bool
@@ -68,7 +69,7 @@ class RateReport:
     """Measurements of all exchange modes.
 
     found: what the configured mode can sustain, as text. fix: what to change; empty if the rate is sustainable.
-    delayed: what delays single exchanges by more than a period, and what to do; empty if nothing does.
+    delayed: what delays occasional exchanges by more than a period, and what to do; empty if nothing does.
     """
 
     modes: tuple[ExchangeMode, ...]
@@ -185,7 +186,7 @@ def _delayed(used: ExchangeMode, wanted: float) -> str:
         return ""
     return (
         f"Some exchanges took up to {used.longest_s * 1e3:.0f} ms: other programs keep this computer busy, or the "
-        "adapter pauses. An experiment tolerates single delays, but stops after a long one: close other programs."
+        "adapter pauses. An experiment tolerates isolated delays, but stops after a long one: close other programs."
     )
 
 

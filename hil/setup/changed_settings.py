@@ -83,7 +83,7 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
     said = f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."
     if (swapped := _swapped(before, after)) is not None:
         first, second = swapped
-        said += f" {first.title} now has what {second} had: their IDs may have been swapped."
+        said += f" {first.title} now has the settings that {second} had: their IDs may have been swapped."
     return said
 
 

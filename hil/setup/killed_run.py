@@ -69,7 +69,8 @@ class Left:
 def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
     """Compare the settings before a killed program with the present ones. Raises the same errors as `Servo.read`.
 
-    If another program changed the Operating Mode, goals and gains belong to the new mode and are kept.
+    If another program changed the Operating Mode, the present goals and gains belong to the new mode and are left as
+    they are.
     """
     changed = {
         name: present[name]

@@ -1,6 +1,6 @@
 """The pose in which a spatial arm lies before a run. The motion starts and ends there, not exactly at arm.rest_pose.
 
-Otherwise the stabiliser would pull the arm to arm.rest_pose at once when torque comes on, perhaps against a stop.
+Otherwise the stabiliser would pull the arm to arm.rest_pose as soon as torque comes on, perhaps against an end stop.
 """
 
 from collections.abc import Sequence
@@ -99,7 +99,7 @@ def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
 
 
 def said_of_the_rest(config: Config, lies: Config) -> str:
-    """Message that the arm does not lie in its rest pose, and where it lies."""
+    """Message saying that the arm does not lie in its rest pose, and where it lies."""
     each = zip(config.joints, lies.arm.rest_pose, config.arm.rest_pose, strict=True)
     away = [
         f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})"

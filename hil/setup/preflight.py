@@ -53,8 +53,8 @@ class Finding:
 
 
 def check_arm(config: Config) -> Iterator[Finding]:
-    """Check port, servos, pose and rate, in this order. A check that cannot be carried out is a STOP, not an
-    exception.
+    """Check port, servos, pose and rate, in this order. A check that cannot be carried out yields a STOP instead of
+    raising an exception.
     """
     fakes.register_for(config.url)
     try:
@@ -196,7 +196,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
         except DriverError as error:
             fix = (
                 f"{error} It answers pings: if it never answers reads, its Status Return Level is 0; power-cycle "
-                "it, which resets it to 2."
+                "it to reset that level to 2."
             )
             yield Finding(Level.STOP, where, "registers", "cannot be read", fix)
             return
@@ -212,8 +212,8 @@ def _still_off(bus: ServoBus) -> Iterator[Finding]:
         return
     if on:
         fix = (
-            f"{on}: it was off when this check began. Another program has switched it on and drives the arm: stop that "
-            "program first; or cut the supply."
+            f"{on}: it was off when this check began. Another program has switched it on and is driving the arm: stop "
+            "that program first; or cut the supply."
         )
         yield Finding(Level.STOP, "bus", "torque", "switched on during this check", fix)
 

@@ -453,7 +453,7 @@ def test_an_arm_that_is_still_moving_when_the_rest_is_over(
 FALSE_VELOCITY = (
     r"'elbow' \(ID 2.* reports a velocity of 0\.\d\d rad/s before the start, but its position .* by 0\.000\d rad"
 )
-MOVES = r"^The arm is moving before the start: joint 'elbow'.* another program commands it, or something pushes"
+MOVES = r"^The arm is moving before the start: joint 'elbow'.* another program is commanding it, or something is push"
 
 
 @pytest.mark.parametrize(("before_the_end", "said"), [(20, FALSE_VELOCITY), (1, MOVES)])
