@@ -35,7 +35,7 @@ PATIENCE_SHARE = 0.5
 """Minimum reply timeout as a fraction of the time between two cycles."""
 
 MOST_PATIENCE_S = 0.02
-"""Upper limit of the minimum reply timeout [s]: in slow cycles too, a silent servo must not delay the others."""
+"""Upper limit of the minimum reply timeout [s]: even in slow cycles, a silent servo must not delay the others."""
 
 AFTER_LOSS = 5
 """Number of reads of different lengths that take turns after lost replies. A reply that arrives fewer than this many

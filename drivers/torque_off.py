@@ -66,7 +66,8 @@ class TorqueOff:
     def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
         """The report after another program has switched torque on again.
 
-        on: joints on whose servos it still is, however often it is cut. silent: those that do not answer since.
+        on: joints whose servos still have torque on, however often it is cut. silent: those that have not answered
+        since.
         """
         why = "Another program had switched its torque on again, and it has not answered since."
         return replace(
@@ -215,8 +216,8 @@ def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseExcepti
 def cut_again(servo: Servo, *, armed: bool) -> bool:
     """Cut the torque of a servo that did not answer before; return whether it was rebooted.
 
-    armed: whether its Bus Watchdog was armed before torque was switched on; if so, it is switched off. Raises the same
-    errors as `Servo.write`.
+    armed: whether its Bus Watchdog was armed before torque was switched on; if so, the watchdog is switched off. Raises
+    the same errors as `Servo.write`.
     """
     if servo.read_despite_error("Torque Enable"):
         servo.write_despite_error("Torque Enable", 0)
@@ -227,7 +228,7 @@ def cut_again(servo: Servo, *, armed: bool) -> bool:
 
 
 def is_torque_on(servo: Servo) -> bool | None:
-    """Whether a servo's torque is on; None if it does not answer, or if its answers may belong to other questions."""
+    """Whether a servo's torque is on; None if it does not answer, or if its answers may belong to other requests."""
     with suppress(DriverError):
         first = servo.read_despite_error("Torque Enable")
         is_its_own = servo.read_despite_error("ID") == servo.id
@@ -237,7 +238,7 @@ def is_torque_on(servo: Servo) -> bool | None:
 
 
 def was_rebooted(servo: Servo) -> bool:
-    """Whether a servo's watchdog, once armed, is no longer armed; False if it does not answer.
+    """Whether a servo's watchdog was armed but no longer is; False if the servo does not answer.
 
     A late reply to an earlier request would be taken for the answer, so another register is read before and after.
     """

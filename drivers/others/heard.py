@@ -42,7 +42,7 @@ class Heard:
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """How many replies in which each servo answered had IDs that do not fit, since a reply was last late."""
+        """Number of replies with one answer per servo but IDs that do not fit, since a reply was last late."""
         self.strangers = 0
         """Number of received packets that this program neither sent nor requested: another master is on the bus."""
 

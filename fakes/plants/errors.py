@@ -1,4 +1,4 @@
-"""The error of plants."""
+"""The error that plants raise."""
 
 
 class PlantError(ValueError):

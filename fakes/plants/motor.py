@@ -141,7 +141,7 @@ class Motor:
         return torque, level, slope, command + away * left
 
     def bend(self, step: float, velocity: float) -> None:
-        """Advance the bristles through the step passed to `push` last, now that its mean velocity [rad/s] is known."""
+        """Advance the bristles through the step last passed to `push`, now that its mean velocity [rad/s] is known."""
         if self.bristle_stiffness:
             self.bristle_torque = self._slipped(step, velocity)
 

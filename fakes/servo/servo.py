@@ -95,7 +95,7 @@ class EmulatedServo(Powered):
         self.heard_at = 0.0
         """Time at which it received the last instruction packet [s]; the Bus Watchdog counts from here."""
         self.ready_at = 0.0
-        """Time at which it has finished booting [s]; it does not respond before."""
+        """Time at which it has finished booting [s]; it does not respond before then."""
         self.present = Present(
             *(self.memory, model, zero_ticks, direction, 1.0 + 1e-6 * clock_error_ppm, current_noise_a),
             Random(f"current {seed} {servo_id}") if current_noise_a else None,

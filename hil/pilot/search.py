@@ -150,7 +150,7 @@ class Search:
         return np.asarray(swing > MOVED_STEPS * step)
 
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
-        """The largest safe amplitude for all plausible arms.
+        """The largest amplitude that is safe for all plausible arms.
 
         If there is none, the amplitude of the last run is used, provided that the real arm has shown it to be safe, and
         otherwise a smaller one. Raises NoSafeTorque if there was no run yet.
