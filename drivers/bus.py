@@ -353,7 +353,7 @@ class ServoBus:
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def check_not_overruled(self, due: float) -> None:
-        """Check that the servos hold this program's goals and modes, if that is possible before `due` [s].
+        """Check that the servos hold this program's goals and modes, if there is time before `due` [s].
 
         Raises PortLost; BusShared if another master has written to a servo.
         """

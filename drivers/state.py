@@ -136,7 +136,7 @@ rebooting the servo.
 
 
 def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans]:
-    """Return the registers that end with the goal, and those that end with SETTINGS.
+    """Return the span of registers that ends with the goal, and the one that ends with SETTINGS.
 
     They begin at an earlier address than necessary, so that the answers differ in length from those that other programs
     usually request.

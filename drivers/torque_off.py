@@ -132,8 +132,8 @@ class TorqueOff:
         alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
         if alone:
             return (
-                f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}, which has no Bus "
-                "Watchdog and may keep its last current: cut the supply now."
+                f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}: without a Bus "
+                "Watchdog, the last current may remain, so cut the supply now."
             )
         return (
             f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, "
@@ -185,7 +185,8 @@ def cut_torque(
 def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
     """Send torque off to all servos in one packet; a failure is noticed when they are read back.
 
-    It is a Sync Write because other servos on the bus may be in use, and it is sent twice because a packet may be lost.
+    The packet is a Sync Write to these servos only, since others on the bus may be in use. It is sent twice, since a
+    packet may be lost.
     """
     _tell(port, servos, "Torque Enable", 0, times=2)
 
@@ -288,7 +289,7 @@ def _of_it(why: str) -> str:
 
 
 def and_list(names: Iterable[str]) -> str:
-    """Join names by commas and "and"."""
+    """Join names with commas and "and"."""
     *most, last = names
     return f"{', '.join(most)} and {last}" if most else last
 

@@ -17,9 +17,9 @@ class ForeignValues:
         self._at: deque[float] = deque(maxlen=ENOUGH)
 
     def add(self, now: float) -> None:
-        """Record such a value, read at `now` [s]."""
+        """Record a value that this program cannot have written, read at `now` [s]."""
         self._at.append(now)
 
     def are_proof(self, now: float) -> bool:
-        """Whether enough such values were read within WITHIN_S before `now` [s]."""
+        """Whether enough foreign values were read within WITHIN_S before `now` [s]."""
         return len(self._at) == ENOUGH and now - self._at[0] <= WITHIN_S

@@ -12,7 +12,7 @@ MOST_STRANGERS = 2
 """Tolerated number of foreign packets heard during an experiment; a late reply can look like one."""
 
 MOST_MIXED_UP = 2
-"""Tolerated number of replies with IDs that do not fit; no answer of such a reply is used."""
+"""Tolerated number of replies with IDs that do not fit; no answer in such a reply is used."""
 
 _RECENT_S = 0.1
 _INSTRUCTIONS = frozenset(Instruction) - {Instruction.STATUS}

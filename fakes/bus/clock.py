@@ -12,7 +12,7 @@ class VirtualClock:
         self._now = start
 
     def now(self) -> float:
-        """Return the seconds of virtual time."""
+        """Return the virtual time [s]."""
         return self._now
 
     def wait_until(self, deadline: float) -> None:

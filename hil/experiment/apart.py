@@ -27,8 +27,8 @@ def opposed(joint: Joint) -> str:
 def causes_of_standstill(joint: Joint) -> str:
     """Say why a joint may stand still although it should move."""
     if asked := opposed(joint):
-        return f"Something blocks it, its encoder is frozen, or {asked}"
-    return "Something blocks it, or its encoder is frozen."
+        return f"Something is blocking it, its encoder is frozen, or {asked}"
+    return "Something is blocking it, or its encoder is frozen."
 
 
 class Apart:

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 ARMS = 96
 WIDENED = 1.5
-"""Factor on the ensemble's standard deviations, for effects that its model does not include."""
+"""Factor applied to the ensemble's standard deviations, for effects that its model does not include."""
 
 LYING_RAD = 0.08
 _FRICTIONS = 8.0

@@ -217,8 +217,8 @@ class Guard:
         self._stop(
             index,
             Cause.GOALS_LOST,
-            f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. Goals are lost on "
-            "the way, or the servo refuses them: check its cable and limits.",
+            f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. Goals are being "
+            "lost on the way, or the servo refuses them: check its cable and limits.",
         )
 
     def _stop_for(self, fault: int, state: State) -> NoReturn:

@@ -34,8 +34,8 @@ LYING_RAD = 0.06
 """An arm within this angle of its rest pose in every joint is already at rest."""
 
 RUNS_AWAY = 0.25
-"""Velocity beyond that of the path home, relative to the velocity limit. A joint that exceeds it and still speeds up
-although its torque opposes the motion does not obey.
+"""Excess of a joint's velocity over that of the path home, relative to the velocity limit. A joint that exceeds this
+and still speeds up although its torque opposes the motion counts as not obeying its motor.
 """
 
 _GROWS_S = 0.015
@@ -157,9 +157,9 @@ class Lowering:
             turned = self._obedience.look(self._watch.residual(state), velocity.tolist(), now)
         if turned >= 0:
             raise SafetyStop(
-                f"{self._config.joints[turned].joint.title} moves against its command: torque that its motion "
-                "contradicted vanished when its goal was removed for a moment. Its motor turns the wrong way: check "
-                "its direction and its wiring, and whether another program has changed its Drive Mode.",
+                f"{self._config.joints[turned].joint.title} is moving against its command: torque that the "
+                "model could not explain vanished when its goal was removed for a moment. Its motor turns the wrong "
+                "way: check its direction and its wiring, and whether another program has changed its Drive Mode.",
                 Cause.WRONG_SIGN,
             )
         excess = velocity - self._velocity[index]

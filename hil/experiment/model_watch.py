@@ -28,7 +28,7 @@ from hil.experiment.consistency import check_standstill
 
 ARMS = 64
 WIDENED = 1.5
-"""Factor on the ensemble's standard deviations, for effects that its model does not include."""
+"""Factor applied to the ensemble's standard deviations, for effects that its model does not include."""
 
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
@@ -39,7 +39,9 @@ hardly exceeds it.
 """
 _TILT_SHARE = 0.2  # standard deviation of gravity perpendicular to the assumed direction, relative to gravity
 _FRICTION_SPREAD = 3.0
-"""Factor on the spread of servo friction for an arm without a description, to allow for friction outside its servos."""
+"""Factor applied to the spread of servo friction for an arm without a description, to allow for friction outside its
+servos.
+"""
 _UNDESCRIBED = {"gravity": 10.0, "viscous": 1.0, "offset": 0.3, "tilt": 1.0}
 _INERTIA = 0.3
 """Standard deviations for an arm without a description, as multiples of the planned torque in SI units.

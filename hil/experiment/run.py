@@ -320,7 +320,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if file is not None:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which allows "
-            f"at most {1 / slowest:.0f} Hz. You have no permission to change it. Type: {command_to_set(file)}"
+            f"at most {1 / slowest:.0f} Hz. You do not have permission to change it. Type: {command_to_set(file)}"
         )
     if bus.port.latency_measured:
         raise WrongSetting(

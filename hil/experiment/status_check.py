@@ -133,8 +133,8 @@ class StatusCheck:
                 "its controller; then check the adapter and the cable."
             )
         return Cause.GOALS_LOST, (
-            f"does not accept goals: {held}, and it missed an earlier one too. Goals are lost on the way, or the servo "
-            "refuses them: check its cable and limits."
+            f"does not accept goals: {held}, and it missed an earlier one too. Goals are being lost on the way, or the "
+            "servo refuses them: check its cable and limits."
         )
 
     def _never_sent(self, joint: int, held: float) -> bool:

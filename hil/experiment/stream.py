@@ -443,7 +443,8 @@ class Stream:
         try:
             state = self._way_down(lowering, state)
         except (SafetyStop, StopRequested, DriverError) as ended:
-            self._told(error, f"Torque was cut while the arm was being lowered, so it fell the remaining way: {ended}")
+            fell = "Torque was cut while the arm was being lowered, so it fell the rest of the way"
+            self._told(error, f"{fell}: {ended}")
             return
         elsewhere = lowering.lies_elsewhere(state)
         done = f"was lowered, but not to its rest pose: {elsewhere}" if elsewhere else "was lowered to its rest pose"

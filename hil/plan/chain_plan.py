@@ -58,7 +58,7 @@ class PathSegment(Segment):
 
 
 class NoHeadroom(ConfigError):
-    """A path needs nearly all the torque of a joint."""
+    """A path needs nearly all of a joint's torque."""
 
 
 def plan_of(config: Config) -> Plan:
@@ -129,9 +129,10 @@ def path_segment(config: Config, thought: ChainTorque, role: str, path: Path) ->
 
 
 def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array | float = 1.0) -> Array:
-    """Torque to command for a path (joints, samples) [N m], which compensates the stabiliser's pull to the rest pose.
+    """Torque to command for a path (joints, samples) [N m], which compensates the stabiliser's pull towards the rest
+    pose.
 
-    share: factor on the feed-forward.
+    share: factor applied to the feed-forward.
     """
     assert config.stabiliser is not None
     stiffness, damping = (np.array(each)[:, None] for each in (config.stabiliser.stiffness, config.stabiliser.damping))

@@ -32,7 +32,7 @@ _POSE = {
 
 
 def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) -> ArmAnswers:
-    """Ask about the arm at an open port, given the result of a scan. Raises ExperimentError if no arm can be formed."""
+    """Ask about the arm on an open port, given the result of a scan. Raises ExperimentError if no arm can be formed."""
     baud, servos = _one_baud(heard)
     port.set_baud(baud)
     chosen = _choose(servos, ask, say)

@@ -15,13 +15,15 @@ from hil.rest_pose_hint import within_limits
 from hil.setup.servo_session import has_moved
 
 AFTER_A_RUN = 2.0
-"""Factor on the tolerance after a run: friction may hold the arm farther from its rest pose than before."""
+"""Factor applied to the tolerance after a run: friction may hold the arm farther from its rest pose than before."""
 
 NEAR_RAD = 0.02
 """Deviation up to which arm.rest_pose is used although the arm lies elsewhere [rad]."""
 
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
-"""Smallest motion after torque off that is reported, and largest deviation from the rest pose before it [rad]."""
+"""Smallest motion after torque off that is reported, and largest deviation from the rest pose before that motion
+[rad].
+"""
 
 _LONGEST_SAG_S = 3.0  # wait for an arm that moves after torque off
 

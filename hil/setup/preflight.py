@@ -43,7 +43,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One check: where, what was checked, what was found, and how to fix it if necessary."""
+    """One check: where it was made, what was checked, what was found, and how to fix it if necessary."""
 
     level: Level
     where: str
@@ -212,8 +212,8 @@ def _still_off(bus: ServoBus) -> Iterator[Finding]:
         return
     if on:
         fix = (
-            f"{on}: it was off when this check began. Another program has switched it on and is driving the arm: stop "
-            "that program first; or cut the supply."
+            f"{on}: torque was off when this check began. Another program has switched it on and is driving the arm: "
+            "stop that program first; or cut the supply."
         )
         yield Finding(Level.STOP, "bus", "torque", "switched on during this check", fix)
 
