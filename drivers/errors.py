@@ -56,7 +56,7 @@ class NotPermitted(PortNotOpened):
 
 
 class PortLost(DriverError):
-    """The port failed after it was opened. Example: the USB cable was unplugged while the arm moved."""
+    """The port failed after it was opened. Example: the USB cable was unplugged while the arm was moving."""
 
 
 class NoReply(DriverError):

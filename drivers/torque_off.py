@@ -32,7 +32,7 @@ _INTERRUPTS_BORNE = 5
 """Attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
-"""Delay with which a watchdog may act after its timeout, since it counts in steps [s]."""
+"""Largest delay after its timeout with which a watchdog acts [s], since it counts in steps."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
 """Further torque-off packets and the time between them [s], since one that collides with a reply is lost."""

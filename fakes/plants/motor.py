@@ -101,8 +101,8 @@ class Motor:
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
         """Return the effect of the drive during one step, given angle and velocity at the middle of the step.
 
-        Returns the mean torque without stiction [N m], the level of the dry friction that sticks [N m], the slope of
-        the smooth friction at this velocity [N m s/rad], and the current at the end of the step [A].
+        Returns the mean torque without stiction [N m], the level of the dry friction that can hold the joint [N m], the
+        slope of the smooth friction at this velocity [N m s/rad], and the current at the end of the step [A].
         """
         torque_constant, offset, level, rise, per_velocity = self.constants
         left, mean_left = self.lag(step)

@@ -41,7 +41,7 @@ from hil.fakes.servo.write_rules import GAINS, GOALS, LIMIT_OF_GOAL, PROFILE, WA
 BOOT_S = 0.25
 """Time after Reboot during which a servo does not respond [s].
 
-Uncertain: the manual gives no figure; clients in use wait 0.3 to 1 s.
+Uncertain: the manual gives no figure; existing clients wait 0.3 to 1 s.
 """
 
 WATCHDOG_UNIT_S = 0.020

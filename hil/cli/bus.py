@@ -60,7 +60,7 @@ def _check_baud(baud: int) -> None:
 
 
 def check(config: ConfigPath, json_only: Json = False) -> None:
-    """Check for everything that would stop an experiment and say how to fix it. Torque stays off."""
+    """Check for anything that would stop an experiment, and say how to fix it. Torque stays off."""
     from hil.api.check import check as check_arm
     from hil.cli.terminal import Terminal
     from hil.cli.views.setup_view import print_findings

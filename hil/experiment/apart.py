@@ -38,8 +38,8 @@ class Apart:
         self._first: dict[tuple[int, int], float] = {}
 
     def look(self, apart: Sequence[Sequence[float]]) -> tuple[int, int, float] | None:
-        """Process a sample. If two servos no longer agree, return the joint, the other servo (both from 0) and the
-        change [rad].
+        """Process a sample. If two servos no longer agree, return the joint, the other servo (both counted from 0) and
+        the change [rad].
 
         apart: angles of each joint's other servos minus the first's [rad], NaN if one did not reply.
         """

@@ -48,7 +48,8 @@ def may_brake(config: Config, error: BaseException) -> bool:
 
 
 def braking_gains(config: Config, interval: float | None = None) -> list[float]:
-    """Braking gains [A s/rad, or V s/rad in PWM mode] with which no single goal reverses the lightest joint.
+    """Braking gains [A s/rad, or V s/rad in PWM mode] with which no single goal reverses the motion of the lightest
+    joint.
 
     interval: time between two exchanges [s]; by default, that on a fast bus.
     """

@@ -104,8 +104,8 @@ def _by_joint(settings: Settings) -> dict[Joint, dict[str, int]]:
 
 
 def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago: float) -> str:
-    """A sentence to add to a stop at a limit if the only change may have been made after the stop; "" if the change
-    explains the stop.
+    """A sentence to add to the message of a stop at a limit if the only change may have been made after the stop; "" if
+    the change explains the stop.
 
     modes_seen_ago: time from the latest correct read-back of the operating modes to the stop [s].
     """

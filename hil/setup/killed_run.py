@@ -94,8 +94,8 @@ class Restored:
 def recover(servo: Servo, port: str) -> Restored:
     """Restore settings that a terminated program left changed. Raises the same errors as `Servo.write`.
 
-    The file with the earlier settings is kept as long as another program's value prevents the restoration of a
-    register.
+    The file with the earlier settings is kept as long as another program's value prevents a register from being
+    restored.
     """
     kept = settings_file.load(port, servo.id, servo.table.model)
     if kept is None or not kept.may_restore:

@@ -1,4 +1,4 @@
-"""Checks for everything that would stop an experiment, with instructions for fixing it. Torque stays off."""
+"""Checks for anything that would stop an experiment, with instructions for fixing it. Torque stays off."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
