@@ -125,7 +125,7 @@ def _described(config: Config) -> Iterator[Finding]:
     try:
         check_rest_pose(config)
     except ConfigError as error:
-        yield Finding(Level.STOP, "arm", "rest pose", "not free", str(error))
+        yield Finding(Level.STOP, "arm", "rest pose", "not clear", str(error))
         return
     yield Finding(Level.OK, "arm", "rest pose", "clear of itself, the floor and the boxes")
     if not config.experiment.pilot:
@@ -159,7 +159,7 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
     try:
         found = others_on_the_bus(bus)
     except DriverError as error:
-        yield Finding(Level.WARNING, config.port.url, "others", "not searched", str(error))
+        yield Finding(Level.WARNING, config.port.url, "others", "not searched for", str(error))
         return
     if found:
         fix = "They are left alone: neither their torque nor their settings are changed."
@@ -298,7 +298,7 @@ def _startup(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: 
         "Startup Configuration switches its torque on at every power-up or reboot, even in the middle of a run. Set "
         "that register to 0 with DYNAMIXEL Wizard 2.0."
     )
-    return _graded(not armed, "at switch-on", "torque switches on by itself" if armed else "torque stays off", fix)
+    return _graded(not armed, "at power-up", "torque switches on by itself" if armed else "torque stays off", fix)
 
 
 def _mode(_config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
@@ -444,7 +444,7 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
             "A Sync Write goal did not arrive although the servo answers reads: try port.one_write = false; check "
             "for an adapter or hub that drops bytes, and for a second servo with this ID."
         )
-        yield Finding(Level.STOP, str(joint), "goals", "not taken", fix)
+        yield Finding(Level.STOP, str(joint), "goals", "not accepted", fix)
 
 
 def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:

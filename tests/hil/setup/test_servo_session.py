@@ -547,7 +547,7 @@ def _drop(_body: bytes, _now: float) -> None:
 @pytest.mark.parametrize(
     ("registers", "what"),
     [
-        ('{ "Startup Configuration" = 1 }', "at switch-on"),
+        ('{ "Startup Configuration" = 1 }', "at power-up"),
         ('{ "Drive Mode" = 1 }', "drive mode"),
         ('{ "PWM Limit" = 100 }', "PWM limit"),
     ],
