@@ -279,8 +279,8 @@ class ServoSession:
                     now = self.bus.drives[joint].read(_DELAY)
             if now != before:
                 yield (
-                    f"{joint.title}: {_DELAY} was changed meanwhile from {2 * before} to {2 * now} us, by another "
-                    "program or a factory reset, which changes other settings too. To restore it: "
+                    f"{joint.title}: {_DELAY} was changed during this command from {2 * before} to {2 * now} us, by "
+                    "another program or a factory reset, which changes other settings too. To restore it: "
                     f"hil setup {self.bus.port.url} --id {joint.id} --return-delay-us {2 * before}"
                 )
 
@@ -303,8 +303,8 @@ class ServoSession:
                     "; the next start on this port then restores the goal" if cut and joint not in self._left else ""
                 )
                 yield (
-                    f"{joint.title}: {_PWM_LIMIT} was changed meanwhile from {before} to {now}, by another program "
-                    f"or a factory reset, and is left as it is{': ' if cut else ''}{', '.join(cut)}. "
+                    f"{joint.title}: {_PWM_LIMIT} was changed during this command from {before} to {now}, by another "
+                    f"program or a factory reset, and is left as it is{': ' if cut else ''}{', '.join(cut)}. "
                     f"To change it back, use DYNAMIXEL Wizard 2.0{later}."
                 )
 
@@ -320,9 +320,9 @@ class ServoSession:
                 with suppress(DriverError):
                     if (now := servo.read(name)) != before and servo.read(name) == now:
                         yield (
-                            f"{joint.title}: {name} was changed meanwhile from {before} to {now}, by another program "
-                            f"or a factory reset, and is left as it is. Set it back to {before} with DYNAMIXEL Wizard "
-                            "2.0 before the next start."
+                            f"{joint.title}: {name} was changed during this command from {before} to {now}, by another "
+                            f"program or a factory reset, and is left as it is. Set it back to {before} with DYNAMIXEL "
+                            "Wizard 2.0 before the next start."
                         )
 
     def _put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:

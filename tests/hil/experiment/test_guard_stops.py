@@ -177,7 +177,8 @@ def test_a_limit_that_another_program_lowered_is_the_cause_that_is_named(
     stop, _ = run_until_stopped(arm(), tmp_path / "run", once(lower), plan)
     assert str(stop).startswith("Another program changed the settings of a servo during the run (joint 'elbow'")
     assert f"{register} is {value} and was " in str(stop) and stop.overruled
-    unrestored = [line for line in stop.__notes__ if f"PWM Limit was changed meanwhile from 885 to {value}" in line]
+    changed = f"PWM Limit was changed during this command from 885 to {value}"
+    unrestored = [line for line in stop.__notes__ if changed in line]
     assert len(unrestored) == (register == "PWM Limit")
     assert not any("next hil identify" in line for line in stop.__notes__), "a promise that could not be kept"
     assert_stopped(ports[0])
@@ -198,7 +199,7 @@ def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
         said = run_experiment(config, run, config.path, lower, plan)
         assert ports[0].bus.servos[2].value(register) == 1193
     else:
-        with pytest.raises(ExperimentError, match="PWM Limit was changed meanwhile from 885 to 700") as stop:
+        with pytest.raises(ExperimentError, match="PWM Limit was changed during this command from 885 to 700") as stop:
             run_experiment(config, run, config.path, lower, plan)
         said = str(stop.value)
     assert "'elbow'" in said and str(value) in said
