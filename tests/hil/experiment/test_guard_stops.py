@@ -160,7 +160,7 @@ def test_a_setting_that_hardly_shows_in_the_motion_is_read_back(
         ports[0].bus.servos[2].memory.set(register, value)
 
     config, begun = arm(), once(change)
-    with pytest.raises(BusShared, match=rf"'elbow'.* is changed by another program: its {register} reads {value}, and"):
+    with pytest.raises(BusShared, match=rf"'elbow'.* was changed by another program: its {register} reads {value}, "):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, begun, plan)
     assert_stopped(ports[0])
 
