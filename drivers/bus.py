@@ -207,16 +207,16 @@ class ServoBus:
         refuse_held(self._servos)
 
     def refuse_switched_on(self) -> None:
-        """Check that torque is off, after this program has found or switched it off.
+        """Check that torque is still off, after this program has found it off or switched it off.
 
-        Otherwise another program has switched it on: torque is cut on all servos. Raises BusShared, or TorqueNotOff.
+        If it is on, another program has switched it on: torque is cut on all servos. Raises BusShared, or TorqueNotOff.
         """
         if not (found := switched_on(self._servos)):
             return
         try:
             raise BusShared(
-                f"{found}: torque was off and has been switched on by another program, which drives the arm. End that "
-                "program, or unplug its controller, then start again."
+                f"{found}: torque was off and has been switched on by another program, which is driving the arm. End "
+                "that program, or unplug its controller, then start again."
             )
         finally:
             report = self.torque_off()
@@ -224,7 +224,7 @@ class ServoBus:
                 raise TorqueNotOff(str(report))
 
     def wait_switched_off(self, until: float) -> None:
-        """Wait until `until` [s, on the port's clock] and check `refuse_switched_on` at least every WATCH_S."""
+        """Wait until `until` [s, on the port's clock] and call `refuse_switched_on` at least every WATCH_S."""
         clock = self.port.clock
         self.refuse_switched_on()
         while (now := clock.now()) < until:
@@ -353,7 +353,7 @@ class ServoBus:
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def check_not_overruled(self, due: float) -> None:
-        """Check that the servos hold this program's goals and modes, if that is possible before `due` [s].
+        """Check that the servos hold this program's goals and modes, if there is time before `due` [s].
 
         Raises PortLost; BusShared if another master has written to a servo.
         """
@@ -381,7 +381,7 @@ class ServoBus:
 
     @property
     def is_watched(self) -> bool:
-        """Whether the watchdog of some servo is armed."""
+        """Whether the watchdog of any servo is armed."""
         return bool(self._armed)
 
     @property
@@ -507,7 +507,7 @@ class ServoBus:
     def shorten_watchdogs(self, seconds: float) -> None:
         """Shorten the armed Bus Watchdogs to `seconds` [s], if they are longer, until torque is off.
 
-        Nothing is read back: a servo that does not hear this keeps the former time.
+        Nothing is read back: a servo that misses the packet keeps its former time.
         """
         if seconds < self._watchdog:
             tell_watchdogs(self.port, {drive: self._servos[drive] for drive in self._armed}, seconds)
@@ -523,7 +523,7 @@ class ServoBus:
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
 
     def cut_again(self, on: Collection[Joint]) -> None:
-        """Cut torque that another program has switched on since `torque_off`; what `torque_now` reads then counts."""
+        """Cut torque that another program has switched on since `torque_off`; `torque_now` then shows the outcome."""
         interrupts: list[BaseException] = []
         with signals_held_back():
             cut_torque(self.port, {joint: self._servos[joint] for joint in on}, (), 0.0, interrupts)

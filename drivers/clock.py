@@ -13,7 +13,7 @@ late.
 
 
 class Clock(Protocol):
-    """Monotonic time in seconds, and a way to wait for it."""
+    """Monotonic time in seconds, and a way to wait until a given time."""
 
     def now(self) -> float:
         """Return the seconds since an arbitrary start; never decreases."""
@@ -25,7 +25,7 @@ class Clock(Protocol):
 
 
 class WallClock:
-    """The machine's monotonic clock. Sleeps to just before the deadline, then spins."""
+    """The machine's monotonic clock. Sleeps until just before the deadline, then spins."""
 
     now = staticmethod(time.perf_counter)  # not wrapped in a method: it is called twice per cycle
 

@@ -3,7 +3,7 @@
 DriverError
 ├── UnknownModel        no control table describes this model name or number
 ├── PortNotOpened       the port does not exist, is in use, or does not support this baud rate
-│   └── NotPermitted    the port exists, but this user may not open it
+│   └── NotPermitted    the port exists, but this user is not permitted to open it
 ├── PortLost            the port failed while open: cable unplugged, adapter gone
 ├── NoReply             a servo did not reply: wrong ID, wrong baud rate, no power
 ├── WrongReply          a servo's reply is corrupted or does not match the request
@@ -52,11 +52,11 @@ class PortNotOpened(DriverError):
 
 
 class NotPermitted(PortNotOpened):
-    """The user may not open the port. Example: a new user who is not in the group `dialout`."""
+    """The user is not permitted to open the port. Example: a new user who is not in the group `dialout`."""
 
 
 class PortLost(DriverError):
-    """The port failed after it was opened. Example: the USB cable was unplugged while the arm moved."""
+    """The port failed after it was opened. Example: the USB cable was unplugged while the arm was moving."""
 
 
 class NoReply(DriverError):

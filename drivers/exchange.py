@@ -7,7 +7,7 @@ A Sync Write has no reply, so the group read that follows it can leave in the sa
 instead of two. All packets are prepared in advance; a cycle only packs the goals and computes one CRC.
 
 The registers that are read vary from cycle to cycle. Most cycles read `spans[0]`. Every `slow_every`-th cycle reads one
-of the other spans, alternately; every `status_every`-th cycle reads `status`, the registers that show whether torque is
+of the other spans, in turn; every `status_every`-th cycle reads `status`, the registers that show whether torque is
 still on. After a lost reply, the usual span is read with a few more bytes. Every span must include what the control
 loop needs.
 """
@@ -35,11 +35,11 @@ PATIENCE_SHARE = 0.5
 """Minimum reply timeout as a fraction of the time between two cycles."""
 
 MOST_PATIENCE_S = 0.02
-"""Upper limit of the minimum reply timeout [s]: in slow cycles too, a silent servo must not delay the others."""
+"""Upper limit of the minimum reply timeout [s]: even in slow cycles, a silent servo must not delay the others."""
 
 AFTER_LOSS = 5
-"""Number of reads of different lengths that take turns after lost replies. A reply that arrives fewer than this many
-cycles late is recognised by its length.
+"""Number of reads of different lengths that are used in turn after a lost reply. A reply that arrives fewer than this
+many cycles late is recognised by its length.
 """
 
 _NEVER = 1 << 62

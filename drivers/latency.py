@@ -11,7 +11,8 @@ FACTORY_MS = 16
 WANTED_MS = 1
 
 LOCAL_S = 1e-3
-"""Latency allowed for a device without a latency timer [s]: a CDC-ACM adapter (one USB frame), a UART, a pty, the fake.
+"""Latency allowed for a device without a latency timer [s]: a CDC-ACM adapter (one USB frame), a UART, a pty, the fake
+bus.
 """
 
 REMOTE_S = 16e-3

@@ -74,7 +74,9 @@ class HardwareError(IntFlag):
 
 
 class Packet(NamedTuple):
-    """One packet with its stuffing removed. `body` runs from after INST to the CRC; in a status it begins with ERR."""
+    """One packet with its stuffing removed. `body` is everything between INST and the CRC; in a status it begins with
+    ERR.
+    """
 
     id: int
     instruction: int

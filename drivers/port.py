@@ -165,7 +165,7 @@ class Port:
         self.baud = baud
 
     def lower_latency(self) -> bool:
-        """Set the adapter's latency timer to 1 ms; return False if it has a timer that this user may not set."""
+        """Set the adapter's latency timer to 1 ms; return False if this user is not permitted to set it."""
         file = latency_timer(self.url)
         if file is None or read_latency_ms(file) <= WANTED_MS:
             return True
@@ -200,7 +200,7 @@ class DescriptorPort(Port):
         poll.register(self._descriptor, select.POLLIN)
         self._wait_ms = poll.poll
         self._looks = _LOOKS
-        """Number of requests before which `ask` still looks for pending input."""
+        """Number of further requests before which `ask` looks for pending input."""
 
     def write(self, data: bytes) -> None:
         try:

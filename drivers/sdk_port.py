@@ -1,5 +1,5 @@
 """The port on which the packet handler of `dynamixel-sdk` works, in place of the SDK's own PortHandler, and a packet
-handler that finds the answer behind noise.
+handler that finds the answer despite noise before it.
 """
 
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, Protocol2PacketHandler
@@ -87,10 +87,10 @@ class SdkPort:
 
 
 class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
-    """The SDK's packet handler, except that noise before a reply costs nothing.
+    """The SDK's packet handler, except that noise before a reply does no harm.
 
-    The SDK gives up where bytes that look like the beginning of a packet do not become one. Here the search goes on
-    behind them, until time is up.
+    The SDK gives up where bytes that look like the beginning of a packet turn out not to be one. Here the search
+    continues after them, until time is up.
     """
 
     def rxPacket(self, port: SdkPort, _fast_option: bool) -> tuple[list[int], int]:  # noqa: N802

@@ -53,8 +53,8 @@ LEAST_OF_MEASURED = 0.75
 """Used in place of `LEAST_SUPPLY` if the supply was measured: it may sag between two readings, and motors differ."""
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
-"""If a current is below the first fraction of its goal, another possible cause is that torque is off. The second value
-then replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
+"""If a current is below the first of these fractions of its goal, torque may also be off. The second value then
+replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
 """
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
@@ -91,7 +91,7 @@ class Published(NamedTuple):
     """A torque constant as published: the median of the figures, and the lowest and highest of them.
 
     It is uncertain even where the figures agree: the stall torque is a servo's peak torque, friction included, and an
-    individual servo can differ from it by tens of percent. If it matters, measure it with a known weight.
+    individual servo can differ from it by tens of percent. If it matters, measure the constant with a known weight.
     """
 
     value: float

@@ -58,7 +58,7 @@ class State(NamedTuple):
     missing: whether the servo returned no values.
     slow, status: values that are only read in some cycles, otherwise None.
     apart: for each joint, the angles of its further servos minus the first's [rad], NaN if one did not reply; None on
-    an arm with one servo per joint. Horns are mounted at any angle, so only a change is meaningful.
+    an arm with one servo per joint. Horns may be mounted at any angle, so only a change is meaningful.
     """
 
     time_before_write: float
@@ -130,13 +130,13 @@ def _status_names(mode: Mode) -> tuple[str, ...]:
 
 
 SETTINGS = ("Drive Mode", "Operating Mode", "Homing Offset")
-"""Settings that determine what goals and angles mean, and that another program may change while torque is on or by a
-reboot.
+"""Settings that determine what goals and angles mean, and that another program may change while torque is on, or by
+rebooting the servo.
 """
 
 
 def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans]:
-    """Return the registers that end with the goal, and those that end with SETTINGS.
+    """Return the span of registers that ends with the goal, and the one that ends with SETTINGS.
 
     They begin at an earlier address than necessary, so that the answers differ in length from those that other programs
     usually request.

@@ -32,7 +32,7 @@ _INTERRUPTS_BORNE = 5
 """Attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
-"""Delay with which a watchdog may act after its timeout, since it counts in steps [s]."""
+"""Largest delay after its timeout with which a watchdog acts [s], since it counts in steps."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
 """Further torque-off packets and the time between them [s], since one that collides with a reply is lost."""
@@ -66,7 +66,8 @@ class TorqueOff:
     def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
         """The report after another program has switched torque on again.
 
-        on: joints on whose servos it still is, however often it is cut. silent: those that do not answer since.
+        on: joints whose servos still have torque on, however often it is cut. silent: those that have not answered
+        since.
         """
         why = "Another program had switched its torque on again, and it has not answered since."
         return replace(
@@ -131,8 +132,8 @@ class TorqueOff:
         alone = [str(joint).upper() for joint, _ in self.unconfirmed if joint in self.unwatched]
         if alone:
             return (
-                f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}, which has no Bus "
-                "Watchdog and may keep its last current: cut the supply now."
+                f"TORQUE OFF IS NOT CONFIRMED for {names} NOTHING STOPS {' AND '.join(alone)}: without a Bus "
+                "Watchdog, the last current may remain, so cut the supply now."
             )
         return (
             f"TORQUE OFF IS NOT CONFIRMED for {names} The Bus Watchdog stops a servo that receives nothing, "
@@ -184,7 +185,8 @@ def cut_torque(
 def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
     """Send torque off to all servos in one packet; a failure is noticed when they are read back.
 
-    It is a Sync Write because other servos on the bus may be in use, and it is sent twice because a packet may be lost.
+    The packet is a Sync Write to these servos only, since others on the bus may be in use. It is sent twice, since a
+    packet may be lost.
     """
     _tell(port, servos, "Torque Enable", 0, times=2)
 
@@ -215,8 +217,8 @@ def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseExcepti
 def cut_again(servo: Servo, *, armed: bool) -> bool:
     """Cut the torque of a servo that did not answer before; return whether it was rebooted.
 
-    armed: whether its Bus Watchdog was armed before torque was switched on; if so, it is switched off. Raises the same
-    errors as `Servo.write`.
+    armed: whether its Bus Watchdog was armed before torque was switched on; if so, the watchdog is switched off. Raises
+    the same errors as `Servo.write`.
     """
     if servo.read_despite_error("Torque Enable"):
         servo.write_despite_error("Torque Enable", 0)
@@ -227,7 +229,7 @@ def cut_again(servo: Servo, *, armed: bool) -> bool:
 
 
 def is_torque_on(servo: Servo) -> bool | None:
-    """Whether a servo's torque is on; None if it does not answer, or if its answers may belong to other questions."""
+    """Whether a servo's torque is on; None if it does not answer, or if its answers may belong to other requests."""
     with suppress(DriverError):
         first = servo.read_despite_error("Torque Enable")
         is_its_own = servo.read_despite_error("ID") == servo.id
@@ -237,7 +239,7 @@ def is_torque_on(servo: Servo) -> bool | None:
 
 
 def was_rebooted(servo: Servo) -> bool:
-    """Whether a servo's watchdog, once armed, is no longer armed; False if it does not answer.
+    """Whether a servo's watchdog was armed but no longer is; False if the servo does not answer.
 
     A late reply to an earlier request would be taken for the answer, so another register is read before and after.
     """
@@ -287,7 +289,7 @@ def _of_it(why: str) -> str:
 
 
 def and_list(names: Iterable[str]) -> str:
-    """Join names by commas and "and"."""
+    """Join names with commas and "and"."""
     *most, last = names
     return f"{', '.join(most)} and {last}" if most else last
 

@@ -194,8 +194,8 @@ def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def found_beside(folder: Path, name: str) -> Path:
-    """Return the file at the path `name`, which a TOML file in `folder` gives; if there is no such file, the one of the
-    same name in `folder`.
+    """Return the file that a TOML file in `folder` refers to as `name`; if it does not exist, the file of the same name
+    in `folder`.
     """
     named = folder / name
     return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name

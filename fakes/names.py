@@ -22,7 +22,7 @@ def arm_names() -> tuple[str, ...]:
 
 
 def find_arm(path: Path | str) -> Path:
-    """Return `path` itself, or the file of the arm of that name if `path` is a bare name and not a file."""
+    """Return `path` itself or, if it is a bare name and not a file, the file of the arm of that name."""
     path = Path(path)
     if path.name != str(path) or path.suffix or path.exists():
         return path

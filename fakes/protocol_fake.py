@@ -41,7 +41,7 @@ class _Unplugged(serial.SerialException):
 
 
 class FakeSerial(SerialBase):
-    """A pyserial port onto a fake bus.
+    """A pyserial port connected to a fake bus.
 
     The arm is created when the port is first opened and lives as long as the port object: after closing and reopening,
     it is as it was left, except that time has passed. Real servos behave in the same way. Two port objects never share
@@ -191,7 +191,7 @@ class FakeSerial(SerialBase):
 def open_fake(
     description: FakeArm, clock: Clock | None = None, *, baud: int = 1_000_000, timeout_s: float | None = 0.1
 ) -> FakeSerial:
-    """Return an open port onto the described arm, on `clock` (by default a new `VirtualClock`)."""
+    """Return an open port to the described arm, with `clock` as its time (by default a new `VirtualClock`)."""
     port = FakeSerial(None, description=description, clock=clock, baudrate=baud, timeout=timeout_s)
     port.open()
     return port

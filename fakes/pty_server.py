@@ -78,7 +78,7 @@ class PtyServer:
     """Serves one fake arm on a pseudo-terminal; `serve` runs until `stop` is called from a thread or signal handler.
 
     link: symbolic link to create for the terminal; raises LinkError if the path already exists.
-    `bus` may be inspected, and its hand moved, from another thread while holding `lock`; from another process, `hil
+    `bus` may be inspected, and its hand moved, from another thread that holds `lock`; from another process, `hil
     hand` moves it.
     """
 

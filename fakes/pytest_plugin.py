@@ -1,7 +1,7 @@
 """pytest fixtures with fake Dynamixel arms. pytest finds this plugin automatically if hil is installed.
 
     def test_my_driver(fake_arm):
-        port = fake_arm()                          # a pyserial port onto two XM430-W350s, IDs 1 and 2, in virtual time
+        port = fake_arm()                          # a pyserial port to two XM430-W350s, IDs 1 and 2, in virtual time
         my_driver(port).ping(1)
         assert not port.bus.servos[1].torque_enabled
 
@@ -59,7 +59,7 @@ def default_arm() -> "FakeArm":
 
 @pytest.fixture
 def fake_arm() -> Iterator[Callable[..., "FakeSerial"]]:
-    """Return a function that opens pyserial ports onto fake arms in virtual time, closed after the test."""
+    """Return a function that opens pyserial ports to fake arms in virtual time; they are closed after the test."""
     from hil.fakes.protocol_fake import open_fake
 
     with ExitStack() as opened:

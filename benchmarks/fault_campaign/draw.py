@@ -48,7 +48,7 @@ WORDS = {
     MIXED: r"another servo's|mixed up|swapped|ID has changed|same ID|was not addressed:",
     REPEATED: r"repeated|too late or twice",
     SETTING: r"changed the settings.{0,80}(Homing Offset|Return Delay Time|PWM Limit|Current Limit) is"
-    r"|(Homing Offset|Return Delay Time|PWM Limit) was changed meanwhile|Current Limit is \d+, but current_limit",
+    r"|(Homing Offset|Return Delay Time|PWM Limit) was changed during this|Current Limit is \d+, but current_limit",
     HAND: r"pushes or holds|pushing or holding|hit it|slips|begun to slip",
     DISK: r"\bdisk\b|no space|File too large|cannot be written",
     POSE: r"rest[_ ]pose|before the start|starts? (from|at)",

@@ -1,25 +1,25 @@
-"""Whether a servo has held values that this program cannot have written too often for chance."""
+"""Whether a servo has held values that this program cannot have written, and has done so too often for chance."""
 
 from collections import deque
 
 __all__ = ["ForeignValues"]
 
 ENOUGH, WITHIN_S = 3, 10.0
-"""Number of such values, and the time within which they prove that something else writes to the servo or changes what
-is written [s]. Noise cannot change a value, since its checksum would fail.
+"""Number of values not written by this program, and the time within which they prove that something else writes to the
+servo or changes what is written [s]. Noise cannot change a value, since its checksum would fail.
 """
 
 
 class ForeignValues:
-    """The latest such values that were read from one servo."""
+    """The latest values read from one servo that this program cannot have written."""
 
     def __init__(self) -> None:
         self._at: deque[float] = deque(maxlen=ENOUGH)
 
     def add(self, now: float) -> None:
-        """Record a value that was read at `now` [s]."""
+        """Record a value that this program cannot have written, read at `now` [s]."""
         self._at.append(now)
 
     def are_proof(self, now: float) -> bool:
-        """Whether enough of them were read within the time before `now` [s]."""
+        """Whether enough foreign values were read within WITHIN_S before `now` [s]."""
         return len(self._at) == ENOUGH and now - self._at[0] <= WITHIN_S

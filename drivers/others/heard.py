@@ -12,7 +12,7 @@ MOST_STRANGERS = 2
 """Tolerated number of foreign packets heard during an experiment; a late reply can look like one."""
 
 MOST_MIXED_UP = 2
-"""Tolerated number of replies with IDs that do not fit; no answer of such a reply is used."""
+"""Tolerated number of replies with IDs that do not fit; no answer in such a reply is used."""
 
 _RECENT_S = 0.1
 _INSTRUCTIONS = frozenset(Instruction) - {Instruction.STATUS}
@@ -42,7 +42,7 @@ class Heard:
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """How many replies in which each servo answered had IDs that do not fit, since a reply was last late."""
+        """Number of replies with one answer per servo but IDs that do not fit, since a reply was last late."""
         self.strangers = 0
         """Number of received packets that this program neither sent nor requested: another master is on the bus."""
 

@@ -11,7 +11,7 @@ from hil.drivers.state import Spans, status_span
 from hil.drivers.sync_read import one_each
 
 CHECK_S = 0.01
-"""Longest time between two exchanges [s], if the bus allows: faults must not go unnoticed at low sample rates."""
+"""Longest time between two exchanges [s], if the bus allows it: faults must not go unnoticed at low sample rates."""
 
 STATUS_S = 0.035
 """Time between two status reads [s]."""

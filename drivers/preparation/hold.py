@@ -22,7 +22,7 @@ _STILL_TICKS = 2  # Present Velocity below which a joint counts as still
 
 
 def is_held(servo: Servo) -> bool:
-    """Return whether the servo has torque on that holds or drives its joint. Raises the same errors as `Servo.read`.
+    """Return whether the servo's torque is on and holds or drives its joint. Raises the same errors as `Servo.read`.
 
     A tripped Bus Watchdog has zeroed the goal, so that in current and PWM mode the joint moves freely.
     """
@@ -47,7 +47,7 @@ def refuse_held(servos: Mapping[Joint, Servo]) -> None:
 def switched_on(servos: Mapping[Joint, Servo]) -> str:
     """Say which servos have torque on, and with which current; "" if none has. Same errors as `Servo.read`.
 
-    Each is read twice, because a reply does not tell which register it is about.
+    Each is read twice, because a reply does not say which register it comes from.
     """
     on = [servo for servo in servos.values() if servo.read("Torque Enable") and servo.read("Torque Enable")]
     return " and ".join(f"{servo.title}{_current(joint, servo)}" for joint, servo in servos.items() if servo in on)

@@ -86,11 +86,11 @@ def shared(what: str) -> BusShared:
 
 def overruled(joint: Joint, found: Overruled) -> BusShared:
     """Return the error for a servo that holds a goal or a setting that this program did not write."""
-    by, before = "commanded", f"but {found.written} was written"
+    by, before = "is being commanded", f"but {found.written} was written"
     if found.register in SETTINGS and found.register != "Operating Mode":
-        by, before = "changed", f"and read {found.written} before the start"
+        by, before = "was changed", f"and read {found.written} before the start"
     return BusShared(
-        f"{joint.title[0].upper()}{joint.title[1:]} is {by} by another program: its {found.register} reads "
+        f"{joint.title[0].upper()}{joint.title[1:]} {by} by another program: its {found.register} reads "
         f"{found.value}, {before}. Stop that program, or unplug its controller."
     )
 

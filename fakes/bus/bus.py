@@ -4,7 +4,7 @@ Bytes take wire time (ten bits each). A packet takes effect when its last byte a
 moment with the previous motor currents, then the addressed servos act. Replies start after the servo's return delay and
 reach the host `adapter_latency_us` later. When the host writes, everything up to the last packet of that write is
 computed, even if it lies ahead of the clock. Between two packets only Bus Watchdogs, the servos' own loops and faults
-can act, and the plant's advance is split at the moment they do.
+can act, and the plant's advance is split at the moments when they do.
 
 When host and servo, or two servos, transmit at once, the later packet and the rest of the earlier one are lost. Which
 servos act and reply is decided in `hil.fakes.bus.instructions`.
@@ -41,8 +41,8 @@ class FakeBus:
     joints: for each servo, the index of the plant joint that it moves, so that two servos may move one joint; by
     default servo i moves joint i.
 
-    The plant's time is 0 when the bus is created. Times in this class are in seconds on `clock`, except `time` and
-    those of faults, which count from the creation of the bus.
+    The plant's time is 0 when the bus is created. Times in this class are in seconds on `clock`, except `time` and the
+    times of faults, which count from the creation of the bus.
     """
 
     def __init__(

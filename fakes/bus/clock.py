@@ -1,18 +1,18 @@
-"""Virtual time: the clock of a fake arm on which nothing outside the process depends."""
+"""Virtual time: the clock of a fake arm, if nothing outside the process depends on it."""
 
 
 class VirtualClock:
     """A `hil.drivers.clock.Clock` that stands still while the program computes and jumps when it waits.
 
     A run on it is deterministic and as fast as the program: twenty seconds of virtual time take only as long as it
-    takes to compute the bytes sent and the plant's motion in them.
+    takes to compute the bytes sent and the plant's motion in that time.
     """
 
     def __init__(self, start: float = 0.0) -> None:
         self._now = start
 
     def now(self) -> float:
-        """Return the seconds of virtual time."""
+        """Return the virtual time [s]."""
         return self._now
 
     def wait_until(self, deadline: float) -> None:

@@ -89,7 +89,7 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
     FaultKind.OVERLOAD: FaultFacts("a servo reports overload"),
     FaultKind.LOW_VOLTAGE: FaultFacts("the supply falls below a servo's Min Voltage Limit", "volts below it", 1.0),
     FaultKind.STUCK_JOINT: FaultFacts("a joint is jammed"),
-    FaultKind.ENCODER_JUMP: FaultFacts("an encoder reads a position that is offset", "ticks", 512),
+    FaultKind.ENCODER_JUMP: FaultFacts("an encoder's position reading is offset", "ticks", 512),
     FaultKind.CABLE_PULLED: FaultFacts(
         "the adapter's cable is unplugged, and replugged when the fault ends; the port must be reopened"
     ),

@@ -1,7 +1,7 @@
 """Precomputed group reads of the control cycle.
 
-These read Present Current, Velocity and Position of several servos, or registers other than the present ones, such
-as goals. They return the same bytes as the general path in `hil.fakes.bus.instructions`, in half the time; a fake bus
+These read Present Current, Velocity and Position of several servos, or registers that hold no measurements, such as
+goals. They return the same bytes as the general path in `hil.fakes.bus.instructions`, in half the time; a fake bus
 spends most of its time here.
 """
 

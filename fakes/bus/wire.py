@@ -94,7 +94,7 @@ class Wire:
         return end
 
     def echo(self, data: bytes, start: float) -> None:
-        """Echo the host's own data, which it sends from time `start`, back to it."""
+        """Echo back to the host the data that it sends from time `start` on."""
         self._arriving.append(Arriving(data, start + self.byte_s + self._latency_s, self.byte_s))
         self._arriving = deque(sorted(self._arriving, key=lambda segment: segment.first))
 

@@ -152,11 +152,11 @@ class Arm(Described):
 
 
 def base_parameters(arm: Arm | None, time: float = math.inf) -> dict[str, float]:
-    """Return the true base parameters of this arm at `time` [s], by the estimator's names and in its order [SI].
+    """Return the true base parameters of this arm at `time` [s], with the estimator's names and in its order [SI].
 
     Empty without an `Arm`, since the parameters of another plant are unknown. Without a time, the drives are warm.
 
-    Effects that no base parameter represents are left out: dry friction above Coulomb (Stribeck rise, load),
+    Effects that no base parameter represents are left out: dry friction beyond Coulomb's (Stribeck rise, load),
     presliding, the current loop's lag, saturation, ripple, cogging, a cable's stiffness, backlash, stops. The `gravity`
     values are those of the tilted plane; an offset includes a cable's torque at angle 0.
     """

@@ -1,5 +1,5 @@
-"""The error of plants."""
+"""The error that plants raise."""
 
 
 class PlantError(ValueError):
-    """A plant cannot be created, or returned an invalid state. The message says which one and what is required."""
+    """A plant cannot be created, or has returned an invalid state. The message names it and says what is required."""

@@ -101,8 +101,8 @@ class Motor:
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
         """Return the effect of the drive during one step, given angle and velocity at the middle of the step.
 
-        Returns the mean torque without stiction [N m], the level of the dry friction that sticks [N m], the slope of
-        the smooth friction at this velocity [N m s/rad], and the current at the end of the step [A].
+        Returns the mean torque without stiction [N m], the level of the dry friction that can hold the joint [N m], the
+        slope of the smooth friction at this velocity [N m s/rad], and the current at the end of the step [A].
         """
         torque_constant, offset, level, rise, per_velocity = self.constants
         left, mean_left = self.lag(step)
@@ -141,7 +141,7 @@ class Motor:
         return torque, level, slope, command + away * left
 
     def bend(self, step: float, velocity: float) -> None:
-        """Advance the bristles through the step passed to `push` last, now that its mean velocity [rad/s] is known."""
+        """Advance the bristles through the step last passed to `push`, now that its mean velocity [rad/s] is known."""
         if self.bristle_stiffness:
             self.bristle_torque = self._slipped(step, velocity)
 

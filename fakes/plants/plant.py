@@ -22,7 +22,7 @@ from hil.fakes.plants.two_link import TwoLink
 
 
 class Plant(Protocol):
-    """A mechanism with one motor per joint, advanced lazily by the bus on the bus's own time.
+    """A mechanism with one motor per joint, advanced lazily by the bus in the bus's own time.
 
     Angles and velocities are those of the servos' output shafts: joint 1 is measured from the horizontal, joint 2
     relative to link 1 (two-link arm). `current` is the actual motor current, after the current loop's lag.
@@ -118,7 +118,7 @@ def load_plant(name: str, options: Mapping[str, object]) -> Plant:
     try:
         factory = getattr(importlib.import_module(module_name), factory_name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise PlantError(f'plant = "{name}": {error}; give "module:factory" of an importable module') from error
+        raise PlantError(f'plant = "{name}": {error}; give "module:factory" with an importable module') from error
     try:
         plant = factory(**options)
     except PlantError:

@@ -36,7 +36,7 @@ the middle of the next step.
 
 
 class TwoLink:
-    """A two-joint arm; see `hil.fakes.plants.plant.Plant`. `velocity` is the joint velocities at time 0 [rad/s]."""
+    """A two-joint arm; see `hil.fakes.plants.plant.Plant`. `velocity`: joint velocities at time 0 [rad/s]."""
 
     def __init__(self, arm: Arm, velocity: Sequence[float] = (0.0, 0.0)) -> None:
         first, second = arm.links

@@ -110,7 +110,7 @@ class Controller:
         self._goal_before = None
 
     def shift(self, ticks: int) -> None:
-        """Shift the setpoint of position control, and the goal it is going to, as Present Position was shifted."""
+        """Shift the setpoint of position control, and its goal, by as much as Present Position was shifted."""
         self.trajectory.position += ticks
         if self._goal_before is not None:
             self._goal_before += ticks

@@ -68,5 +68,5 @@ class Health:
         return self._overloaded_s > overload.time_s
 
     def rest(self) -> None:
-        """Reset the overload timer, as a reboot does; the temperature stays."""
+        """Reset the overload timer, as a reboot does; the temperature remains."""
         self._overloaded_s = 0.0

@@ -7,7 +7,7 @@ from hil.fakes.servo.registers import EmulatedModel, Register
 
 
 class Memory:
-    """Registers as bytes. `hil.fakes.servo.servo` decides what may be written when, and the consequences."""
+    """Registers as bytes. `hil.fakes.servo.servo` decides what may be written when, and with what consequences."""
 
     def __init__(self, model: EmulatedModel) -> None:
         self.registers = model.registers

@@ -41,7 +41,7 @@ from hil.fakes.servo.write_rules import GAINS, GOALS, LIMIT_OF_GOAL, PROFILE, WA
 BOOT_S = 0.25
 """Time after Reboot during which a servo does not respond [s].
 
-Uncertain: the manual gives no figure; clients in use wait 0.3 to 1 s.
+Uncertain: the manual gives no figure; existing clients wait 0.3 to 1 s.
 """
 
 WATCHDOG_UNIT_S = 0.020
@@ -95,7 +95,7 @@ class EmulatedServo(Powered):
         self.heard_at = 0.0
         """Time at which it received the last instruction packet [s]; the Bus Watchdog counts from here."""
         self.ready_at = 0.0
-        """Time at which it has finished booting [s]; it does not respond before."""
+        """Time at which it has finished booting [s]; it does not respond before then."""
         self.present = Present(
             *(self.memory, model, zero_ticks, direction, 1.0 + 1e-6 * clock_error_ppm, current_noise_a),
             Random(f"current {seed} {servo_id}") if current_noise_a else None,

@@ -26,7 +26,7 @@ def scan(
     baud: Annotated[list[int] | None, typer.Option("--baud", help="Scan only this baud rate; may be repeated.")] = None,
     json_only: Json = False,
 ) -> None:
-    """Find servos at every baud rate and ID, with model, firmware, voltage, temperature and errors."""
+    """Find servos at every baud rate and ID; show their model, firmware, voltage, temperature and errors."""
     from hil.cli.terminal import Terminal
     from hil.cli.views.setup_view import print_ports, print_scan, scanned
     from hil.config.schema import port_url
@@ -60,7 +60,7 @@ def _check_baud(baud: int) -> None:
 
 
 def check(config: ConfigPath, json_only: Json = False) -> None:
-    """Check for everything that would stop an experiment and say how to fix it. Torque stays off."""
+    """Check for anything that would stop an experiment, and say how to fix it. Torque stays off."""
     from hil.api.check import check as check_arm
     from hil.cli.terminal import Terminal
     from hil.cli.views.setup_view import print_findings

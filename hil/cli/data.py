@@ -17,7 +17,7 @@ def compare(
     mujoco: Annotated[bool, typer.Option("--mujoco", help="Include mujoco.sysid; needs the extra `peers`.")] = False,
     json_only: Json = False,
 ) -> None:
-    """Apply other methods to the same recording: RLS, EKF, UKF, IDIM-LS, Zhu et al. (docs/paper.md), mujoco.sysid.
+    """Apply other methods to a run's recording: RLS, EKF, UKF, IDIM-LS, Zhu et al. (docs/paper.md), mujoco.sysid.
 
     For a spatial arm: least squares on Fourier lines, and IDIM-LS.
     """

@@ -18,7 +18,7 @@ def exit_code(error: Exception) -> int | None:
 
 
 def message(error: Exception) -> str:
-    """Return the message of the error and of the error that was being handled when it occurred, then its notes.
+    """Return the error's message, that of an expected error that was being handled when it occurred, and its notes.
 
     The notes end with the next command, if they name one.
     """

@@ -48,7 +48,7 @@ def list_faults() -> None:
 
 
 def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
-    """Move joints whose torque is off, or release joints, of the fake arm served at `device`. Raises ConfigError."""
+    """Move (while their torque is off) or release joints of the fake arm served at `device`. Raises ConfigError."""
     try:
         for servo in release:
             ask_hand(device, f"release {servo}")
@@ -107,7 +107,7 @@ def _totals(counts: Counts) -> str:
     return (
         f"{counts.damaged} damaged, {counts.collisions} collisions, {counts.faults} faults, "
         f"{counts.overruns} more than 1 ms late (worst {1e3 * counts.late_max_s:.1f} ms)"
-        + (f", {counts.lost_s:.1f} s slower than real time" if counts.lost_s >= 0.1 else "")
+        + (f", {counts.lost_s:.1f} s behind real time" if counts.lost_s >= 0.1 else "")
     )
 
 

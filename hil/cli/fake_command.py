@@ -1,4 +1,4 @@
-"""Arguments of the subcommands about fake arms; hil.cli.fake does the work and is imported on demand."""
+"""Arguments of the subcommands for fake arms; hil.cli.fake does the work and is imported on demand."""
 
 from pathlib import Path
 from typing import Annotated
@@ -22,7 +22,7 @@ def fake(
     ],
     pty: Annotated[bool, typer.Option("--pty", help="Serve it on a pseudo-terminal until Ctrl-C or SIGTERM.")] = False,
     link: Annotated[
-        Path | None, typer.Option(metavar="PATH", help="Symbolic link to create to the pseudo-terminal.")
+        Path | None, typer.Option(metavar="PATH", help="Create this symbolic link to the pseudo-terminal.")
     ] = None,
     fault: Annotated[
         list[str] | None,
@@ -64,7 +64,7 @@ def hand(
     ] = None,
     release: Annotated[list[int] | None, typer.Option(metavar="ID", help="Release this servo's joint.")] = None,
 ) -> None:
-    """Move joints of a fake arm whose torque is off, like a person who calibrates an arm by hand."""
+    """Move joints of a fake arm while their torque is off, like a person calibrating an arm by hand."""
     from hil.cli import fake as work
 
     work.move_by_hand(device, moves or [], release or [])

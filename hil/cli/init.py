@@ -17,7 +17,9 @@ def init(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Ask no questions; accept every default.")] = False,
 ) -> None:
-    """Scan the bus, ask for other facts, and write a commented TOML file. Torque stays off; no setting is changed."""
+    """Scan the bus, ask for the remaining facts, and write a commented TOML file. Torque stays off; no setting
+    changes.
+    """
     from hil.cli.terminal import Terminal
     from hil.config.fake_url import url_for
     from hil.config.schema import parse_config, port_url
@@ -46,7 +48,7 @@ def init(
     finally:
         opened.close()
     parse_config(arm_toml(answers), out)  # raises if the file would not be valid
-    with terminal.busy("Measuring what rate the bus allows"):
+    with terminal.busy("Measuring the rate that the bus can sustain"):
         found, said = measured_bus(answers, out)
     terminal.say(said)
     text = arm_toml(replace(answers, measured=found))

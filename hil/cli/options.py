@@ -9,7 +9,7 @@ ConfigPath = Annotated[
     Path, typer.Argument(metavar="CONFIG", help="TOML file of the arm, or the name of a bundled one.")
 ]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder of `hil identify` or `hil record`.")]
-OutPath = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Run folder; default runs/TIME-ARM.")]
+OutPath = Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Run folder; default: runs/TIME-ARM.")]
 PortOrFile = Annotated[
     str, typer.Argument(metavar="PORT", help="Serial port or pyserial URL, a TOML file, or a bundled name.")
 ]

@@ -1,4 +1,4 @@
-"""Handle standard output that was closed early by its reader or goes to a full disk. Results are saved by then."""
+"""Handle standard output that its reader closed early or that goes to a full disk. Results have been saved by then."""
 
 import errno
 import os

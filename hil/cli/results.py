@@ -25,7 +25,7 @@ def report(
         Path | None, typer.Option("--svg", metavar="DIR", help="Save the figures in this folder as SVG.")
     ] = None,
 ) -> None:
-    """Write a run as one self-contained HTML page: verdict, parameters, figures."""
+    """Write the report of a run: one self-contained HTML page with verdict, parameters and figures."""
     from hil.cli.views.result_table import what_next
     from hil.model_file import read_result
     from hil.report.pictures import save_pictures
@@ -56,7 +56,7 @@ def export(
     ] = None,
     samples: Annotated[
         int | None,
-        typer.Option("--samples", metavar="N", help="Draw N arms from the posterior into --out."),
+        typer.Option("--samples", metavar="N", help="Draw N arms from the posterior and write them to --out."),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the draws.")] = 1,
 ) -> None:

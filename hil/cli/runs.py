@@ -139,7 +139,7 @@ def _would_show(detectable: "Mapping[str, float]") -> list[str]:
     never = [name for name, percent in detectable.items() if percent > _WHOLE]
     lines = []
     if least:
-        known = "Smallest change of each term that 95 of 100 such pairs of runs would detect"
+        known = "Smallest change in each term that 95 of 100 pairs of runs like these would detect"
         lines.append(f"{known}: {', '.join(least)}.")
     if never:
         lines.append(f"For these terms, not even a doubling would be detected: {', '.join(never)}.")

@@ -29,7 +29,7 @@ class Terminated(KeyboardInterrupt):
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Turn a signal in the block into a message and an exit code."""
+    """Turn a signal that arrives in the block into a message and an exit code."""
     former = _catch() if threading.current_thread() is threading.main_thread() else {}
     try:
         yield

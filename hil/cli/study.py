@@ -44,7 +44,9 @@ def study(
         from hil.study.page import FILE_NAME, write_page
         from hil.study.run import run_study
     except ImportError as error:
-        raise MissingExtra(f"hil study needs the extra `study` ({error.name}): pip install 'hil[study]'.") from error
+        raise MissingExtra(
+            f"hil study needs the extra `study` ({error.name} is missing): pip install 'hil[study]'."
+        ) from error
     checked = load_study(study_path)
     folder = out or Path("studies") / study_path.stem
     console = Console(stderr=True, quiet=json_only or is_quiet(), highlight=False)

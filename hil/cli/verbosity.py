@@ -1,4 +1,4 @@
-"""Adds -v and -q to every subcommand: how much of the logger `hil` is shown on standard error.
+"""Adds -v and -q to every subcommand; they set how much the logger `hil` writes to standard error.
 
 Without either, a command reports its progress and its errors. -v adds log messages and -vv debug messages; -q leaves
 only the result on standard output and errors on standard error.

@@ -2,9 +2,9 @@
 
 Two servos on one joint are coupled by their horns. A horn that slips, a loose screw or a broken gear lets one of them
 turn without the other. The joint's angle is taken from the first servo and does not show this. The difference between
-their angles is compared with what it was at the first sample, because horns are mounted at any angle. If the configured
-direction of one servo is wrong, the servos work against each other. The joint then does not turn at all, as if an
-obstacle held it.
+their angles is compared with what it was at the first sample, because horns may be mounted at any angle. If the
+configured direction of one servo is wrong, the servos work against each other. The joint then does not turn at all, as
+if an obstacle held it.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ ALLOWED_RAD = 0.1
 
 
 def opposed(joint: Joint) -> str:
-    """Return the question of whether a joint's two servos work against each other; "" if it has one servo."""
+    """Return a question to the user: do the joint's two servos work against each other? "" if it has one servo."""
     if not joint.seconds:
         return ""
     signs = [joint.direction, *(second.direction for second in joint.seconds)]
@@ -27,8 +27,8 @@ def opposed(joint: Joint) -> str:
 def causes_of_standstill(joint: Joint) -> str:
     """Say why a joint may stand still although it should move."""
     if asked := opposed(joint):
-        return f"Something blocks it, its encoder is frozen, or {asked}"
-    return "Something blocks it, or its encoder is frozen."
+        return f"Something is blocking it, its encoder is frozen, or {asked}"
+    return "Something is blocking it, or its encoder is frozen."
 
 
 class Apart:
@@ -38,8 +38,8 @@ class Apart:
         self._first: dict[tuple[int, int], float] = {}
 
     def look(self, apart: Sequence[Sequence[float]]) -> tuple[int, int, float] | None:
-        """Process a sample. If two servos no longer agree, return the joint, the other servo (both from 0) and the
-        change [rad].
+        """Process a sample. If two servos no longer agree, return the joint, the other servo (both counted from 0) and
+        the change [rad].
 
         apart: angles of each joint's other servos minus the first's [rad], NaN if one did not reply.
         """

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 
 ARMS = 96
 WIDENED = 1.5
-"""Factor on the ensemble's standard deviations, for effects that its model does not include."""
+"""Factor applied to the ensemble's standard deviations, for effects that its model does not include."""
 
 LYING_RAD = 0.08
 _FRICTIONS = 8.0
@@ -80,7 +80,7 @@ class ChainWatch:
             self._raise(joint, state)
 
     def residual(self, state: State | None = None) -> Residual:
-        """What the model does not explain, after processing a sample, if one is given, without raising anything."""
+        """What the model does not explain. A sample, if given, is processed first, without raising SafetyStop."""
         if state is not None:
             self._observe(state)
         return Residual(self._observer.lacking, self._observer.torque, self._observer.is_beyond)
@@ -131,7 +131,7 @@ class ChainWatch:
             said = (
                 f"{name} does not move like any arm consistent with the prior and the data so far: "
                 f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "
-                "encoder has failed, something pushes or holds it, or the arm is not the one described."
+                "encoder has failed, something is pushing or holding it, or the arm is not the one described."
             )
         raise SafetyStop(said, Cause.UNEXPECTED)
 

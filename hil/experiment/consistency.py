@@ -18,8 +18,8 @@ servo are known:
 A reading that jumps back and forth, as with a stuck bit, cancels in those memories. Therefore each single interval is
 also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
 
-If the reported velocity stays exactly the same, it was the joint's true velocity all that time, except for the last
-`LAG_S` at most. The distance covered before that must therefore equal velocity times time. This detects a velocity
+If the reported velocity stays exactly the same, it was the joint's true velocity all that time, except perhaps during
+the last `LAG_S`. The distance covered before that must therefore equal velocity times time. This detects a velocity
 that freezes near its peak sooner than the memories do, in which a lag could explain the difference.
 
 Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to twice the
@@ -74,8 +74,8 @@ STEPS, STEPS_S = 4, 0.5
 """Number of jumps that counts as a fault, and the longest time between them [s]."""
 
 BLOCK_S = 0.0099
-"""Shortest interval between two notes of the distance covered under an unchanged velocity [s]. The latest three notes
-reach back by `LAG_S`.
+"""Shortest interval between two stored values of the distance covered under an unchanged velocity [s]. The latest three
+values reach back by `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
@@ -95,8 +95,8 @@ samples per period, the fastest that is used, needs 0.27.
 """
 
 CURVED_AT_FIRST = 0.3
-"""Allowance for the first interval, as a fraction of the motion. Around the peak of such a wave, two successive samples
-may have the same velocity, and there is no earlier change to compare with.
+"""Allowance for the first interval, as a fraction of the motion. Around the peak of a wave with four samples per
+period, two successive samples may have the same velocity, and there is no earlier change to compare with.
 """
 
 
@@ -121,8 +121,8 @@ _SAME = np.dtype(
 )
 """Motion since the velocity last changed.
 
-seconds, moved, unknown: time, change of position and its uncertainty [s, rad, rad]. since: time since the last note
-[s]. count: number of notes. d1, t1 to d3, t3: the latest three notes of `moved` and `seconds`.
+seconds, moved, unknown: time, change of position and its uncertainty [s, rad, rad]. since: time since values were last
+stored [s]. count: how often they were. d1, t1 to d3, t3: the latest three stored values of `moved` and `seconds`.
 """
 
 MEMORY = np.dtype(
@@ -148,7 +148,7 @@ accepted values [s, 1].
 
 
 def begin(memory: Any) -> None:
-    """Initialise a record of zeros."""
+    """Initialise a zero-filled record."""
     memory["position"] = np.nan
     memory["lag"], memory["scale"] = LAG_S, SCALE
 
@@ -205,7 +205,7 @@ def lost(memory: Any) -> None:
 def moved_at_standstill(states: Iterable[State], joint: int, still: float) -> str:
     """Describe how far a joint moved while its velocity was reported to be below `still` [rad/s]; "" if not at all.
 
-    states: the latest states, the last one first.
+    states: the latest states, the most recent first.
     """
     said, last, later = "", None, None
     for state in states:

@@ -23,7 +23,7 @@ class Deadlines:
     """Counts missed deadlines of the samples. Every method may raise SafetyStop.
 
     heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did. any_share:
-    whether any share of deadlines may be missed, as while an arm is lowered, where only the time without a command
+    whether any share of deadlines may be missed, as while an arm is being lowered, when only the time without a command
     matters.
     """
 

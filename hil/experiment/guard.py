@@ -1,6 +1,6 @@
 """Checks every sample and stops the arm when a limit is exceeded or a reply is inconsistent.
 
-The checks take a few us per sample. Those of every joint are one compiled loop (`joint_checks`), which also applies
+The checks take a few us per sample. Those of every joint form one compiled loop (`joint_checks`), which also applies
 `following` (does the motor carry the commanded current), `consistency` (do position and velocity agree) and `work`
 (does the motor turn as commanded). Other modules check the status registers (`status_check`) and the time without
 commands or replies (`deadlines` and `silence`); `command_limits` clamps what is sent.
@@ -44,8 +44,8 @@ limit.
 """
 
 _ERRORS_IN_A_ROW = 3
-"""Number of consecutive replies with values and an error number after which the arm is stopped: that servo may not
-accept its goals.
+"""Number of consecutive replies with values and an error number after which the arm is stopped: that servo may be
+rejecting its goals.
 """
 
 NONE_HEARD = "No servo was heard"
@@ -67,8 +67,8 @@ class Guard:
 
     recent: the exchanges so far, if another guard has checked them.
 
-    lowers_since: when this guard begins to watch an arm that is lowered: the time of the last exchange that all servos
-    answered [s]. Replies may then be missing longer, and no advice about the experiment's torque is given.
+    lowers_since: for an arm that is being lowered, the time of the last exchange that all servos answered [s]. Replies
+    may then be missing longer, and no advice about the experiment's torque is given.
     """
 
     def __init__(
@@ -217,8 +217,8 @@ class Guard:
         self._stop(
             index,
             Cause.GOALS_LOST,
-            f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. Goals are lost on "
-            "the way, or the servo refuses them: check its cable and limits.",
+            f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. Goals are being "
+            "lost on the way, or the servo refuses them: check its cable and limits.",
         )
 
     def _stop_for(self, fault: int, state: State) -> NoReturn:
@@ -252,8 +252,8 @@ class Guard:
                     index,
                     Cause.EARLY_MOTION,
                     f"moved before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
-                    f"is allowed. {self._still_swings()} Otherwise check whether a hand or a cable pushes or holds it, "
-                    "whether its horn slips, or whether another program commands it.",
+                    f"is allowed. {self._still_swings()} Otherwise check whether a hand or a cable is pushing or "
+                    "holding it, whether its horn slips, or whether another program is commanding it.",
                 )
 
     def _still_swings(self) -> str:
@@ -269,8 +269,8 @@ class Guard:
             index,
             Cause.UNLIKE_BEFORE,
             f"does not repeat its motion: under the same torque it is at {position:.3f} rad, far from where it was one "
-            "period ago. Something pushes or holds it, its load has changed, it slips, or its encoder has failed. If "
-            f"none of these applies, it swings so far that its motion never repeats.{self._lower_torque}",
+            "period ago. Something is pushing or holding it, its load has changed, it slips, or its encoder has "
+            f"failed. If none of these applies, it swings so far that its motion never repeats.{self._lower_torque}",
         )
 
     def _count_missing(self, index: int, error: int, now: float, *, alone: bool) -> None:
@@ -369,17 +369,17 @@ class Guard:
                     index,
                     Cause.OUT_OF_VOLTAGE,
                     f"{said}: at that speed its supply cannot drive more current against the back-EMF, or its current "
-                    f"sensor is wrong. Lower velocity_limit to {slower}, or raise the supply voltage; if it stops at "
-                    f"lower speeds too, suspect the sensor.{self._lower_torque}",
+                    f"sensor is wrong. Lower velocity_limit to {slower}, or raise the supply voltage; if this "
+                    f"happens at lower speeds too, suspect the sensor.{self._lower_torque}",
                 )
             # Published figures are too uncertain to rule the supply out: the arm is braked all the same.
             self._stop(
                 index,
                 Cause.GOALS_CHANGED,
-                f"{said}: {self._supply[index]:.1f} V would drive it at that speed, according to the published "
-                "figures. Its goals are changed on the way or by another program, its supply sags, or its current "
-                "sensor is wrong: check these. If all are in order, its motor is weaker than published: lower "
-                f"velocity_limit to {slower}.",
+                f"{said}: {self._supply[index]:.1f} V would drive the commanded current at that speed, according to "
+                "the published figures. Its goals are being changed on the way or by another program, its supply sags, "
+                "or its current sensor is wrong: check these. If all are in order, its motor is weaker than published: "
+                f"lower velocity_limit to {slower}.",
             )
         seconds = self._joints[index]["found"]
         self._stop(
@@ -394,16 +394,18 @@ class Guard:
         held = self._status.other_goal(index)
         if held is not None and abs(carried - held) < abs(carried - commanded):
             return (
-                f"Its goal register reads {held:.3f} {unit}, which fits what it carries: another program commands it, "
-                "or goals are changed or lost on the way."
+                f"Its goal register reads {held:.3f} {unit}, which matches what it carries: another program is "
+                "commanding it, or goals are being changed or lost on the way."
             )
         along = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
         allowed = self._joints[index]["following"]["allowed"]
         if along > abs(commanded) + allowed or along < -allowed:
-            return "Its torque is not the commanded one: another program commands it, or its current sensor is wrong."
+            return "Its torque is not as commanded: another program is commanding it, or its current sensor is wrong."
         weak = "it cannot deliver this much at its speed and supply voltage (safety.follow_share)."
         if along > HARDLY_ANY * abs(commanded):
-            return f"Its goals are changed on the way or by another program, its current sensor is wrong, or {weak}"
+            return (
+                f"Its goals are being changed on the way or by another program, its current sensor is wrong, or {weak}"
+            )
         return f"Its torque is off, it was rebooted, its watchdog acted, or {weak}"
 
     def _not_together(self, index: int, servo: int, turned: float) -> NoReturn:
@@ -443,7 +445,7 @@ class Guard:
             index,
             Cause.WRONG_SIGN,
             f"is moving against its command: its motor has taken {self._joints[index]['found']:.2f} J out of the arm, "
-            "more than friction can account for. Is its direction reversed, or does something else drive the arm?",
+            "more than friction can account for. Is its direction reversed, or is something else driving the arm?",
         )
 
     def _look_slow(self, slow: Slow) -> None:

@@ -6,7 +6,7 @@ experiment. It is aborted and torque is cut after an alert, if a current does no
 path, or if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities that agree with
 the positions.
 
-Replies may be missing for a moment, also at the beginning: joints that are not heard get the feed-forward torque alone.
+Replies may be missing for a moment, even at the beginning: joints that are not heard get the feed-forward torque alone.
 """
 
 from collections import deque
@@ -34,8 +34,8 @@ LYING_RAD = 0.06
 """An arm within this angle of its rest pose in every joint is already at rest."""
 
 RUNS_AWAY = 0.25
-"""Velocity beyond that of the path home, relative to the velocity limit. A joint that exceeds it and still speeds up
-although its torque opposes the motion does not obey.
+"""Excess of a joint's velocity over that of the path home, relative to the velocity limit. A joint that exceeds this
+and still speeds up although its torque opposes the motion counts as not obeying its motor.
 """
 
 _GROWS_S = 0.015
@@ -94,10 +94,11 @@ class Lowering:
         return away
 
     def begin(self, state: State, goal: list[float], recent: RecentMotion, watch: ChainWatch | None = None) -> int:
-        """Start lowering from this sample, the latest that all servos answered; return the number of samples it takes.
+        """Start lowering from this sample, the latest that all servos answered; return the number of samples that
+        lowering takes.
 
         goal: latest goals [A or V]. recent: the latest exchanges. watch: the model's check, which has seen the motion
-        so far; without one, motors that turn against their goals are only found once their joints run away.
+        so far; without one, motors that turn against their goals are detected only once their joints run away.
         """
         self._recent, self._watch = recent, watch
         position, velocity = np.array(state.position), np.array(recent.until(state).believed(state))
@@ -156,9 +157,9 @@ class Lowering:
             turned = self._obedience.look(self._watch.residual(state), velocity.tolist(), now)
         if turned >= 0:
             raise SafetyStop(
-                f"{self._config.joints[turned].joint.title} moves against its command: torque that its motion "
-                "contradicted vanished when its goal was taken away for a moment. Its motor turns the wrong way: check "
-                "its direction and its wiring, and whether another program has changed its Drive Mode.",
+                f"{self._config.joints[turned].joint.title} is moving against its command: torque that the "
+                "model could not explain vanished when its goal was removed for a moment. Its motor turns the wrong "
+                "way: check its direction and its wiring, and whether another program has changed its Drive Mode.",
                 Cause.WRONG_SIGN,
             )
         excess = velocity - self._velocity[index]

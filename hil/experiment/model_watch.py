@@ -28,7 +28,7 @@ from hil.experiment.consistency import check_standstill
 
 ARMS = 64
 WIDENED = 1.5
-"""Factor on the ensemble's standard deviations, for effects that its model does not include."""
+"""Factor applied to the ensemble's standard deviations, for effects that its model does not include."""
 
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
@@ -39,7 +39,9 @@ hardly exceeds it.
 """
 _TILT_SHARE = 0.2  # standard deviation of gravity perpendicular to the assumed direction, relative to gravity
 _FRICTION_SPREAD = 3.0
-"""Factor on the spread of servo friction for an arm without a description, to allow for friction outside its servos."""
+"""Factor applied to the spread of servo friction for an arm without a description, to allow for friction outside its
+servos.
+"""
 _UNDESCRIBED = {"gravity": 10.0, "viscous": 1.0, "offset": 0.3, "tilt": 1.0}
 _INERTIA = 0.3
 """Standard deviations for an arm without a description, as multiples of the planned torque in SI units.
@@ -110,8 +112,8 @@ class Jolts:
         self.forget()
 
     def look(self, velocity: Sequence[float], seconds: float, now: float) -> tuple[int, float] | None:
-        """Process velocities [rad/s], `seconds` after the previous ones [s]; return a jolt's joint and change
-        [rad/s].
+        """Process velocities [rad/s], `seconds` after the previous ones [s]; return the joint that jolted and its
+        change of velocity [rad/s], or None.
         """
         self._pack(self._bytes, 0, *velocity)
         joint = self._jolting(self._joints, self._former, self._velocity, seconds, now, self._least)
@@ -247,7 +249,7 @@ class ModelWatch:
             said = (
                 f"{name} does not move like any arm consistent with the prior and the data so far: "
                 f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "
-                "encoder has failed, something pushes or holds it, or the arm is not the one described."
+                "encoder has failed, something is pushing or holding it, or the arm is not the one described."
             )
         raise SafetyStop(said, Cause.UNEXPECTED)
 

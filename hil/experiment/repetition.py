@@ -1,7 +1,8 @@
 """Comparison of successive periods sample by sample, which avoids a burst of work at the end of a period.
 
-The difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated during the period, so that
-only a few divisions remain at its end. The previous period is kept in one buffer, which the latest one overwrites.
+The measure of difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated during the
+period, so that only a few divisions remain at its end. The previous period is kept in one buffer, which the latest one
+overwrites.
 
 The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same
 sample of the previous period. If they differ by more than `TIMES` times the RMS difference between the two previous

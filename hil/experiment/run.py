@@ -90,7 +90,7 @@ def run_experiment(
             log.note(clock.now(), what)
 
         if config.is_chain and not config.is_fake:
-            note("spatial arms have not been tested on hardware yet: keep a hand on the supply's switch")
+            note("spatial arms have not been tested on hardware yet: keep a hand on the power supply's switch")
         note(f"opened {config.port.url} at {config.port.baud} baud")
         _check_rate(config, bus)
         lies = _wait_for_rest(config, bus)
@@ -320,7 +320,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if file is not None:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which allows "
-            f"at most {1 / slowest:.0f} Hz. This user may not change it. Type: {command_to_set(file)}"
+            f"at most {1 / slowest:.0f} Hz. You do not have permission to change it. Type: {command_to_set(file)}"
         )
     if bus.port.latency_measured:
         raise WrongSetting(

@@ -1,4 +1,4 @@
-"""How long servos have not replied, counting only the time during which this program listened to them.
+"""How long servos have been silent, counting only the time during which this program was listening to them.
 
 A stalled computer neither receives nor sends anything, which reveals nothing about the servos. That time is limited as
 missed deadlines are (`hil.experiment.deadlines`); only the time in which this program waited for a reply that did not
@@ -14,7 +14,7 @@ from hil.config.schema import Config
 from hil.plan.silence import Limit, bridged_limit, is_missing_too_long, late_limit, missing_limit
 
 LATE_WAKE_UP_S = 1e-3
-"""Lateness of this program that indicates a busy computer [s]; an idle one stays below a third of it."""
+"""Lateness of this program that indicates a busy computer [s]; on an idle one, it stays below a third of this."""
 
 BUSY_S = 2.0
 """How long a computer counts as busy after this program was late [s]."""
@@ -24,7 +24,7 @@ class Silence:
     """Counts the missing replies of each joint.
 
     interval: time between two exchanges [s]. patience: how long an exchange waits for replies [s].
-    heard_at: when the arm began to be lowered, the time at which all servos had been heard last [s].
+    heard_at: for an arm that is being lowered, the time at which all servos were last heard before that [s].
     """
 
     def __init__(self, config: Config, interval: float, patience: float = 0.0, heard_at: float | None = None) -> None:

@@ -86,7 +86,7 @@ class StatusCheck:
         if status.torque is False:
             return Cause.TORQUE_OFF, (
                 "has lost its torque: Torque Enable reads 0 although this program switched it on. It was rebooted, its "
-                "supply failed for a moment, or another program uses this bus."
+                "supply failed for a moment, or another program is using this bus."
             )
         return (
             self._watchdog(status)
@@ -107,7 +107,7 @@ class StatusCheck:
             return None
         return Cause.WATCHDOG, (
             f"is no longer protected: its Bus Watchdog reads {status.watchdog} but was set to {self._armed}. Another "
-            "program uses this bus, or the servo was rebooted."
+            "program is using this bus, or the servo was rebooted."
         )
 
     def _goal(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
@@ -129,12 +129,12 @@ class StatusCheck:
         if self._is_foreign[joint] or is_repeated:
             return Cause.GOALS_LOST, (
                 f"does not hold the goals of this program: {held}, and it holds goals that this program never sent. "
-                "Another program commands it, or goals are changed on the way: stop that program or unplug its "
-                "controller; then check the adapter and the cable."
+                "Another program is commanding it, or goals are being changed on the way: stop that program or unplug "
+                "its controller; then check the adapter and the cable."
             )
         return Cause.GOALS_LOST, (
-            f"does not accept goals: {held}, and it missed an earlier one too. Goals are lost on the way, or the servo "
-            "refuses them: check its cable and limits."
+            f"does not accept goals: {held}, and it missed an earlier one too. Goals are being lost on the way, or the "
+            "servo refuses them: check its cable and limits."
         )
 
     def _never_sent(self, joint: int, held: float) -> bool:
@@ -173,7 +173,7 @@ class StatusCheck:
                 return None
             if self._is_anothers(joint, offset, now):
                 return Cause.STALE, (
-                    "returns another servo's data: its reply carries the clock of another joint. Replies are mixed up. "
+                    "returns another servo's data: its reply carries that servo's clock. Replies are being mixed up. "
                     "Check the adapter, and that every servo has its own ID."
                 )
             return Cause.STALE, (

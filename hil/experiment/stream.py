@@ -78,7 +78,7 @@ Note = Callable[[str], None]
 
 
 class Stream:
-    """Plays a plan on a bus whose torque is on. `run` returns when the arm is at rest again.
+    """Plays a plan on servos whose torque is on. `run` returns when the arm is at rest again.
 
     watch: called with the progress about 20 times a second. note: called with each event to be logged. Neither may
     block. arms: prior knowledge of the arm; by default, from the configuration. Create the stream before torque is on:
@@ -201,7 +201,7 @@ class Stream:
             raise ExperimentError(
                 self._false_velocity(state, window)
                 or f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again. If it "
-                "moved by itself, another program commands it, or something pushes or holds it."
+                "moved by itself, another program is commanding it, or something is pushing or holding it."
             )
 
     def _false_velocity(self, state: State, window: int) -> str:
@@ -443,7 +443,8 @@ class Stream:
         try:
             state = self._way_down(lowering, state)
         except (SafetyStop, StopRequested, DriverError) as ended:
-            self._told(error, f"Torque was cut while the arm was being lowered, so it fell from there: {ended}")
+            fell = "Torque was cut while the arm was being lowered, so it fell the rest of the way"
+            self._told(error, f"{fell}: {ended}")
             return
         elsewhere = lowering.lies_elsewhere(state)
         done = f"was lowered, but not to its rest pose: {elsewhere}" if elsewhere else "was lowered to its rest pose"

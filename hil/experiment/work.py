@@ -1,7 +1,7 @@
 """Work of the motors: a motor that only takes energy out of the arm turns against its command.
 
-Work is checked only without a stabiliser. Such an arm starts at a stable rest pose and cannot return more work than was
-put in. A motor that continually takes work out of it therefore turns the wrong way.
+Work is checked only without a stabiliser. An arm without one starts at a stable rest pose and cannot return more work
+than was put in. A motor that continually takes work out of it therefore turns the wrong way.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
 that it keeps for a joint is a record of the type `MEMORY`.
@@ -33,7 +33,7 @@ held: latest goal [A or V].
 
 
 def begin(memory: Any, scale: float, planned: float) -> None:
-    """Initialise a record of zeros. scale: torque per goal [N m/A or N m/V]. planned: largest planned goal [A or V]."""
+    """Initialise a zero-filled record. scale: torque per goal [N m/A or N m/V]. planned: largest goal [A or V]."""
     memory["scale"] = scale
     memory["least"] = -TOLERANCE_RAD * planned * scale
 

@@ -70,7 +70,9 @@ class Belief:
 
     @property
     def parameters(self) -> list[dict[str, float]]:
-        """Parameters of every arm by the estimator's names [SI], assuming the first joint's nominal torque constant."""
+        """Parameters of every arm, keyed by the estimator's names [SI], assuming the first joint's nominal torque
+        constant.
+        """
         return [
             within_range({**self.fixed, **dict(zip(self.names, values.tolist(), strict=True))})
             for values in self._values(self.coordinates)

@@ -1,10 +1,10 @@
-"""Breaking away joints that friction holds: torque rises from run to run, and a run ends soon after a joint moves.
+"""Breakaway of joints that friction holds: torque rises from run to run, and a run ends soon after a joint moves.
 
 A joint that stood still reveals little more than that its friction is larger than the torque. Just above that friction,
-motion grows quickly: on many of the plausible arms even a few percent more torque exceeds a limit. A torque that is
-safe for a whole run can therefore hardly be raised. Instead, the guard is given narrow limits for such joints. The
-torque can then grow by a constant ratio up to the current limit. The arm is braked and the run ends once the joint has
-moved and thus shown its friction.
+motion grows quickly: on many of the plausible arms even a few percent more torque makes a joint exceed a limit. A
+torque that is safe for a whole run can therefore hardly be raised. Instead, the guard is given narrow limits for such
+joints. The torque can then grow by a constant ratio up to the current limit. The arm is braked and the run ends once
+the joint has moved and thus shown its friction.
 """
 
 import numpy as np

@@ -92,7 +92,7 @@ class ChainBelief:
         return share
 
     def gains(self, given: Config) -> ChainGains:
-        """Limits of the stabiliser's gains for the ensemble."""
+        """Limits on the stabiliser's gains for the ensemble."""
         return ChainGains.of(given, self.arms.first(SIMULATED), _poses(given))
 
     def learn(self, config: Config, samples: NDArray[np.void]) -> "ChainBelief":

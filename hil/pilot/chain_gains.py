@@ -32,7 +32,7 @@ MOST_DRIVING = 0.3
 
 @dataclass(frozen=True)
 class ChainGains:
-    """Limits of the gains for each joint (joints,).
+    """Limits on the gains of each joint (joints,).
 
     stiffness, damping: gains at a high rate [N m/rad, N m s/rad]. friction: least viscous friction [N m s/rad].
     lightest: smallest inertia with the other joints free [kg m^2].

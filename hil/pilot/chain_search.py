@@ -149,7 +149,9 @@ class ChainSearch(SafeShares):
         return error
 
     def learn(self, config: Config, folder: RunFolder) -> None:
-        """Update the belief, and which joints were beyond their rest pose, from the recording in a folder."""
+        """Update the belief, and the record of which joints were beyond their rest pose, from the recording in a
+        folder.
+        """
         samples = load_samples(folder.samples_path, len(config.joints))
         self.belief = self.belief.learn(config, samples)
         found = passed_rest(config, samples["position"])

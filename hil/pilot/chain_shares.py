@@ -1,4 +1,4 @@
-"""The largest share of a spatial arm's designed paths that is safe for every arm of the current belief.
+"""The largest share of the designed paths' amplitude that is safe for every spatial arm of the current belief.
 
 `hil identify` and `hil dry-run` both decide in this way, on the same arms, so that they agree.
 """
@@ -299,7 +299,7 @@ def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
 def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
     """Return what to change, and by how much, if a joint exceeds a limit on some of the simulated arms.
 
-    stiffness: of each joint's stabiliser at this rate, relative to that at a high rate (joints,).
+    stiffness: each joint's stabiliser stiffness at this rate, relative to that at a high rate (joints,).
     """
     row, at = nearest_limit(peaks)
     joint, limit, rate = config.joints[at], float(peaks.limits[row, at]), config.experiment.rate
@@ -319,12 +319,12 @@ def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
     else:
         side = "lower" if QUANTITIES[row] == "lowest position" else "upper"
         helps.append(
-            f"a position_limit of {joint.name!r} with its {side} end at {wanted:.2f} rad, if the arm allows it, or a "
+            f"a position_limit for {joint.name!r} with its {side} end at {wanted:.2f} rad, if the arm allows it, or a "
             f"rest_pose {abs(wanted - limit):.2f} rad farther from that end"
         )
     torque = QUANTITIES.index("torque")
     if peaks.quantile[torque, at] > SATURATED * peaks.limits[torque, at]:
-        helps.append(f"a larger {joint.goal_limit_name} of {joint.name!r}, since some simulated arms need all of it")
+        helps.append(f"a larger {joint.goal_limit_name} for {joint.name!r}, since some simulated arms need all of it")
     if has_room:
         spread = _spread(config)
         helps.append(

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 def identify_in_steps(
     config: Config, run: RunFolder, shown_path: Path, watch: Watch, say: Say, earlier: Result | None = None
 ) -> tuple[str, SettledResult]:
-    """Identify an arm from link lengths only, or from an `earlier` result for the same arm.
+    """Identify an arm from link lengths alone, or from an `earlier` result for the same arm.
 
     Returns the sentence about the torque state and the result.
 

@@ -150,10 +150,10 @@ class Search:
         return np.asarray(swing > MOVED_STEPS * step)
 
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
-        """The largest safe amplitude for all plausible arms.
+        """The largest amplitude that is safe for all plausible arms.
 
         If there is none, the amplitude of the last run is used, provided that the real arm has shown it to be safe, and
-        otherwise a smaller one. Raises NoSafeTorque if there was no run yet.
+        otherwise a smaller one. Raises NoSafeTorque if there has been no run yet.
         """
         ensemble, options = self.belief.ensemble(self._farther), self.options
         cap = self.cap
@@ -302,7 +302,7 @@ class Search:
         self.learn(played_config, played)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude) -> Played:
-        """Play one run from where the last one left the arm, checked against the plausible arms."""
+        """Play one run from where the last one left the arm; its motion is checked against the plausible arms."""
         arms = self.belief.ensemble(self._farther)
         return self.player.play(config if self.pose is None else _from_anywhere(config), folder, name, found, arms)
 

@@ -18,7 +18,7 @@ from hil.plan.recent_motion import RecentMotion
 FULL_AT = 0.5
 """Fraction of the velocity limit at which the brake uses the full current limit.
 
-A stronger brake hardly stops sooner, and throws the arm back much farther if the connection is lost during braking.
+A stronger brake hardly stops the arm sooner, and throws it back much farther if the connection is lost during braking.
 """
 
 LIGHTEST = 0.5
@@ -48,7 +48,8 @@ def may_brake(config: Config, error: BaseException) -> bool:
 
 
 def braking_gains(config: Config, interval: float | None = None) -> list[float]:
-    """Braking gains [A s/rad, or V s/rad in PWM mode] with which no single goal reverses the lightest joint.
+    """Braking gains [A s/rad, or V s/rad in PWM mode] with which no single goal reverses the motion of the lightest
+    joint.
 
     interval: time between two exchanges [s]; by default, that on a fast bus.
     """

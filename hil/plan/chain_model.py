@@ -26,7 +26,7 @@ class KnownChain:
     base: BaseParameters
     prior: Prior
     described: Array
-    """All parameters of the description (11 joints,) [SI]."""
+    """All parameters of the description (11 * joints,) [SI]."""
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ class PathSegment(Segment):
 
 
 class NoHeadroom(ConfigError):
-    """A path needs nearly all the torque of a joint."""
+    """A path needs nearly all of a joint's torque."""
 
 
 def plan_of(config: Config) -> Plan:
@@ -67,7 +67,7 @@ def plan_of(config: Config) -> Plan:
 
 
 def missing_path(config: Config) -> str:
-    """Message that a spatial arm without a pilot lacks its path; "" if nothing is missing."""
+    """Message saying that a spatial arm without a pilot lacks its path; "" if nothing is missing."""
     if config.joint_path is not None:
         return ""
     return (
@@ -95,7 +95,7 @@ def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str,
 
 
 def lowering_samples(config: Config) -> int:
-    """Largest number of samples of a lowering stop, including its braking and its end."""
+    """Largest number of samples of a lowering stop, including braking and coming to rest."""
     safety = config.safety
     return round((safety.lower_time + 1.0 + 2.0 * SETTLE_IN) * config.experiment.rate)
 
@@ -129,9 +129,10 @@ def path_segment(config: Config, thought: ChainTorque, role: str, path: Path) ->
 
 
 def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array | float = 1.0) -> Array:
-    """Torque to command for a path (joints, samples) [N m], which compensates the stabiliser's pull to the rest pose.
+    """Torque to command for a path (joints, samples) [N m], which compensates the stabiliser's pull towards the rest
+    pose.
 
-    share: factor on the feed-forward.
+    share: factor applied to the feed-forward.
     """
     assert config.stabiliser is not None
     stiffness, damping = (np.array(each)[:, None] for each in (config.stabiliser.stiffness, config.stabiliser.damping))
@@ -190,8 +191,8 @@ def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
         if peak > TORQUE_SHARE * most:
             raise NoHeadroom(
                 f"{config.path}: joint_path: {joint.name!r} needs about {peak:.3g} N m for this path, more than "
-                f"{100 * TORQUE_SHARE:.0f} % of its {most:.3g} N m. That leaves too little margin for errors of the "
-                f"described masses: lower joint_path.speed or swing, or raise its {joint.goal_limit_name}."
+                f"{100 * TORQUE_SHARE:.0f} % of its limit of {most:.3g} N m. That leaves too little margin for errors "
+                f"of the described masses: lower joint_path.speed or swing, or raise its {joint.goal_limit_name}."
             )
 
 

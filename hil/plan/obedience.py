@@ -2,8 +2,8 @@
 
 As long as the torque does not change, a reversed motor and something that pushes the joint look alike: the arm moves as
 if an additional torque acted on the joint. So the goal of such a joint is removed for a moment, while the others are
-held. Unexplained torque that comes from the joint's own motor falls in proportion to its goal; that of a push does not.
-The test is short: in that time a limp joint gains less speed from gravity than a reversed motor would give it.
+held. Unexplained torque that comes from the joint's own motor falls in proportion to its goal; torque from a push does
+not. The test is short: in that time a limp joint gains less speed from gravity than a reversed motor would give it.
 """
 
 from collections.abc import Sequence
@@ -63,11 +63,13 @@ class Obedience:
         self._pushed = [False] * joints
 
     def is_limp(self, joint: int) -> bool:
-        """Whether this joint must not get any torque now."""
+        """Whether this joint must receive no torque now."""
         return self._tests[joint] is not None
 
     def suspect(self, found: Residual, velocity: Sequence[float], now: float) -> None:
-        """Begin the tests that the latest exchange calls for. velocity: believed ones [rad/s]. now: its time [s]."""
+        """Begin the tests that the latest exchange calls for. velocity: believed velocities [rad/s]. now: time of that
+        exchange [s].
+        """
         for joint, (lacking, torque) in enumerate(zip(found.lacking, found.torque, strict=True)):
             if self._tests[joint] or self._pushed[joint] or now < self._rests_until[joint]:
                 continue

@@ -19,7 +19,7 @@ from hil.drivers.state import State
 __all__ = ["RecentMotion", "Travel"]
 
 SHORT_S, LONG_S = 0.004, 0.02
-"""The two spans [s]; each reaches back to the latest exchange that is at least as old."""
+"""The two spans over which motion is judged [s]; each reaches back to the latest exchange that is at least that old."""
 
 _OLDEST_S = 0.05
 _LONGER = 1.5
@@ -89,7 +89,7 @@ class RecentMotion:
         return found
 
     def contradicts(self, joint: int, velocity: float) -> bool:
-        """Whether a velocity cannot be the joint's. Either no known change of its position allows it, or no change is
+        """Whether a velocity cannot be the joint's: either no known change of its position allows it, or no change is
         known and no servo turns that fast.
         """
         travels = self.travels(joint)

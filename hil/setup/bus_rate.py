@@ -1,7 +1,8 @@
 """The sample rate that a bus can sustain, measured with torque off for every exchange mode.
 
-The rate is a property of servos, wire and adapter. A computer that other programs keep busy delays single exchanges,
-which an experiment tolerates (`hil.experiment.deadlines`): such outliers are reported, but do not limit the rate.
+The rate is a property of servos, wire and adapter. A computer that other programs keep busy delays occasional
+exchanges, which an experiment tolerates (`hil.experiment.deadlines`): such outliers are reported, but do not limit the
+rate.
 """
 
 from collections.abc import Sequence
@@ -18,11 +19,11 @@ from hil.setup.realtime import on_time
 CYCLES = 200
 SLOW_EVERY = 10
 USUAL = 0.9
-"""Fraction of the exchanges that are fast enough for the reported rate; an experiment needs four fifths on time."""
+"""Fraction of the exchanges that must be fast enough for a reported rate; an experiment needs four fifths on time."""
 PATIENCE_S = 0.05
 """Time after which a reply counts as lost [s]; on a busy computer the kernel may deliver a reply 10 to 20 ms late."""
 AGAIN_AFTER_S = 0.5
-"""Time after which a rate that seems too high is measured again [s]."""
+"""If the wanted rate seems too high for the bus, the bus is measured again after this time [s]."""
 SHARE = 0.9
 """Fraction of a period that the exchange may take; the rest is for the computer."""
 RATE_MARGIN = 1.2
@@ -34,7 +35,7 @@ class ExchangeMode:
     """Measured timing of one exchange mode.
 
     median_s, longest_s: round trips [s]. usual_s: time within which 90 % of the exchanges with the slowest kind of read
-    return [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
+    complete [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
     """
 
     one_write: bool
@@ -68,7 +69,7 @@ class RateReport:
     """Measurements of all exchange modes.
 
     found: what the configured mode can sustain, as text. fix: what to change; empty if the rate is sustainable.
-    delayed: what delays single exchanges by more than a period, and what to do; empty if nothing does.
+    delayed: what delays occasional exchanges by more than a period, and what to do; empty if nothing does.
     """
 
     modes: tuple[ExchangeMode, ...]
@@ -132,8 +133,8 @@ def goal_register(joint: Joint) -> str:
 
 
 def goals_taken(bus: ServoBus) -> list[Joint]:
-    """The drives, one per servo, that accept goals from a Sync Write. To be called only with torque off. Raises
-    DriverError.
+    """The servos (as single-servo joints) that accept goals from a Sync Write. To be called only with torque off.
+    Raises DriverError.
 
     Each is sent a goal that differs from its present one. The goal is read back, then the previous one is restored.
     """
@@ -184,8 +185,9 @@ def _delayed(used: ExchangeMode, wanted: float) -> str:
     if used.longest_s <= 1 / wanted:
         return ""
     return (
-        f"Some exchanges took up to {used.longest_s * 1e3:.0f} ms: other programs keep this computer busy, or the "
-        "adapter pauses. An experiment tolerates single delays, but stops after a long one: close other programs."
+        f"Some exchanges took up to {used.longest_s * 1e3:.0f} ms: other programs are keeping this computer busy, "
+        "or the adapter pauses. An experiment tolerates isolated delays, but stops after a long one: close other "
+        "programs."
     )
 
 
@@ -200,8 +202,8 @@ def _fix(used: ExchangeMode, modes: list[ExchangeMode], wanted: float) -> str:
         return "Replies are lost with every read method: check cables, supply and termination."
     best = max((mode for mode in modes if mode.sound), key=lambda mode: mode.rate)
     busy = (
-        "Half of the exchanges are fast enough, so other programs may keep this computer busy: close them and check "
-        "again. Otherwise: "
+        "Half of the exchanges are fast enough, so other programs may be keeping this computer busy: close them and "
+        "check again. Otherwise: "
         if wanted * best.median_s <= SHARE
         else ""
     )

@@ -83,7 +83,7 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
     said = f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."
     if (swapped := _swapped(before, after)) is not None:
         first, second = swapped
-        said += f" {first.title} now has what {second} had: their IDs may have been swapped."
+        said += f" {first.title} now has the settings that {second} had: their IDs may have been swapped."
     return said
 
 
@@ -104,8 +104,8 @@ def _by_joint(settings: Settings) -> dict[Joint, dict[str, int]]:
 
 
 def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago: float) -> str:
-    """A sentence to add to a stop at a limit if the only change may have been made after the stop; "" if the change
-    explains the stop.
+    """A sentence to add to the message of a stop at a limit if the only change may have been made after the stop; "" if
+    the change explains the stop.
 
     modes_seen_ago: time from the latest correct read-back of the operating modes to the stop [s].
     """

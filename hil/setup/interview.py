@@ -32,14 +32,14 @@ _POSE = {
 
 
 def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) -> ArmAnswers:
-    """Ask about the arm at an open port, given the result of a scan. Raises ExperimentError if no arm can be formed."""
+    """Ask about the arm on an open port, given the result of a scan. Raises ExperimentError if no arm can be formed."""
     baud, servos = _one_baud(heard)
     port.set_baud(baud)
     chosen = _choose(servos, ask, say)
     handles = [Servo(port, found.id, load_control_table(str(found.model))) for found in chosen]
     for servo in handles:
         if servo.read("Torque Enable"):
-            raise ExperimentError(f"{servo.title} keeps its torque on. Power-cycle it, then start again.")
+            raise ExperimentError(f"{servo.title} still has its torque on. Power-cycle it, then start again.")
     names = [_name(number, found, ask) for number, found in enumerate(chosen)]
     stance = _stance(ask, say)
     tilt = (
@@ -70,7 +70,7 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
         answers = JointAnswers(name, found.id, str(found.model), zero, rest, directions[number], swing, length)
         joints.append(replace(answers, voltage=found.voltage))
     head = (
-        "Written by hil init. Before the first run: read each line, then `hil check` this file.\n"
+        "Written by hil init. Before the first run: read each line, then run `hil check` on this file.\n"
         "NOT yet run on this arm: the limits are conservative guesses from the servo models."
     )
     gravity = 0.0 if stance == FLAT else round(STANDARD_GRAVITY * math.cos(tilt), 3)
@@ -130,9 +130,9 @@ def _say_who_is_left_out(others: Sequence[Found], say: Say) -> None:
         ids = ", ".join(str(found.id) for found in others)
         say(
             f"LEFT OUT: ID {ids}. hil init describes planar arms of one or two joints; the other servos are neither "
-            "read nor moved, so hold or fix their joints. An arm of more joints, or one that is not planar, needs its "
-            "URDF or MJCF: copy configs/open_manipulator_x.toml, name the description in [arm] urdf, then type: hil "
-            "pose YOUR_FILE.toml"
+            "read nor moved, so hold or fix their joints. An arm with more joints, or one that is not planar, needs "
+            "its URDF or MJCF: copy configs/open_manipulator_x.toml, name the description in [arm] urdf, then type: "
+            "hil pose YOUR_FILE.toml"
         )
 
 

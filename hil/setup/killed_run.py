@@ -69,7 +69,8 @@ class Left:
 def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
     """Compare the settings before a killed program with the present ones. Raises the same errors as `Servo.read`.
 
-    If another program changed the Operating Mode, goals and gains belong to the new mode and are kept.
+    If another program changed the Operating Mode, the present goals and gains belong to the new mode and are left as
+    they are.
     """
     changed = {
         name: present[name]
@@ -93,8 +94,8 @@ class Restored:
 def recover(servo: Servo, port: str) -> Restored:
     """Restore settings that a terminated program left changed. Raises the same errors as `Servo.write`.
 
-    The file with the earlier settings is kept as long as another program's value prevents the restoration of a
-    register.
+    The file with the earlier settings is kept as long as another program's value prevents a register from being
+    restored.
     """
     kept = settings_file.load(port, servo.id, servo.table.model)
     if kept is None or not kept.may_restore:

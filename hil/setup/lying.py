@@ -1,6 +1,6 @@
 """The pose in which a spatial arm lies before a run. The motion starts and ends there, not exactly at arm.rest_pose.
 
-Otherwise the stabiliser would pull the arm to arm.rest_pose at once when torque comes on, perhaps against a stop.
+Otherwise the stabiliser would pull the arm to arm.rest_pose as soon as torque comes on, perhaps against an end stop.
 """
 
 from collections.abc import Sequence
@@ -15,13 +15,15 @@ from hil.rest_pose_hint import within_limits
 from hil.setup.servo_session import has_moved
 
 AFTER_A_RUN = 2.0
-"""Factor on the tolerance after a run: friction may hold the arm farther from its rest pose than before."""
+"""Factor applied to the tolerance after a run: friction may hold the arm farther from its rest pose than before."""
 
 NEAR_RAD = 0.02
 """Deviation up to which arm.rest_pose is used although the arm lies elsewhere [rad]."""
 
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
-"""Smallest motion after torque off that is reported, and largest deviation from the rest pose before it [rad]."""
+"""Smallest motion after torque off that is reported, and largest deviation from the rest pose before that motion
+[rad].
+"""
 
 _LONGEST_SAG_S = 3.0  # wait for an arm that moves after torque off
 
@@ -99,7 +101,7 @@ def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
 
 
 def said_of_the_rest(config: Config, lies: Config) -> str:
-    """Message that the arm does not lie in its rest pose, and where it lies."""
+    """Message saying that the arm does not lie in its rest pose, and where it lies."""
     each = zip(config.joints, lies.arm.rest_pose, config.arm.rest_pose, strict=True)
     away = [
         f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})"

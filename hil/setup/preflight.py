@@ -1,4 +1,4 @@
-"""Checks for everything that would stop an experiment, with instructions for fixing it. Torque stays off."""
+"""Checks for anything that would stop an experiment, with instructions for fixing it. Torque stays off."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One check: where, what was checked, what was found, and how to fix it if necessary."""
+    """One check: where it was made, what was checked, what was found, and how to fix it if necessary."""
 
     level: Level
     where: str
@@ -53,8 +53,8 @@ class Finding:
 
 
 def check_arm(config: Config) -> Iterator[Finding]:
-    """Check port, servos, pose and rate, in this order. A check that cannot be carried out is a STOP, not an
-    exception.
+    """Check port, servos, pose and rate, in this order. A check that cannot be carried out yields a STOP instead of
+    raising an exception.
     """
     fakes.register_for(config.url)
     try:
@@ -125,7 +125,7 @@ def _described(config: Config) -> Iterator[Finding]:
     try:
         check_rest_pose(config)
     except ConfigError as error:
-        yield Finding(Level.STOP, "arm", "rest pose", "not free", str(error))
+        yield Finding(Level.STOP, "arm", "rest pose", "not clear", str(error))
         return
     yield Finding(Level.OK, "arm", "rest pose", "clear of itself, the floor and the boxes")
     if not config.experiment.pilot:
@@ -159,7 +159,7 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
     try:
         found = others_on_the_bus(bus)
     except DriverError as error:
-        yield Finding(Level.WARNING, config.port.url, "others", "not searched", str(error))
+        yield Finding(Level.WARNING, config.port.url, "others", "not searched for", str(error))
         return
     if found:
         fix = "They are left alone: neither their torque nor their settings are changed."
@@ -196,7 +196,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
         except DriverError as error:
             fix = (
                 f"{error} It answers pings: if it never answers reads, its Status Return Level is 0; power-cycle "
-                "it, which resets it to 2."
+                "it to reset that level to 2."
             )
             yield Finding(Level.STOP, where, "registers", "cannot be read", fix)
             return
@@ -212,8 +212,8 @@ def _still_off(bus: ServoBus) -> Iterator[Finding]:
         return
     if on:
         fix = (
-            f"{on}: it was off when this check began. Another program has switched it on and drives the arm: stop that "
-            "program first; or cut the supply."
+            f"{on}: torque was off when this check began. Another program has switched it on and is driving the arm: "
+            "stop that program first; or cut the supply."
         )
         yield Finding(Level.STOP, "bus", "torque", "switched on during this check", fix)
 
@@ -298,7 +298,7 @@ def _startup(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: 
         "Startup Configuration switches its torque on at every power-up or reboot, even in the middle of a run. Set "
         "that register to 0 with DYNAMIXEL Wizard 2.0."
     )
-    return _graded(not armed, "at switch-on", "torque switches on by itself" if armed else "torque stays off", fix)
+    return _graded(not armed, "at power-up", "torque switches on by itself" if armed else "torque stays off", fix)
 
 
 def _mode(_config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo) -> _Seen:
@@ -444,7 +444,7 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
             "A Sync Write goal did not arrive although the servo answers reads: try port.one_write = false; check "
             "for an adapter or hub that drops bytes, and for a second servo with this ID."
         )
-        yield Finding(Level.STOP, str(joint), "goals", "not taken", fix)
+        yield Finding(Level.STOP, str(joint), "goals", "not accepted", fix)
 
 
 def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:

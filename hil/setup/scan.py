@@ -40,8 +40,8 @@ class Found(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """The replies at one baud rate. Over TCP, it is the rate that the servos are set to, or the first one if none
-    answered.
+    """The replies at one baud rate. Over TCP, this is the rate that the servos are set to; if none answered, the
+    port's.
 
     trouble: description of a problem on the whole bus; empty if there is none.
     """

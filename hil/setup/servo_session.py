@@ -162,8 +162,8 @@ class ServoSession:
             self._kept[joint] = settings_file.keep(url, joint.id, model, settings, changed, since)
         except RunFolderError as error:
             self._say(
-                f"The settings of {joint} cannot be saved ({error}). If this program is killed, its Operating Mode "
-                f"{settings['Operating Mode']} and Current Limit must be restored by hand."
+                f"The settings of {joint} cannot be saved ({error}). If this program is killed, the servo's Operating "
+                f"Mode {settings['Operating Mode']} and Current Limit must be restored by hand."
             )
             self._kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")
 
@@ -177,7 +177,7 @@ class ServoSession:
         self.was_stopped = False
         self._say(
             f"THE ARM MOVES AGAIN IN {COUNT_DOWN_S:.0f} s: the previous run was stopped, but this command continues. "
-            f"Keep clear of the arm; Ctrl-C ends it now."
+            f"Keep clear of the arm; Ctrl-C ends this command now."
         )
         self.bus.wait_switched_off(self.bus.port.clock.now() + COUNT_DOWN_S)
 
@@ -226,7 +226,7 @@ class ServoSession:
         if off := [joint for joint in self._on_again if joint not in {*on, *silent}]:
             yield (
                 f"Another program switched torque on at {and_list(map(str, off))} while the settings were being "
-                "restored. It was cut again and was still off when it was read last of all. End that program before "
+                "restored. It was cut again and was still off when it was last read. End that program before "
                 "you reach into the arm: it may switch torque on again."
             )
 
@@ -279,8 +279,8 @@ class ServoSession:
                     now = self.bus.drives[joint].read(_DELAY)
             if now != before:
                 yield (
-                    f"{joint.title}: {_DELAY} was changed meanwhile from {2 * before} to {2 * now} us, by another "
-                    "program or a factory reset, which changes other settings too. To restore it: "
+                    f"{joint.title}: {_DELAY} was changed during this command from {2 * before} to {2 * now} us, by "
+                    "another program or a factory reset, which changes other settings too. To restore it: "
                     f"hil setup {self.bus.port.url} --id {joint.id} --return-delay-us {2 * before}"
                 )
 
@@ -303,8 +303,8 @@ class ServoSession:
                     "; the next start on this port then restores the goal" if cut and joint not in self._left else ""
                 )
                 yield (
-                    f"{joint.title}: {_PWM_LIMIT} was changed meanwhile from {before} to {now}, by another program "
-                    f"or a factory reset, and is left as it is{': ' if cut else ''}{', '.join(cut)}. "
+                    f"{joint.title}: {_PWM_LIMIT} was changed during this command from {before} to {now}, by another "
+                    f"program or a factory reset, and is left as it is{': ' if cut else ''}{', '.join(cut)}. "
                     f"To change it back, use DYNAMIXEL Wizard 2.0{later}."
                 )
 
@@ -320,9 +320,9 @@ class ServoSession:
                 with suppress(DriverError):
                     if (now := servo.read(name)) != before and servo.read(name) == now:
                         yield (
-                            f"{joint.title}: {name} was changed meanwhile from {before} to {now}, by another program "
-                            f"or a factory reset, and is left as it is. Set it back to {before} with DYNAMIXEL Wizard "
-                            "2.0 before the next start."
+                            f"{joint.title}: {name} was changed during this command from {before} to {now}, by another "
+                            f"program or a factory reset, and is left as it is. Set it back to {before} with DYNAMIXEL "
+                            "Wizard 2.0 before the next start."
                         )
 
     def _put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:

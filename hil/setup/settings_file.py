@@ -22,7 +22,7 @@ _LONGEST_NAME = 80
 class Kept:
     """Saved settings of one servo.
 
-    changed: the EEPROM registers that the program sets, with their values. program: its process ID.
+    changed: the EEPROM registers that the program sets, with their values. program: the program's process ID.
     """
 
     port: str
@@ -70,7 +70,7 @@ def keep(
 ) -> Kept:
     """Write the file of a servo; it is on disk when this function returns. Raises RunFolderError.
 
-    since: when these settings were saved first; by default, now.
+    since: when these settings were first saved; by default, now.
     """
     since = since or datetime.now().astimezone().isoformat(timespec="seconds")
     kept = Kept(port, servo_id, model, settings, changed, os.getpid(), since)

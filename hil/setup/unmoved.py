@@ -1,7 +1,8 @@
-"""Check that the arm stays in the pose in which it was first read until torque is switched on.
+"""Check that, until torque is switched on, the arm stays in the pose in which it was first read.
 
 Without torque, only a hand or gravity can move it. Any other change means that its readings are no longer correct: a
-horn slips, another servo answers, or another program changes Homing Offset. From then on every angle would be wrong.
+horn has slipped, another servo answers, or another program has changed Homing Offset. From then on every angle would be
+wrong.
 """
 
 import math

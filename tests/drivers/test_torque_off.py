@@ -126,7 +126,7 @@ def test_what_is_said_of_one_servo_of_two_and_of_those_without_a_watchdog() -> N
         "NOT CONFIRMED for JOINT 'B' (ID 2, XM430-W350). It is silent." in watched and "Bus Watchdog stops" in watched
     )
     unwatched = str(TorqueOff((first,), ((second, "It is silent."),), frozenset((second,))))
-    assert "NOTHING STOPS JOINT 'B' (ID 2, XM430-W350), which has no Bus Watchdog" in unwatched
+    assert "NOTHING STOPS JOINT 'B' (ID 2, XM430-W350): without a Bus Watchdog" in unwatched
 
 
 def test_a_reason_that_concerns_several_servos_is_given_once() -> None:

@@ -41,9 +41,9 @@ def layout_for(columns: int, name: int) -> Layout:
 
 
 class LiveView:
-    """Draws progress reports; stores values that are not in every sample: positions, temperatures and voltages.
+    """Draws progress reports; keeps the latest values of what a sample may lack: positions, temperatures and voltages.
 
-    Each run of a pilot starts over: its timing is not compared with the previous run's.
+    The timing statistics start afresh with each run of a pilot.
     """
 
     def __init__(self, config: Config, columns: int) -> None:

@@ -41,7 +41,7 @@ def test_a_run_differs_from_itself_in_nothing(identified: Path, capsys: pytest.C
     assert hil("diff", identified, identified) == 0
     said = capsys.readouterr().out
     assert "No significant changes" in said and "is compared with itself" in said
-    _, smallest, named = said.partition("Smallest change of each term")
+    _, smallest, named = said.partition("Smallest change in each term")
     assert smallest and "coulomb_1 " in named
 
 

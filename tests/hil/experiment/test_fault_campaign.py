@@ -98,7 +98,7 @@ CONTRADICTION = (
 )
 NO_TORQUE = "carries 0.000 instead of the commanded 0.300. Its torque is off."
 UNLIKE_ANY = (
-    "does not move like any arm consistent with the data. Its encoder has failed, something pushes or holds it."
+    "does not move like any arm consistent with the data. Its encoder has failed, something is pushing or holding it."
 )
 TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
 
@@ -109,8 +109,8 @@ TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
         (Kind.PUSHED, "state", UNLIKE_ANY, JUMP),
         (Kind.WEAK, "state", NO_TORQUE, CONTRADICTION),
         (Kind.LOWERED_LIMIT, "state", "its Current Limit is 236, but current_limit = 1.2 A needs 447", CONTRADICTION),
-        (Kind.DEAF, "state", "does not accept goals: some are lost. Goals are lost on the way.", CONTRADICTION),
-        (Kind.GOAL_FIGHT, "state", "Another program commands it.", "stands still. Something blocks it."),
+        (Kind.DEAF, "state", "does not accept goals: some are lost. Goals are being lost on the way.", CONTRADICTION),
+        (Kind.GOAL_FIGHT, "state", "Another program is commanding it.", "stands still. Something is blocking it."),
         (Kind.BIAS, "position", JUMP, NO_TORQUE),
         (Kind.BIAS, "current", NO_TORQUE, JUMP),
         (Kind.REPEAT, "state", TWICE, "its reply is another servo's."),

@@ -493,13 +493,13 @@ def test_the_supply_is_blamed_only_if_it_cannot_drive_more_at_this_speed(
     assert stop.cause is (Cause.OUT_OF_VOLTAGE if is_supply else Cause.GOALS_CHANGED)
     assert ("its supply cannot drive more" in said) == is_supply
     assert "its current sensor is wrong" in said
-    assert ("goals are changed on the way" in said) == (not is_supply)
+    assert ("goals are being changed on the way" in said) == (not is_supply)
     assert "carries 0.120 A instead of the commanded 0.300 A" in said
 
 
 def test_another_goal_in_the_servo_is_named_before_the_supply(arm: Arm) -> None:
     said = str(not_followed(Guard(arm()), 0.12, 3.6, volt=12.0, held=0.12))
-    assert "Its goal register reads 0.120 A" in said and "another program commands it" in said
+    assert "Its goal register reads 0.120 A" in said and "another program is commanding it" in said
     assert "supply" not in said
 
 

@@ -160,7 +160,7 @@ def test_a_setting_that_hardly_shows_in_the_motion_is_read_back(
         ports[0].bus.servos[2].memory.set(register, value)
 
     config, begun = arm(), once(change)
-    with pytest.raises(BusShared, match=rf"'elbow'.* is changed by another program: its {register} reads {value}, and"):
+    with pytest.raises(BusShared, match=rf"'elbow'.* was changed by another program: its {register} reads {value}, "):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, begun, plan)
     assert_stopped(ports[0])
 
@@ -177,7 +177,8 @@ def test_a_limit_that_another_program_lowered_is_the_cause_that_is_named(
     stop, _ = run_until_stopped(arm(), tmp_path / "run", once(lower), plan)
     assert str(stop).startswith("Another program changed the settings of a servo during the run (joint 'elbow'")
     assert f"{register} is {value} and was " in str(stop) and stop.overruled
-    unrestored = [line for line in stop.__notes__ if f"PWM Limit was changed meanwhile from 885 to {value}" in line]
+    changed = f"PWM Limit was changed during this command from 885 to {value}"
+    unrestored = [line for line in stop.__notes__ if changed in line]
     assert len(unrestored) == (register == "PWM Limit")
     assert not any("next hil identify" in line for line in stop.__notes__), "a promise that could not be kept"
     assert_stopped(ports[0])
@@ -198,7 +199,7 @@ def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
         said = run_experiment(config, run, config.path, lower, plan)
         assert ports[0].bus.servos[2].value(register) == 1193
     else:
-        with pytest.raises(ExperimentError, match="PWM Limit was changed meanwhile from 885 to 700") as stop:
+        with pytest.raises(ExperimentError, match="PWM Limit was changed during this command from 885 to 700") as stop:
             run_experiment(config, run, config.path, lower, plan)
         said = str(stop.value)
     assert "'elbow'" in said and str(value) in said
@@ -453,7 +454,7 @@ def test_an_arm_that_is_still_moving_when_the_rest_is_over(
 FALSE_VELOCITY = (
     r"'elbow' \(ID 2.* reports a velocity of 0\.\d\d rad/s before the start, but its position .* by 0\.000\d rad"
 )
-MOVES = r"^The arm is moving before the start: joint 'elbow'.* another program commands it, or something pushes"
+MOVES = r"^The arm is moving before the start: joint 'elbow'.* another program is commanding it, or something is push"
 
 
 @pytest.mark.parametrize(("before_the_end", "said"), [(20, FALSE_VELOCITY), (1, MOVES)])

@@ -30,7 +30,7 @@ def peaks(quantity: str, joint: int, typical: float, reached: float, *, torque: 
 def test_a_joint_that_sags_beyond_its_range_needs_a_wider_one_or_better_known_masses() -> None:
     said = limit_remedy(LEG, peaks("highest position", 2, 0.6, 1.4), STIFF)
     high = LEG.joints[2].position_limit[1]
-    assert f"a position_limit of {LEG.joints[2].name!r} with its upper end at {1.48 * high:.2f} rad" in said
+    assert f"a position_limit for {LEG.joints[2].name!r} with its upper end at {1.48 * high:.2f} rad" in said
     assert f"rest_pose {0.48 * high:.2f} rad farther from that end" in said
     assert said.endswith("([arm.prior] spread = 0.15 instead of 0.3)")
     assert "current_limit" not in said and "Hz" not in said
@@ -40,7 +40,7 @@ def test_masses_do_not_help_where_a_typical_arm_exceeds_the_limit_nor_torque_tha
     said = limit_remedy(LEG, peaks("velocity", 1, 1.1, 1.5, torque=1.0), STIFF)
     assert f"a velocity_limit of at least {1.6 * LEG.joints[1].velocity_limit:.2g} rad/s" in said
     assert "masses" not in said
-    assert f"a larger current_limit of {LEG.joints[1].name!r}" in said
+    assert f"a larger current_limit for {LEG.joints[1].name!r}" in said
 
 
 @pytest.mark.parametrize(("stiffness", "times"), [(0.2, 2.4), (0.8, 1.25)])

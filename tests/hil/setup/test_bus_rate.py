@@ -58,7 +58,7 @@ def test_a_slower_bus_does_not_and_says_so(tmp_path: Path) -> None:
     ("times", "fix"),
     [
         ([6e-3, 2e-3], ""),
-        ([6e-3, 6e-3], "Half of the exchanges are fast enough, so other programs may keep"),
+        ([6e-3, 6e-3], "Half of the exchanges are fast enough, so other programs may be keeping"),
         ([2e-3], ""),
     ],
 )

@@ -129,7 +129,7 @@ def test_a_return_delay_that_another_program_changed_is_named(arm: Arm, bench: B
         servo = bench.servos[2]
         servo.memory.store(servo.model.registers["Return Delay Time"], 250)
     said = str(stop.value)
-    assert "'elbow'" in said and "changed meanwhile from 0 to 500 us" in said and "--return-delay-us 0" in said
+    assert "'elbow'" in said and "during this command from 0 to 500 us" in said and "--return-delay-us 0" in said
     assert "'shoulder'" not in said
 
 
@@ -141,7 +141,8 @@ def test_a_setting_that_gives_angles_another_meaning_is_named_with_the_value_to_
         servo = bench.servos[2]
         servo.memory.store(servo.model.registers[name], value)
     said = str(stop.value)
-    assert f"{name} was changed meanwhile from 0 to {value}" in said and "Set it back to 0 with DYNAMIXEL" in said
+    assert f"{name} was changed during this command from 0 to {value}" in said
+    assert "Set it back to 0 with DYNAMIXEL" in said
     assert "'elbow'" in said and "'shoulder'" not in said
 
 
@@ -547,7 +548,7 @@ def _drop(_body: bytes, _now: float) -> None:
 @pytest.mark.parametrize(
     ("registers", "what"),
     [
-        ('{ "Startup Configuration" = 1 }', "at switch-on"),
+        ('{ "Startup Configuration" = 1 }', "at power-up"),
         ('{ "Drive Mode" = 1 }', "drive mode"),
         ('{ "PWM Limit" = 100 }', "PWM limit"),
     ],
