@@ -83,11 +83,12 @@ def store(past: Any, theta: Any, covariance: Any) -> None:
     count, head = theta.size, past[_SLOTS + 1]
     row = past[int(head[_NEXT])]
     at = 1 + 2 * (_ROW + count) + 4
-    row[:at] = past[_SLOTS, :at]
-    row[at : at + count] = theta
-    at += count
+    for i in range(at):  # element by element: assigning a slice takes 2 s to compile
+        row[i] = past[_SLOTS, i]
     for i in range(count):
-        row[at + i * count : at + (i + 1) * count] = covariance[i]
+        row[at + i] = theta[i]
+        for k in range(count):
+            row[at + (1 + i) * count + k] = covariance[i, k]
     head[_NEXT] = (head[_NEXT] + 1.0) % _SLOTS
     head[_STORED] = min(head[_STORED] + 1.0, float(_SLOTS))
 
