@@ -28,7 +28,7 @@ from hil.estimator.data.fourier import interpolated_noise, slow_part, white_nois
 
 __all__ = ["agreed_noise", "coloured_noise", "repeated_noise"]
 
-FEWEST = 32  # samples of a pass
+FEWEST = 20  # samples of a pass; at 20 Hz, half a period of 2 s
 ROUNDING = 1.0 / 12.0  # steps^2
 AGREE = 2.0  # standard errors
 _LINES = 8.0  # samples of a period per line that its noise is measured by

@@ -53,7 +53,22 @@ def test_missing_samples_are_bridged_and_single_passes_say_nothing() -> None:
     assert found is not None
     np.testing.assert_allclose(found / STEP, np.sqrt(1.0 / 12.0 + 0.34**2), rtol=0.12)
     assert repeated_noise([one], STEP) is None
-    assert repeated_noise([one[:, :20], other[:, :20]], STEP) is None
+    assert repeated_noise([one[:, :19], other[:, :19]], STEP) is None
+
+
+@pytest.mark.parametrize("std", [0.3, 1.5])
+def test_few_samples_suffice(std: float) -> None:
+    """At 20 Hz, half a period of 2 s has 20 samples, and the motion's own lines reach up to the Nyquist frequency."""
+    rng, turn = np.random.default_rng(7), 2.0 * np.pi * np.arange(20) / 20
+    found = []
+    for _ in range(100):
+        motion = 300.0 * np.sin(turn + rng.uniform(0.0, 6.0)) + 80.0 * np.sin(3.0 * turn + rng.uniform(0.0, 6.0))
+        three = [np.round(motion + std * rng.standard_normal((1, 20))) for _ in range(3)]
+        noise = repeated_noise(three, np.ones(1))
+        assert noise is not None
+        found.append(noise[0] / np.hypot(std, 12**-0.5))
+    assert np.median(found) == pytest.approx(1.0, abs=0.15)
+    assert np.quantile(found, 0.05) > 0.5 and np.quantile(found, 0.95) < 2.0
 
 
 @pytest.mark.parametrize("lost", [0.05, 0.15])
