@@ -12,6 +12,7 @@ from hil.estimator.errors import RecordingError
 from hil.recordings.clean import Rows, cleaned
 from hil.recordings.encoder import encoder_step
 from hil.recordings.guess import guessed, said
+from hil.recordings.missing_codes import without_codes
 from hil.recordings.plausible import refuse_degrees
 from hil.recordings.table import Table
 from hil.recordings.units import UNITS, unit_of, wrapped
@@ -119,6 +120,12 @@ def _quantity(
     """A column in SI units; notes: receives a sentence if it was corrected."""
     full, values, stated = table.find(name)
     unit = _unit(table, full, kind, stated, given)
+    values, code = without_codes(values)
+    if code is not None and notes is not None:
+        notes.append(
+            f"{table.source}: column {full!r} contains {code:g}, which is far from all its other values: these samples "
+            "are taken as missing."
+        )
     bits = wrapped(values, (32,) if kind == "position" else (16, 32))
     if bits is not None and notes is not None:
         values = np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values)

@@ -28,7 +28,7 @@ def read_csv_table(path: Path) -> Table:
         raise CsvError(f"{path}: two columns are named {sorted(double)[0]!r}; rename one of them.")
     fields = [(number, _split(line, delimiter)) for number, line in rows]
     units: dict[str, str] = {}
-    if fields and all(_is_unit(field) for field in fields[0][1]) and any(field.strip() for field in fields[0][1]):
+    if fields and _are_units(fields[0][1]):
         named = zip(header, fields[0][1], strict=False)
         units = {name: field.strip(" []()") for name, field in named if field.strip(" []()")}
         fields = fields[1:]
@@ -108,9 +108,11 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _is_unit(field: str) -> bool:
-    text = field.strip()
-    return not text or (unit_of(text.strip(" []()")) is not None and not text.isdigit())
+def _are_units(fields: list[str]) -> bool:
+    """Whether a line states units: at least one is known, and none of the others is a number."""
+    texts = [field.strip(" []()") for field in fields]
+    known = any(unit_of(text) is not None and not text.isdigit() for text in texts)
+    return known and not any(text and np.isfinite(_number(text, decimal_comma=True)) for text in texts)
 
 
 def _numbers(fields: list[str], decimal_comma: bool) -> Values:

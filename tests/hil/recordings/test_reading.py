@@ -17,6 +17,7 @@ from hil.estimator.data.recording import Recording
 from hil.recordings.convert import Converted, convert
 from hil.recordings.encoder import encoder_step
 from hil.recordings.files import read_tables
+from hil.recordings.missing_codes import without_codes
 from hil.recordings.periodic import mean_period
 from hil.recordings.units import split_head, unit_of, wrapped
 
@@ -336,6 +337,25 @@ def test_unsigned_ticks_and_currents_are_taken_as_signed_and_it_is_said(tmp_path
     assert recording.torque[0] == pytest.approx(np.array(current) * 1.5e-3)
     said = " ".join(found.notes)
     assert "column 'position [ticks]' wraps at 2^32" in said and "column 'current [mA]' wraps at 2^16" in said
+
+
+def test_a_code_for_missing_values_is_left_out_and_it_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "coded.csv"
+    position = [-999.0 if k in (50, 51, 200) else math.sin(0.05 * k) for k in range(400)]
+    rows = (f"{0.01 * k:.2f};{p};{math.sin(0.03 * k)}\n" for k, p in enumerate(position))
+    path.write_text("Zeit;Winkel;Moment\ns;Bogen;Nm\n" + "".join(rows), encoding="utf-8")  # one unit is unknown
+    given = {"time": "Zeit", "position": ["Winkel"], "torque": ["Moment"]}
+    found = convert(read_tables(path)[0], Columns(**given, position_unit="rad"))  # type: ignore[arg-type]
+    assert np.flatnonzero(np.isnan(found.recordings[0].position[0])).tolist() == [50, 51, 200]
+    assert "'Winkel' contains -999, which is far from all its other values" in " ".join(found.notes)
+    with pytest.raises(CsvError, match="states the unit 'Bogen', which is not one of rad"):
+        convert(read_tables(path)[0], Columns(**given))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("values", [[99.0, 99.0, 50.0, 10.0, 0.0], [-999.0, 1.0, 2.0, 3.0], [99.0] * 5])
+def test_values_among_others_single_ones_and_constants_are_no_codes(values: list[float]) -> None:
+    kept, code = without_codes(np.array(values))
+    assert kept.tolist() == values and code is None
 
 
 def test_rows_stamped_when_they_arrived_are_not_called_coarse(tmp_path: Path) -> None:
