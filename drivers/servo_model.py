@@ -53,7 +53,7 @@ LEAST_OF_MEASURED = 0.75
 """Used in place of `LEAST_SUPPLY` if the supply was measured: it may sag between two readings, and motors differ."""
 
 HARDLY_ANY, LEAST_SUPPLY_AT_NO_LOAD = 0.2, 0.85
-"""If a current is below the first of these fractions of its goal, torque may also be off. The second value then
+"""A current below the first fraction of its goal may also mean that torque is switched off. The second value then
 replaces `LEAST_OF_MEASURED` and `LEAST_SUPPLY`.
 """
 

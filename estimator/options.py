@@ -279,7 +279,7 @@ class SelectionOptions:
     wave_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))
     """Numbers of ripple and cogging cycles per turn that are tried."""
     max_wave_peaks: int = 3
-    """Maximum number of different cycles per turn from which fits with ripple or cogging are started."""
+    """Maximum number of spatial frequencies (cycles per turn) from which fits with ripple or cogging start."""
     wave_evidence: float = 0.05
     """Ripple or cogging is tried if the evidence in the score test is at least this.
 

@@ -80,7 +80,8 @@ def shared(what: str) -> BusShared:
     """Return the error for a bus with another active master; `what` describes what that master does."""
     return BusShared(
         f"Another master {what} on this bus, or the adapter echoes what this program sends. Two masters corrupt each "
-        "other's packets, and the other's goals would move the arm too: stop that program, or unplug that controller."
+        "other's packets, and the other master's goals would move the arm too. Stop the other program or unplug the "
+        "other controller; if there is none, switch off the adapter's echo."
     )
 
 

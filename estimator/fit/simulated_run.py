@@ -39,9 +39,10 @@ class SimulatedRun:
     max_substeps: int
     """Maximum number of substeps into which a step is divided near standstill."""
     pulled_to: Array | None = None
-    """Encoder readings at the angles to which springs pull the arm, held between samples (joints, samples) [rad].
+    """Targets of the springs that pull the arm, as encoder readings that are held constant between samples (joints,
+    samples) [rad].
 
-    By default, springs pull towards `measured`, regardless of encoder errors.
+    The default is `measured`, without correction for encoder errors.
     """
 
     @classmethod

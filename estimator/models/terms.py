@@ -70,7 +70,9 @@ OPTIONS: dict[Option, str] = {
 }
 """Optional parts of a model and their descriptions; also keys of `[model]`."""
 BEYOND_SPEEDS = 3.0
-"""Stribeck velocity, as a multiple of a joint's highest speed, at which the rise falls by no more than a tenth."""
+"""Stribeck velocity, as a multiple of a joint's highest speed, at which the Stribeck rise of friction decreases by no
+more than a tenth over the speeds of the recording.
+"""
 
 
 @dataclass(frozen=True)

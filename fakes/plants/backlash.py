@@ -155,7 +155,9 @@ class _Links:
 
     @property
     def lightness(self) -> float:
-        """Bound of the acceleration per torque at the joints in any pose [1/(kg m^2)]: trace over determinant."""
+        """Upper bound, over all poses, on the acceleration per unit of torque at the joints [1/(kg m^2)]: trace over
+        determinant of the mass matrix.
+        """
         if len(self.angle) == 1:
             return 1.0 / self._first
         bound = 0.0

@@ -8,8 +8,10 @@ from hil.drivers.servo_model import Mode
 
 
 def torque_limit(config: Config, samples: NDArray[np.void], index: int | None = None) -> str:
-    """Return the setting of the limit that joint `index`, or any joint, came closest to, and the fraction of it that
-    was used. Without a pilot, the setting is "", since the user gave peak_torque.
+    """Describe, for a message, the limit that the pilot approached most closely: its setting, and the fraction used.
+
+    index: the joint whose limits count; None for all joints. Returns "" without a pilot, because the user then gave
+    peak_torque.
     """
     if not config.experiment.pilot or not len(samples):
         return ""

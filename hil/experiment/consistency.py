@@ -6,8 +6,8 @@ velocity must equal the change in position. The difference,
     apart = position - integral of velocity,
 
 is tracked with two fading memories (leaky integrators): a short one, which reveals a sudden fault at once, and a long
-one, which reveals a gradual one. Rounding and encoder noise do not accumulate in it. The contributions of a healthy
-servo are known:
+one, which reveals a gradual one. Rounding and encoder noise do not accumulate in this difference. The contributions of
+a healthy servo are known:
 
 - a velocity that lags by tau, because the servo filters it: tau times the velocity, minus its mean over the memory. Any
   lag up to `LAG_S` is accepted;
@@ -18,9 +18,10 @@ servo are known:
 A reading that jumps back and forth, as with a stuck bit, cancels in those memories. Therefore each single interval is
 also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
 
-If the reported velocity stays exactly the same, it was the joint's true velocity all that time, except perhaps during
-the last `LAG_S`. The distance covered before that must therefore equal velocity times time. This detects a velocity
-that freezes near its peak sooner than the memories do, in which a lag could explain the difference.
+If a healthy servo reports exactly the same velocity for some time, the joint really moved at that velocity, except
+perhaps during the last `LAG_S`. The distance covered before that must therefore equal velocity times time; otherwise,
+the reported velocity is frozen. This detects a velocity that freezes near its peak sooner than the memories do, in
+which a lag could explain the difference.
 
 Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to twice the
 values estimated by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.

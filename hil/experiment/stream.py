@@ -43,7 +43,7 @@ from hil.setup.servo_session import has_moved
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
 _STILL_STEPS = 1
-"""Change of the position of a joint at rest, in encoder steps: it may lie between two of them."""
+"""Largest change in the reading of a joint at rest, in encoder steps: the joint may rest between two steps."""
 
 _BY_OTHER_GOALS = {
     *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED, Cause.UNEXPECTED),

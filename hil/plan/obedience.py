@@ -13,8 +13,8 @@ from typing import NamedTuple
 __all__ = ["Obedience", "Residual"]
 
 SUSPECT = 0.5, 5.0
-"""Range of the unexplained torque, relative to the commanded one, that a reversed motor may cause: ideally 2; less
-right after the reversal, more if its torque has just changed.
+"""Range of the ratio of unexplained to commanded torque that may indicate a reversed motor. Ideally the ratio is 2; it
+is smaller just after the motor has become reversed, and larger if the commanded torque has just changed.
 """
 
 ENOUGH = 0.45

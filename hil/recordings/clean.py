@@ -133,10 +133,15 @@ def _filled(source: str, rows: Rows, held: bool) -> Rows:
         row[~known] = row[before][~known] if held else np.interp(rows.time[~known], rows.time[known], row[known])
     notes = []
     if (hole & ~out).any():
-        notes.append(f"{source}: torque was filled in for {int((hole & ~out).sum())} rows that lack it.")
+        notes.append(f"{source}: torque was filled in where it is missing, in {_rows(hole & ~out)}.")
     if out.any():
-        notes.append(f"{source}: {int(out.sum())} rows without a torque were left out.")
+        notes.append(f"{source}: rows without a torque were left out, {_rows(out)}.")
     return Rows(rows.time, torque, rows.position, rows.notes).kept(~out, *notes)
+
+
+def _rows(chosen: NDArray[np.bool_]) -> str:
+    count = int(chosen.sum())
+    return f"{count} row" + "s" * (count != 1)
 
 
 def _apart(rows: Rows) -> list[Rows]:
