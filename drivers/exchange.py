@@ -303,13 +303,10 @@ class Exchange:
             raise ValueError(f"goals {list(goal_ticks)}: each must be a whole number from -32768 to 32767") from None
         self._sent.append(tuple(goal_ticks))
         before = self._now()
-        if self._echoes:
-            received = self._ask_behind_echo(goals, read, timeout, before)
-        elif self.one_write:
+        if self.one_write and not self._echoes:
             received = port.ask(goals + read.request, read.reply_size, timeout, before)
         else:
-            port.write(goals)
-            received = port.ask(read.request, read.reply_size, timeout, before)
+            received = self._ask_otherwise(goals, read, timeout, before)
         if port.overheard:
             self._overhear()
         servos = read.unpack(received)
@@ -388,14 +385,17 @@ class Exchange:
             self._cut_off = (self._cut_off + self._port.overheard)[-_LONGEST_REPLY:]
         self._port.overheard = b""
 
-    def _ask_behind_echo(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:
-        """Return the reply received through an adapter that echoes what is sent, with the echo removed."""
+    def _ask_otherwise(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:
+        """Return the reply if it takes two writes, or if the adapter echoes what is sent; the echo is removed."""
         port, sent = self._port, goals + read.request
+        expected = read.reply_size + (len(sent) if self._echoes else 0)
         if self.one_write:
-            received = port.ask(sent, len(sent) + read.reply_size, timeout, start)
+            received = port.ask(sent, expected, timeout, start)
         else:
             port.write(goals)
-            received = port.ask(read.request, len(sent) + read.reply_size, timeout, start)
+            received = port.ask(read.request, expected, timeout, start)
+        if not self._echoes:
+            return received
         if len(received) == read.reply_size and read.unpack(received) is not None:
             self._echoes = False  # an adapter that no longer echoes: waiting for it would make every cycle late
         return received.removeprefix(sent)
