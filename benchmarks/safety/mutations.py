@@ -47,7 +47,7 @@ TESTS = {
     "hil/plan/recent_motion.py": [f"{_EXPERIMENT}/test_brake.py", f"{_EXPERIMENT}/test_guard.py"],
     "hil/experiment/stream.py": [
         f"{_EXPERIMENT}/test_stream_schedule.py",
-        *(f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py", f"{_EXPERIMENT}/test_lowering.py"),
+        *(f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py"),
     ],
     "hil/drivers/exchange.py": [
         *("tests/drivers/test_exchange_cycles.py", "tests/drivers/test_heard_instead.py"),

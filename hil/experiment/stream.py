@@ -21,21 +21,20 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
-from hil.drivers.torque_off import TRIP_S
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.estimator.data.periodicity import correlation_of_changes, decay_of
 from hil.experiment.apart import opposed
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
-from hil.experiment.lowering import Lowering, may_lower
 from hil.experiment.model_watch import ModelWatch
 from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
+from hil.experiment.stopping.lowering import may_lower
+from hil.experiment.stopping.way_down import Stopped, WayDown
 from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
-from hil.plan.silence import BRIDGED_S
 from hil.plan.stabiliser import Stabiliser, must_balance
 from hil.runs.recording import Phase, Recorder, missed
 from hil.setup.servo_session import has_moved
@@ -55,9 +54,6 @@ _BRAKING_WATCHDOG_S = 0.04
 """Bus Watchdog while the arm is braked [s]: should the cable be unplugged meanwhile, the current of a brake must not
 flow for as long as that of an experiment might, whose next command may be late.
 """
-
-_LATE_REPLIES_S = 0.008
-"""How much longer replies are awaited while the arm is lowered [s]."""
 
 _FORGETS = 0.98
 """Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
@@ -119,7 +115,10 @@ class Stream:
             if not isinstance(arms, ChainArms) and not config.is_chain
             else ChainWatch(config, planned, arms if isinstance(arms, ChainArms) else None, self._apart)
         )
-        self._lowering = Lowering(config, plan, self._apart) if config.is_chain else None
+        self._way_down: WayDown | None = None
+        if config.is_chain:
+            model = self._model if isinstance(self._model, ChainWatch) else None
+            self._way_down = WayDown(bus, plan, config, recorder, stop, note, self._guard, model)
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
@@ -166,8 +165,9 @@ class Stream:
             if isinstance(error, SafetyStop) and error.cause in _BY_OTHER_GOALS and self._bus.commanded_by_another:
                 error.add_note(self._bus.commanded_by_another)
                 error.overruled = True
-            if self._lowering is not None and may_lower(self._config, error):
-                self._lower(self._lowering, error)
+            if self._way_down is not None and may_lower(self._config, error):
+                stopped = Stopped(self._state, self._whole, self._goal, self._sent_at, self._segment)
+                self._way_down.lower(error, stopped)
             elif may_brake(self._config, error):
                 self._brake()
             raise
@@ -424,66 +424,6 @@ class Stream:
                 if number == 0:
                     self._bus.shorten_watchdogs(_BRAKING_WATCHDOG_S)
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
-
-    def _lower(self, lowering: Lowering, error: ExperimentError) -> None:
-        """Brake and lower the arm until it is at rest, a check fails, or a second signal arrives. Never raises."""
-        state = self._whole
-        if state is None or self._state is None or any(self._state.error) or lowering.lies(state):
-            return
-        if self._is_blind and self._clock.now() - state.time_before_write > BRIDGED_S:
-            return
-        since = 0.0 if self._sent_at is None else self._clock.now() - self._sent_at
-        if self._bus.is_watched and since >= self._safety.watchdog + TRIP_S:
-            self._told(error, "The arm could not be lowered: the servos' watchdogs had already acted, so it fell.")
-            return
-        self._note(f"lowering the arm after: {error}")
-        # The deadlines missed so far are not those of the way down.
-        self._ticks = FixedRate(self._clock, self._plan.rate)
-        self._deadline, self._sent_at = None, self._clock.now()
-        try:
-            state = self._way_down(lowering, state)
-        except (SafetyStop, StopRequested, DriverError) as ended:
-            self._told(error, f"Torque was cut while the arm was being lowered, so it fell from there: {ended}")
-            return
-        elsewhere = lowering.lies_elsewhere(state)
-        done = f"was lowered, but not to its rest pose: {elsewhere}" if elsewhere else "was lowered to its rest pose"
-        self._told(error, f"The arm {done}.")
-
-    def _way_down(self, lowering: Lowering, state: State) -> State:
-        """Follow the path home; return the last state. Raises SafetyStop, StopRequested, DriverError."""
-        asked = max(1, self._stop.count)
-        watch = self._model if isinstance(self._model, ChainWatch) else None
-        # Replies that are merely late are worth a missed deadline: without them, nothing corrects the way down.
-        self._exchange.wait_longer(_LATE_REPLIES_S)
-        # The path begins with the latest state that is known, which may be a few exchanges old.
-        passed = round((self._clock.now() - state.time_before_write) / self._interval) if self._is_blind else 0
-        for index in range(passed, lowering.begin(state, self._goal, self._guard.recent, watch)):
-            for checked in self._between_samples() if index > passed else ():
-                lowering.look(index - 1, checked, checked.time_before_write - state.time_before_write, between=True)
-                state = checked
-            self._look_for_another_master(self._interval)
-            deadline, now, late = self._ticks.wait()
-            self._deadline = deadline
-            self._stop.check_again(asked)
-            if late:
-                self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, missed(self._goal, now))
-                lowering.late(now - (deadline if self._sent_at is None else self._sent_at))
-                continue
-            self._goal = lowering.goals(index, state)
-            former, state = state.time_before_write, self._bus.exchange(self._goal)
-            self._sent_at = state.time_before_write
-            self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, state)
-            lowering.look(index, state, state.time_before_write - former)
-        return state
-
-    @property
-    def _is_blind(self) -> bool:
-        """Whether replies were missing in the latest exchange."""
-        return self._state is not None and any(self._state.missing)
-
-    def _told(self, error: ExperimentError, what: str) -> None:
-        error.add_note(what)
-        self._note(what)
 
     def _silence(self, samples: int) -> NDArray[np.float64]:
         return np.zeros((samples, len(self._bus.joints)))
