@@ -43,10 +43,11 @@ TESTS = {
     "hil/experiment/deadlines.py": [f"{_EXPERIMENT}/test_deadlines.py"],
     "hil/experiment/stop_request.py": [f"{_EXPERIMENT}/test_stop_request.py"],
     "hil/plan/silence.py": [f"{_EXPERIMENT}/test_deadlines.py"],
-    "hil/plan/brake.py": [f"{_EXPERIMENT}/test_brake.py"],
-    "hil/plan/recent_motion.py": [f"{_EXPERIMENT}/test_brake.py", f"{_EXPERIMENT}/test_guard.py"],
+    "hil/plan/brake.py": ["tests/hil/plan/test_brake.py"],
+    "hil/plan/recent_motion.py": ["tests/hil/plan/test_brake.py", f"{_EXPERIMENT}/test_guard.py"],
+    "hil/experiment/pace.py": [f"{_EXPERIMENT}/stream/test_stream_schedule.py"],
     "hil/experiment/stream.py": [
-        f"{_EXPERIMENT}/test_stream_schedule.py",
+        f"{_EXPERIMENT}/stream/test_stream_schedule.py",
         *(f"{_EXPERIMENT}/test_run.py", f"{_EXPERIMENT}/test_guard_stops.py"),
     ],
     "hil/drivers/exchange.py": [
