@@ -12,7 +12,7 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
-from hil.drivers.torque_off import TRIP_S
+from hil.drivers.torque.off import TRIP_S
 from hil.errors import ExperimentError, SafetyStop, StopRequested
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard

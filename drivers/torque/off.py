@@ -114,7 +114,7 @@ class TorqueOff:
         if self.unconfirmed:
             told.append(self._outcome_alone())
         elif self.confirmed:
-            told.append(f"Torque is off, read back, on {and_list(map(str, self.confirmed))}.")
+            told.append(f"Torque is off on {and_list(map(str, self.confirmed))}, confirmed by reading it back.")
         return " ".join(told)
 
     def _outcome_alone(self) -> str:

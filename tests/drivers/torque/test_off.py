@@ -12,7 +12,7 @@ from hil.drivers.errors import DriverError, NoReply, PortLost
 from hil.drivers.joint import Joint
 from hil.drivers.packet import BROADCAST_ID, Instruction, encode
 from hil.drivers.servo_model import Mode, servo_model
-from hil.drivers.torque_off import (
+from hil.drivers.torque.off import (
     TorqueOff,
     and_list,
     by_reason,
