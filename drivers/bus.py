@@ -11,7 +11,6 @@ from hil.drivers.others.heard import MOST_MIXED_UP, MOST_STRANGERS
 from hil.drivers.packet import ALERT
 from hil.drivers.port import Port, open_port
 from hil.drivers.preparation.cadence import CHECK_S, cadence
-from hil.drivers.preparation.hold import let_sink, refuse_held
 from hil.drivers.preparation.prepare import (
     check_quiet,
     learn_latency,
@@ -23,6 +22,7 @@ from hil.drivers.servo import Servo
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
 from hil.drivers.state import NAN, SETTINGS, Converter, State, fold, read_back_spans, spans
 from hil.drivers.sync_read import Answer
+from hil.drivers.torque.held import let_sink, refuse_held
 from hil.drivers.torque.switch import TorqueSwitch
 
 __all__ = ["CHECK_S", "BusConfig", "ServoBus"]

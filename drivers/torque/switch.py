@@ -7,10 +7,10 @@ from hil.drivers.errors import BusShared, DriverError, ServoFault, ServoRefused,
 from hil.drivers.joint import Joint
 from hil.drivers.packet import HardwareError
 from hil.drivers.port import Port
-from hil.drivers.preparation.hold import switched_on
 from hil.drivers.preparation.prepare import fault_text, shuts_down
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import WATCHDOG_UNIT, Mode
+from hil.drivers.torque.held import switched_on
 from hil.drivers.torque.off import (
     TorqueOff,
     cut_again,
