@@ -1,47 +1,31 @@
-"""The servos of one arm on one port: preparation, the control cycle, and torque off afterwards."""
+"""The servos of one arm on one port: preparation and the control cycle; torque is switched by `hil.drivers.torque`."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from hil.drivers.control_table import load_control_table, model_names
-from hil.drivers.errors import BusShared, DriverError, ServoFault, ServoRefused, TorqueNotOff, WrongModel, WrongReply
+from hil.drivers.errors import ServoFault, WrongModel, WrongReply
 from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
 from hil.drivers.others.heard import MOST_MIXED_UP, MOST_STRANGERS
-from hil.drivers.packet import ALERT, HardwareError
+from hil.drivers.packet import ALERT
 from hil.drivers.port import Port, open_port
 from hil.drivers.preparation.cadence import CHECK_S, cadence
-from hil.drivers.preparation.hold import let_sink, refuse_held, switched_on
 from hil.drivers.preparation.prepare import (
     check_quiet,
-    fault_text,
     learn_latency,
     overruled,
     prepare_servo,
     shared,
-    shuts_down,
 )
-from hil.drivers.servo import Servo, describe_error
-from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, WATCHDOG_UNIT, Mode, with_article
+from hil.drivers.servo import Servo
+from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
 from hil.drivers.state import NAN, SETTINGS, Converter, State, fold, read_back_spans, spans
 from hil.drivers.sync_read import Answer
-from hil.drivers.torque_off import (
-    TorqueOff,
-    cut_again,
-    cut_torque,
-    disarm_watchdogs,
-    is_torque_on,
-    signals_held_back,
-    tell_torque_off,
-    tell_watchdogs,
-    was_rebooted,
-)
+from hil.drivers.torque.held import let_sink, refuse_held
+from hil.drivers.torque.switch import TorqueSwitch
 
 __all__ = ["CHECK_S", "BusConfig", "ServoBus"]
-
-WATCH_S = 0.1
-"""Interval at which Torque Enable is read while the arm must be without torque [s]."""
 
 _PROBES = 3
 """Unanswered Fast Sync Reads after which Sync Read is used instead."""
@@ -82,7 +66,7 @@ class BusConfig:
         return (self.url, self.baud, self.joints) == (other.url, other.baud, other.joints)
 
 
-class ServoBus:
+class ServoBus(TorqueSwitch):
     """The servos of an arm on an open port. Use as a context manager; `close` may be called twice.
 
         with ServoBus.open(BusConfig("/dev/ttyUSB0", 1_000_000, joints)) as bus, bus.torque(watchdog=0.1):
@@ -92,16 +76,15 @@ class ServoBus:
     """
 
     def __init__(self, port: Port, config: BusConfig) -> None:
-        self.port = port
+        drives = tuple(drive for joint in config.joints for drive in joint.drives)
+        tables = {drive: load_control_table(drive.servo.name) for drive in drives}
+        super().__init__(port, {drive: Servo(port, drive.id, tables[drive], drive.title) for drive in drives})
         self.config = config
         self.joints = config.joints
-        self._drives = tuple(drive for joint in self.joints for drive in joint.drives)
+        self._drives = drives
         """One entry per servo, each a joint with a single servo."""
         self._of = tuple(index for index, joint in enumerate(self.joints) for _ in joint.drives)
         self._in_pairs = len(self._drives) > len(self.joints)
-        self._servos = {
-            drive: Servo(port, drive.id, load_control_table(drive.servo.name), drive.title) for drive in self._drives
-        }
         self._measured = self._drives
         """The entries of `_drives`, with their zeros shifted to the present turn by `prepare`."""
         self._exchange: Exchange | None = None
@@ -109,12 +92,7 @@ class ServoBus:
         """Number of exchanges per sample, at most CHECK_S apart if the bus is fast enough; set by `prepare`.
         """
         self._converter = Converter(self._drives, [NAN] * len(self._drives))
-        self._without_watchdog: set[Joint] = set()
-        self._watchdog = 0.0
-        self._armed: set[Joint] = set()
-        """Servos whose Bus Watchdog has been armed and not disarmed since."""
         self._last_answers: Sequence[Answer] = ()
-        self.torque_off_report: TorqueOff | None = None
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
@@ -155,14 +133,13 @@ class ServoBus:
         """Return the joint's servo (the first if it has several), for reading and writing registers."""
         return self.servos(joint)[0]
 
-    @property
-    def drives(self) -> Mapping[Joint, Servo]:
-        """All servos, each keyed by a single-servo joint from `Joint.drives`, in bus order."""
-        return self._servos
-
     def servos(self, joint: Joint) -> tuple[Servo, ...]:
         """Return all servos of a joint, in the order of its `drives`."""
         return tuple(self._servos[drive] for drive in joint.drives)
+
+    def _silent(self) -> set[Joint]:
+        answers = zip(self._drives, self._last_answers, strict=False)
+        return {drive for drive, answer in answers if answer is None or len(answer) == 1}
 
     def check_identity(self) -> None:
         """Ping every servo and compare its model and firmware with the configuration; raises NoReply, WrongModel.
@@ -205,31 +182,6 @@ class ServoBus:
         if self.config.take_over:
             let_sink(self._servos, self.port.clock)
         refuse_held(self._servos)
-
-    def refuse_switched_on(self) -> None:
-        """Check that torque is still off, after this program has found it off or switched it off.
-
-        If it is on, another program has switched it on: torque is cut on all servos. Raises BusShared, or TorqueNotOff.
-        """
-        if not (found := switched_on(self._servos)):
-            return
-        try:
-            raise BusShared(
-                f"{found}: torque was off and has been switched on by another program, which is driving the arm. End "
-                "that program, or unplug its controller, then start again."
-            )
-        finally:
-            report = self.torque_off()
-            if report.unconfirmed:
-                raise TorqueNotOff(str(report))
-
-    def wait_switched_off(self, until: float) -> None:
-        """Wait until `until` [s, on the port's clock] and call `refuse_switched_on` at least every WATCH_S."""
-        clock = self.port.clock
-        self.refuse_switched_on()
-        while (now := clock.now()) < until:
-            clock.wait_until(min(until, now + WATCH_S))
-            self.refuse_switched_on()
 
     def prepare(self) -> None:
         """Set every servo's mode with torque off, and prepare the exchange.
@@ -380,11 +332,6 @@ class ServoBus:
         return self.prepared.heard.advice(self.port.clock.now(), self.port.url)
 
     @property
-    def is_watched(self) -> bool:
-        """Whether the watchdog of any servo is armed."""
-        return bool(self._armed)
-
-    @property
     def commanded_by_another(self) -> str:
         """Which servo held a value that this program did not write when goals were last read back; "" if none did.
 
@@ -417,137 +364,6 @@ class ServoBus:
         """Return the faults of a joint's servos after one of them has raised its alert."""
         texts = [self._fault(drive, alone=len(joint.drives) == 1) for drive in joint.drives]
         return " ".join(filter(None, texts))
-
-    def _fault(self, drive: Joint, *, alone: bool = True) -> str:
-        """Return the fault of one servo as text, or "" if it reports none and may not be the one that raised the alert.
-
-        alone: the joint has no other servo, so the alert is certainly this one's.
-        """
-        try:
-            error = self._servos[drive].hardware_error()
-            cause = describe_error(error)
-        except DriverError as problem:
-            return fault_text(drive, f"unknown; it could not be read ({problem})")
-        cuts = True
-        with suppress(DriverError):
-            cuts = not error or shuts_down(self._servos[drive], error)
-        return fault_text(drive, cause, shuts_down=cuts) if alone or error else ""
-
-    @contextmanager
-    def torque(self, watchdog: float) -> Iterator[None]:
-        """Switch torque on for the block and off afterwards, however the block is left.
-
-        watchdog: time without packets after which a servo stops by itself [s] (in steps of 20 ms, at most 2.54 s).
-        Raises BusShared if another program has switched torque on; TorqueNotOff on exit if torque off could not be
-        confirmed; `torque_off_report` lists the servos.
-        """
-        self.refuse_switched_on()
-        self.torque_off_report = None
-        try:
-            self._torque_on(watchdog)
-            yield
-        finally:
-            # No statement may stand between `finally` and `try`, so that an interrupt before torque_off is caught here.
-            try:
-                report = self.torque_off()
-            except BaseException:
-                if self.torque_off_report is None:
-                    self.torque_off()
-                raise
-            if report.unconfirmed:
-                raise TorqueNotOff(str(report))
-
-    def _torque_on(self, watchdog: float) -> None:
-        ticks = round(watchdog / WATCHDOG_UNIT)
-        if not 1 <= ticks <= 127:
-            raise ValueError(f"watchdog must be 0.02 to 2.54 s, not {watchdog}")
-        self._watchdog = watchdog
-        for joint, servo in self._servos.items():
-            watched = joint not in self._without_watchdog
-            if watched:
-                servo.write("Bus Watchdog", 0)
-            # A change of Operating Mode leaves Goal Current at Current Limit, so it is zeroed before torque is on.
-            servo.write("Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM", 0)
-            if watched:
-                servo.write("Bus Watchdog", ticks)
-                self._armed.add(joint)
-        for joint, servo in self._servos.items():
-            try:
-                servo.write("Torque Enable", 1)
-            except ServoRefused:
-                if servo.hardware_error() != HardwareError(0):
-                    raise ServoFault(self._fault(joint)) from None
-                raise
-
-    def torque_off(self) -> TorqueOff:
-        """Cut torque on every servo and read it back (`hil.drivers.torque_off`). All servos are tried, whatever fails.
-
-        Signals are held back meanwhile; an interrupt that still arrives is raised once all servos have been tried and
-        `torque_off_report` is set.
-        """
-        interrupts: list[BaseException] = []
-        with signals_held_back():
-            silent = {
-                drive
-                for drive, answer in zip(self._drives, self._last_answers, strict=False)
-                if answer is None or len(answer) == 1
-            }
-            confirmed, unconfirmed = cut_torque(self.port, self._servos, silent, self._watchdog, interrupts)
-            fell_silent = {joint: self._servos[joint] for joint in confirmed if joint in silent & self._armed}
-            rebooted = frozenset(joint for joint, servo in fell_silent.items() if was_rebooted(servo))
-            watched = {joint: self._servos[joint] for joint in confirmed if joint not in self._without_watchdog}
-            disarm_watchdogs(watched, interrupts)
-            self._armed.difference_update(watched)
-            unwatched = frozenset(self._without_watchdog)
-            self.torque_off_report = TorqueOff(confirmed, unconfirmed, unwatched, rebooted=rebooted)
-        if interrupts:
-            raise interrupts[0]
-        return self.torque_off_report
-
-    def shorten_watchdogs(self, seconds: float) -> None:
-        """Shorten the armed Bus Watchdogs to `seconds` [s], if they are longer, until torque is off.
-
-        Nothing is read back: a servo that misses the packet keeps its former time.
-        """
-        if seconds < self._watchdog:
-            tell_watchdogs(self.port, {drive: self._servos[drive] for drive in self._armed}, seconds)
-
-    def repeat_torque_off(self) -> None:
-        """Send torque off to all servos once more without waiting for an answer, in case a silent servo receives it."""
-        tell_torque_off(self.port, self._servos)
-
-    def torque_now(self) -> dict[Joint, bool | None]:
-        """Read whether torque is on at each servo that is not reported as unconfirmed; None where that is unknown."""
-        report = self.torque_off_report
-        unconfirmed = set() if report is None else {joint for joint, _ in report.unconfirmed}
-        return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
-
-    def cut_again(self, on: Collection[Joint]) -> None:
-        """Cut torque that another program has switched on since `torque_off`; `torque_now` then shows the outcome."""
-        interrupts: list[BaseException] = []
-        with signals_held_back():
-            cut_torque(self.port, {joint: self._servos[joint] for joint in on}, (), 0.0, interrupts)
-        if interrupts:
-            raise interrupts[0]
-
-    def report_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> None:
-        """Let `torque_off_report` say that another program keeps torque on (`TorqueOff.with_driven`)."""
-        report = self.torque_off_report or TorqueOff(tuple(self._servos), ())
-        self.torque_off_report = report.with_driven(on, silent)
-
-    def confirm_later(self, drive: Joint) -> bool:
-        """Cut the torque of a servo (a key of `drives`) that `torque_off` could not confirm as off, and read it back.
-
-        Returns False if there was nothing to do; otherwise `torque_off_report` then lists the servo as confirmed.
-        Raises DriverError if the servo still does not answer.
-        """
-        report = self.torque_off_report
-        if report is None or drive not in [joint for joint, _ in report.unconfirmed]:
-            return False
-        rebooted = cut_again(self._servos[drive], armed=drive in self._armed)
-        self._armed.discard(drive)
-        self.torque_off_report = report.with_later(drive, rebooted=rebooted)
-        return True
 
 
 def _knows_fast_sync_read(joint: Joint, servo: Servo) -> bool:

@@ -16,6 +16,7 @@ import math
 import struct
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -111,7 +112,7 @@ class Exchange:
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
         ]
-        self._pack = self._writes[0].pack if len(self._writes) == 1 else self._pack_each
+        self._write = self._writes[0] if len(self._writes) == 1 else None
         every = [*spans] if status is None else [*spans, status]
         self._kinds = len(every)
         every += _of_other_lengths(every, len(self.ids))
@@ -127,6 +128,7 @@ class Exchange:
                 max(self._timeout(read, return_delay), least),
                 self._wire_s[read],
                 0.5 * self._wire_s[read],
+                span >= self._kinds,
             )
             for span, read in enumerate(reads)
         ]
@@ -137,14 +139,12 @@ class Exchange:
         self._until_slow = slow_every
         self._slow = 0
         self._late_possible = False
-        self._collided = False
-        """Whether a late reply may have been on the wire, and destroyed the latest goals, when they were sent."""
         self._after_loss = 0
         self._cut_off = b""
         """The part of a reply that had been received when time was up in the latest exchange."""
         self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
-        self._off_wire = math.inf
-        """Duration of the latest cycle without its wire time [s]."""
+        self._took = math.inf
+        """Duration of the latest cycle [s]."""
         self._usual = self._latest_plan = self._plans[0]
         self._read_back: ReadBack | None = None
         self.read_back_at = math.inf
@@ -171,7 +171,7 @@ class Exchange:
     def wait_longer(self, seconds: float) -> None:
         """Wait this much longer [s] for missing replies from now on: they may merely be late."""
         is_usual = self._latest_plan is self._usual
-        self._plans = [plan._replace(timeout=plan.timeout + seconds) for plan in self._plans]
+        self._plans = [replace(plan, timeout=plan.timeout + seconds) for plan in self._plans]
         self._usual = self._plans[0]
         self._latest_plan = self._usual if is_usual else self._latest_plan
 
@@ -235,7 +235,8 @@ class Exchange:
 
     def _takes(self, read: GroupRead, back: ReadBack) -> float:
         """Longest time that a read-back is expected to take [s]."""
-        return self._wire_s[read] + max(self._off_wire, back.longest)
+        off_wire = self._took - self._latest_plan.wire_s
+        return self._wire_s[read] + max(off_wire, back.longest)
 
     def _held(self, back: ReadBack, due: float) -> Overruled | None:
         """Read back once if that is possible before `due` [s]."""
@@ -267,7 +268,7 @@ class Exchange:
                 self.read_back_at = now + TRY_AGAIN_S  # a late reply costs the next cycle time
         else:
             back.took(min(now - before, 2.0 * takes) - self._wire_s[read])
-        found = back.look(servos, self._sent, now, collided=self._collided)
+        found = back.look(servos, self._sent, now, collided=self._latest_plan.is_after_loss)
         if back.is_unexpected:
             self.read_status_next()  # it distinguishes lost goals from another master's
         return found
@@ -284,25 +285,28 @@ class Exchange:
         if not between:
             self._until_slow -= 1
         self._until_status -= 1
-        self._collided = self._late_possible
         if self._until_status > 0 and (self._until_slow > 0 or between) and not self._late_possible:
             plan = self._usual
         else:
             plan = self._plans[self._other_span(between)]
-        read, span, timeout, wire_s, soonest = plan
+        read, timeout = plan.read, plan.timeout
+        write = self._write
         try:
-            goals = self._pack(goal_ticks)
+            if write is None:
+                goals = self._pack_each(goal_ticks)
+            else:  # as `_GoalWrite.pack`, without its frame
+                fields = write.fields
+                fields[2::2] = goal_ticks
+                goals = write.pack_fields(*fields)
+                goals += _pack_crc(_crc(goals))
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)}: each must be a whole number from -32768 to 32767") from None
         self._sent.append(tuple(goal_ticks))
         before = self._now()
-        if self._echoes:
-            received = self._ask_behind_echo(goals, read, timeout, before)
-        elif self.one_write:
+        if self.one_write and not self._echoes:
             received = port.ask(goals + read.request, read.reply_size, timeout, before)
         else:
-            port.write(goals)
-            received = port.ask(read.request, read.reply_size, timeout, before)
+            received = self._ask_otherwise(goals, read, timeout, before)
         if port.overheard:
             self._overhear()
         servos = read.unpack(received)
@@ -312,12 +316,12 @@ class Exchange:
             after = self._now()
             if None in servos:
                 self._late_possible = True
-        elif after - before < soonest and self._doubts:
+        elif after - before < plan.soonest and self._doubts:
             servos = self._latest(read, servos, before + timeout)
             after = self._now()
-        self._off_wire = after - before - wire_s
+        self._took = after - before
         self._latest_plan = plan
-        return _reply((before, after, span, servos))
+        return _reply((before, after, plan.span, servos))
 
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
         """Handle replies that arrive sooner than the wire allows: they may belong to an earlier request.
@@ -381,14 +385,17 @@ class Exchange:
             self._cut_off = (self._cut_off + self._port.overheard)[-_LONGEST_REPLY:]
         self._port.overheard = b""
 
-    def _ask_behind_echo(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:
-        """Return the reply received through an adapter that echoes what is sent, with the echo removed."""
+    def _ask_otherwise(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:
+        """Return the reply if it takes two writes, or if the adapter echoes what is sent; the echo is removed."""
         port, sent = self._port, goals + read.request
+        expected = read.reply_size + (len(sent) if self._echoes else 0)
         if self.one_write:
-            received = port.ask(sent, len(sent) + read.reply_size, timeout, start)
+            received = port.ask(sent, expected, timeout, start)
         else:
             port.write(goals)
-            received = port.ask(read.request, len(sent) + read.reply_size, timeout, start)
+            received = port.ask(read.request, expected, timeout, start)
+        if not self._echoes:
+            return received
         if len(received) == read.reply_size and read.unpack(received) is not None:
             self._echoes = False  # an adapter that no longer echoes: waiting for it would make every cycle late
         return received.removeprefix(sent)
@@ -408,12 +415,13 @@ class Exchange:
         return sum(write.size for write in self._writes) + len(read.request) + read.reply_size
 
 
-class _Plan(NamedTuple):
+@dataclass(frozen=True)
+class _Plan:
     """One of the group reads of an exchange.
 
     span: the span that a Reply reports. timeout: how long to wait for the replies [s]. wire_s: wire time of goals,
     request and replies [s]. soonest: time after the start of a cycle before which a complete reply may belong to an
-    earlier request [s].
+    earlier request [s]. is_after_loss: whether a late reply may be on the wire, and destroy the goals, when it is sent.
     """
 
     read: GroupRead
@@ -421,6 +429,7 @@ class _Plan(NamedTuple):
     timeout: float
     wire_s: float
     soonest: float
+    is_after_loss: bool
 
 
 class _GoalWrite:
@@ -429,10 +438,10 @@ class _GoalWrite:
     def __init__(self, goal: Register, ids: Sequence[int], places: Sequence[int]) -> None:
         # A two-byte value between ID bytes (at most 252) can never hold FF FF FD: the goals are never stuffed.
         packet = struct.Struct("<12s" + "Bh" * len(places))
-        self._pack = packet.pack
-        self._fields: list[bytes | int] = [_front(goal, len(places))]
+        self.pack_fields = packet.pack
+        self.fields: list[bytes | int] = [_front(goal, len(places))]
         for place in places:
-            self._fields += [ids[place], 0]
+            self.fields += [ids[place], 0]
         self.places = tuple(places)
         self.size = packet.size + 2
 
@@ -440,9 +449,9 @@ class _GoalWrite:
         """Return the packet for these goals, one per servo of the subset; raises struct.error for one that is too
         large, ValueError or struct.error for a wrong number of goals.
         """
-        fields = self._fields
+        fields = self.fields
         fields[2::2] = goal_ticks
-        packet = self._pack(*fields)
+        packet = self.pack_fields(*fields)
         return packet + _pack_crc(_crc(packet))
 
 

@@ -17,6 +17,7 @@ from hil.drivers.clock import Clock, WallClock
 from hil.drivers.errors import NotPermitted, PortLost, PortNotOpened
 from hil.drivers.latency import WANTED_MS, adapter_latency, latency_timer, read_latency_ms, write_latency_ms
 
+_now = time.perf_counter
 _FAILURES = (OSError, termios.error)
 # OSError covers SerialException. An unplugged cable makes flushing the input raise termios.error, which is no OSError.
 
@@ -214,7 +215,7 @@ class DescriptorPort(Port):
 
     def read(self, count: int, timeout: float) -> bytes:
         try:
-            return self._read_on(b"", count, time.perf_counter() + timeout)
+            return self._read_on(b"", count, _now() + timeout)
         except (OSError, ValueError) as error:  # ValueError: closed
             raise self._lost(error) from error
 
@@ -232,7 +233,7 @@ class DescriptorPort(Port):
             received = b""
             if self._wait_ms(int(timeout * 1e3)):
                 early_until = start + _EARLY_BITS * len(data) / self.baud
-                if time.perf_counter() < early_until:
+                if _now() < early_until:
                     if not looks:
                         return self._ask_behind_pending(count, early_until, start + timeout)
                     if looks <= _LOOKS:
@@ -259,8 +260,8 @@ class DescriptorPort(Port):
     def _ask_behind_pending(self, count: int, early_until: float, deadline: float) -> bytes:
         """Keep apart what arrives before the request can have been transmitted, then read the reply as `ask` does."""
         self._looks = _LOOKS_AFTER_LOSS
-        while select.select([self._descriptor], [], [], max(0.0, deadline - time.perf_counter()))[0]:
-            is_early = time.perf_counter() < early_until
+        while select.select([self._descriptor], [], [], max(0.0, deadline - _now()))[0]:
+            is_early = _now() < early_until
             received = os.read(self._descriptor, count)
             self._check_alive(received)
             if not is_early:
@@ -287,7 +288,7 @@ class DescriptorPort(Port):
     def _read_on(self, received: bytes, count: int, deadline: float) -> bytes:
         """Read the rest of a fragmented reply. Uses select because poll only has a resolution of one millisecond."""
         while len(received) < count:
-            remaining = max(0.0, deadline - time.perf_counter())
+            remaining = max(0.0, deadline - _now())
             if not select.select([self._descriptor], [], [], remaining)[0]:
                 break
             more = os.read(self._descriptor, count - len(received))
@@ -303,10 +304,10 @@ class DescriptorPort(Port):
 
     def _write_rest(self, data: bytes) -> None:
         """Write what the device did not accept at once, as its buffer drains."""
-        deadline = time.perf_counter() + self.wire_time(len(data)) + _WRITE_PATIENCE_S
+        deadline = _now() + self.wire_time(len(data)) + _WRITE_PATIENCE_S
         try:
             while data:
-                remaining = deadline - time.perf_counter()
+                remaining = deadline - _now()
                 if remaining <= 0:
                     raise TimeoutError(f"it accepts no more bytes; {len(data)} were not sent")
                 if select.select([], [self._descriptor], [], remaining)[1]:

@@ -161,28 +161,37 @@ class Converter:
 
     def ticks(self, goals: Sequence[float]) -> list[int]:
         """Return the goals rounded to the nearest ticks; raises ValueError for a goal that is not a finite number."""
+        units = self._drive_units
+        if len(goals) != len(units):
+            raise self._wrong(goals)
         try:
-            return [round(goal / unit) for goal, unit in zip(goals, self._drive_units, strict=True)]
+            return list(map(round, map(operator.truediv, goals, units)))
         except (ValueError, OverflowError):
             raise self._wrong(goals) from None
 
     def state(self, ticks: Sequence[int], reply: Reply) -> State:
         before, after, span, servos = reply
-        sent = tuple(map(operator.mul, self._drive_units, ticks))
-        try:
-            if span == 0:
-                # Most cycles: each servo answers with its ERR byte and the three values that are always read.
-                answers: Any = servos
-                values = [
-                    (raw_drive * drive, raw_velocity * velocity, (raw_position - zero) * position, error)
-                    for (error, raw_drive, raw_velocity, raw_position), (drive, velocity, position, zero) in zip(
-                        answers, self._scales, strict=True
-                    )
-                ]
-                return _state((before, after, sent, *zip(*values, strict=True), self._none_missing, None, None, None))
-        except (TypeError, ValueError):
-            pass  # a servo did not answer, or refused
-        return self._any_state(sent, reply)
+        if span == 0 and len(servos) == len(ticks) == len(self._scales):
+            # Most cycles: each servo answers with its ERR byte and the three values that are always read. With the cold
+            # caches of a cycle, one plain loop takes half the time of a comprehension and a transposition by zip; a
+            # keyword argument (strict) alone takes 2 us.
+            answers: Any = servos
+            sent, drive, velocity, position, error = [], [], [], [], []
+            try:
+                for tick, answer, scales in zip(ticks, answers, self._scales):  # noqa: B905
+                    told, raw_drive, raw_velocity, raw_position = answer
+                    unit, velocity_unit, position_unit, zero = scales
+                    sent.append(unit * tick)
+                    drive.append(raw_drive * unit)
+                    velocity.append(raw_velocity * velocity_unit)
+                    position.append((raw_position - zero) * position_unit)
+                    error.append(told)
+            except (TypeError, ValueError):
+                pass  # a servo did not answer, or refused
+            else:
+                each = (tuple(sent), tuple(drive), tuple(velocity), tuple(position), tuple(error), self._none_missing)
+                return _state((before, after, *each, None, None, None))
+        return self._any_state(tuple(map(operator.mul, self._drive_units, ticks)), reply)
 
     def _any_state(self, sent: tuple[float, ...], reply: Reply) -> State:
         """Convert a reply as `state` does, but for any span, and with missing or refused answers."""

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks.machine import machine
 from hil.config.schema import load_config
-from tests.support.late_loop import measure
+from tests.support.stream.late_loop import measure
 
 CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link_ideal.toml"
 

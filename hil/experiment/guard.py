@@ -25,7 +25,7 @@ from hil.experiment.apart import Apart
 from hil.experiment.command_limits import CommandLimits
 from hil.experiment.deadlines import Deadlines
 from hil.experiment.joint_checks import JOINT, MOST_OUTSIDE_RAD, JointChecks
-from hil.experiment.silence import Silence
+from hil.experiment.silence import LATE_WAKE_UP_S, Silence
 from hil.experiment.status_check import StatusCheck
 from hil.plan.find_torque import how_to_find_torque
 from hil.plan.recent_motion import RecentMotion
@@ -109,8 +109,11 @@ class Guard:
         """The latest exchanges, including those during a stop."""
         self._silence = Silence(config, interval, patience, lowers_since)
         self._patience = patience or float("inf")
+        self._late_after = self._patience + LATE_WAKE_UP_S
+        """Duration of an exchange that shows that this computer is busy [s]."""
         self._heard_instead = heard_instead
         self._deadlines = Deadlines(config, heard_instead, any_share=is_lowering)
+        self._longest_gap = safety.watchdog
         self._joints = _joint_records(config, planned, left_by_a_run)
         self._checks = JointChecks(self._joints, interval)
         self._apart = Apart()
@@ -118,7 +121,8 @@ class Guard:
         self._missing = self._silence.counts
         self._errors = [0] * len(config.joints)
         """Number of consecutive replies with values and an error, by joint."""
-        self._any_errors = False
+        self._was_irregular = False
+        """Whether replies were missing or reported an error in the previous exchange."""
         self._resting: Sequence[float] | None = None
         self._shortest = float("inf")
         self._supply = [float("nan")] * len(config.joints)
@@ -146,42 +150,43 @@ class Guard:
         watchdog_gap: time since the previous exchange [s]. between: whether this exchange took place between two
         samples.
         """
+        now, after, goals, _, _, _, error, missing, slow, status, apart = state
         self.recent.add(state)
-        now = state.time_before_write
-        took = state.time_after_read - now
+        self._status.sent(goals)
+        took = after - now
         gap = watchdog_gap if watchdog_gap > took else took
-        self._deadlines.check_gap(gap)
-        self._status.sent(state.goal_current)
-        self._silence.ask(now)
-        self._silence.woke_up(now, took - self._patience)
+        if gap >= self._longest_gap:
+            self._deadlines.check_gap(gap)
+        if took >= self._late_after:
+            self._silence.woke_up(now, took - self._patience)
         if took < self._shortest:
             self._shortest = took
-        unsure = took - self._shortest
         if self._deadlines.any_missed and not between:
             self._deadlines.met()
-        if any(state.error) or True in state.missing or self._silence.any_missed or self._any_errors:
-            self._look_one_by_one(state, now, unsure)
+        if self._was_irregular or True in missing or any(error):
+            self._look_one_by_one(state, took - self._shortest)
         else:
-            fault = self._checks.look(state, unsure)
+            fault = self._checks.look(state, took - self._shortest)
             if fault != joint_checks.FINE:
                 self._stop_for(fault, state)
             self._silence.all_heard(now)
-        if state.apart is not None and (turned := self._apart.look(state.apart)) is not None:
+        if apart is not None and (turned := self._apart.look(apart)) is not None:
             self._not_together(*turned)
-        if state.slow is not None:
-            self._look_slow(state.slow)
-            self._look_at_clocks(state.slow, now)
-        if state.status is not None:
-            self._look_status(state.status, state)
+        if slow is not None:
+            self._look_slow(slow)
+            self._look_at_clocks(slow, now)
+        if status is not None:
+            self._look_status(status, state)
 
     @property
     def wants_status(self) -> bool:
         """Whether the servos' status should be read again in the next exchange."""
         return self._status.is_in_doubt
 
-    def _look_one_by_one(self, state: State, now: float, unsure: float) -> None:
-        """Check an exchange in which replies are missing or report an error, or that follows a missing reply."""
-        missing, error = state.missing, state.error
+    def _look_one_by_one(self, state: State, unsure: float) -> None:
+        """Check an exchange in which replies are missing or report an error, or that follows such an exchange."""
+        now, missing, error = state.time_before_write, state.missing, state.error
+        self._silence.ask(now)
         # Lowering ends before an exchange that might last too long.
         silent = 2.0 * state.time_after_read - now if self._is_lowering else now
         for index in range(len(missing)):
@@ -197,7 +202,7 @@ class Guard:
             if fault != joint_checks.FINE:
                 self._stop_for(fault, state)
             self._silence.heard(index, now)
-        self._any_errors = any(self._errors)
+        self._was_irregular = self._silence.any_missed or any(self._errors)
 
     def _count_errors(self, index: int, error: int) -> None:
         """Count the errors that a servo reports in a row together with its values; too many are a stop."""

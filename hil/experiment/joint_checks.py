@@ -78,7 +78,7 @@ class JointChecks:
         for joint in joints:
             consistency.begin(joint["consistency"])
         _look(joints, self._sample, 0, 0, 0.0, 0.0, interval, 0.0, 0)  # compile
-        self._check = only_version(_look)
+        self._check: Callable[..., int] = only_version(_look)
 
     def look(self, state: State, unsure: float) -> int:
         """Check all joints; none may have missed this reply or the previous one.
@@ -86,16 +86,16 @@ class JointChecks:
         Returns FINE, or CHECKS * joint + the number of the failed check for the first joint that fails one; later
         joints are not checked. unsure: excess duration of the exchange [s].
         """
-        self._pack(self._bytes, 0, *state.position, *state.velocity, *state.goal_current, *state.current)
-        before, after = state.time_before_write, state.time_after_read
-        return int(self._check(self.joints, self._sample, 0, self._count, before, after, self.interval, unsure, 0))
+        before, after, goal, current, velocity, position, _, _, _, _, _ = state
+        self._pack(self._bytes, 0, *position, *velocity, *goal, *current)
+        return self._check(self.joints, self._sample, 0, self._count, before, after, self.interval, unsure, 0)
 
     def look_at(self, joint: int, state: State, unsure: float, missed: int) -> int:
         """Check one joint whose last `missed` replies were missing. The result is as for `look`."""
-        self._pack(self._bytes, 0, *state.position, *state.velocity, *state.goal_current, *state.current)
-        before, after = state.time_before_write, state.time_after_read
+        before, after, goal, current, velocity, position, _, _, _, _, _ = state
+        self._pack(self._bytes, 0, *position, *velocity, *goal, *current)
         only = joint, joint + 1
-        return int(self._check(self.joints, self._sample, *only, before, after, self.interval, unsure, missed))
+        return self._check(self.joints, self._sample, *only, before, after, self.interval, unsure, missed)
 
 
 def _may_be_outside(joint: Any, position: float) -> bool:

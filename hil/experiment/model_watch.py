@@ -9,8 +9,9 @@ import math
 import operator
 from collections import deque
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from struct import Struct
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -185,7 +186,7 @@ class ModelWatch:
         held = interval < 0.99 / config.experiment.rate
         self._follows = 1.0 - math.exp(-interval / _LAG_S) if held else 1.0
         self._felt = [0.0] * len(largest)
-        self._commanded: deque[tuple[State, list[float]]] = deque(maxlen=math.ceil(_WINDOW_S / interval))
+        self._recent: deque[State] = deque(maxlen=math.ceil(_WINDOW_S / interval) + 1)
         self._stands_for = 0.0
         self._long = max(interval, _VAGUE_S)
         self._jolts = Jolts(len(largest), interval)
@@ -193,53 +194,57 @@ class ModelWatch:
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
-        if True in state.missing:
+        now, after, sent, _, velocity, position, _, missing, _, _, _ = state
+        if True in missing:
             return
-        goal, self._goal = self._goal, state.goal_current
-        now = state.time_before_write
+        goal, self._goal = self._goal, sent
         seconds, self._seen_at = now - self._seen_at, now
         # During a long exchange the time of the measurement is unknown, so the motion up to it is not judged.
-        took = state.time_after_read - now
+        took = after - now
         if took < self._shortest:
             self._shortest = took
         if goal is None or took - self._shortest > self._long:
-            goal, seconds = state.goal_current, float("inf")
+            goal, seconds = sent, float("inf")
         torque = list(map(operator.mul, self._constants, goal))
         if self._follows < 1.0:
             follows = self._follows
             torque = self._felt = [felt + follows * (to - felt) for felt, to in zip(self._felt, torque, strict=True)]
-        self._look_for_jolts(state, seconds)
-        self._commanded.append((state, torque))
-        joint = self._observer.observe(state.position, state.velocity, torque, seconds)
+        if seconds > self._longest_gap:
+            self._jolts.forget()
+        if (found := self._jolts.look(velocity, seconds, now)) is not None:
+            self._jerked(*found)
+        self._recent.append(state)
+        joint = self._observer.observe(position, velocity, torque, seconds)
         if joint < 0:
             self._stands_for = 0.0
             return
         # After a step, a heavy joint takes a while to reach the smallest velocity that the register shows.
-        if self._follows < 1.0 and abs(state.velocity[joint]) < _STILL_RAD_S:
+        if self._follows < 1.0 and abs(velocity[joint]) < _STILL_RAD_S:
             self._stands_for += min(seconds, self._long)
             if self._stands_for < _STEP_S:
                 return
         self._raise(joint, state)
 
-    def _look_for_jolts(self, state: State, seconds: float) -> None:
-        if seconds > self._longest_gap:
-            self._jolts.forget()
-        if (found := self._jolts.look(state.velocity, seconds, self._seen_at)) is not None:
-            joint, change = found
-            raise SafetyStop(
-                f"{self._names[joint]} jerked: its velocity changed by {change:+.1f} rad/s and back within "
-                f"{1e3 * JOLT_BACK_S:.0f} ms, which the commanded torques cannot cause. Its horn slips on the shaft, "
-                "something hit it, its encoder is wrong, or another program sent it a goal.",
-                Cause.UNEXPECTED,
-            )
+    def _jerked(self, joint: int, change: float) -> NoReturn:
+        raise SafetyStop(
+            f"{self._names[joint]} jerked: its velocity changed by {change:+.1f} rad/s and back within "
+            f"{1e3 * JOLT_BACK_S:.0f} ms, which the commanded torques cannot cause. Its horn slips on the shaft, "
+            "something hit it, its encoder is wrong, or another program sent it a goal.",
+            Cause.UNEXPECTED,
+        )
 
-    def _raise(self, joint: int, state: State) -> None:
+    def _raise(self, joint: int, state: State) -> NoReturn:
         lacking = self._observer.lacking[joint]
         name, velocity = self._names[joint], state.velocity[joint]
-        check_standstill(name, (state for state, _ in reversed(self._commanded)), joint, _STILL_RAD_S)
+        check_standstill(name, reversed(self._recent), joint, _STILL_RAD_S)
         if abs(velocity) < _STILL_RAD_S:
-            since = self._seen_at - _WINDOW_S
-            recent = [torque[joint] for at, torque in self._commanded if at.time_before_write >= since]
+            since, constant = self._seen_at - _WINDOW_S, self._constants[joint]
+            # What was sent with one sample acts until the next.
+            recent = [
+                constant * before.goal_current[joint]
+                for before, at in pairwise(self._recent)
+                if at.time_before_write >= since
+            ]
             low, high = min(recent), max(recent)
             said = (
                 f"{name} is not moving, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "

@@ -10,6 +10,8 @@ up late, silence of all servos may be due to the computer, and is also limited i
 some servos are heard and one is not, that servo is silent.
 """
 
+from math import inf
+
 from hil.config.schema import Config
 from hil.plan.silence import Limit, bridged_limit, is_missing_too_long, late_limit, missing_limit
 
@@ -37,9 +39,10 @@ class Silence:
         self._already = heard_at is not None
         self._asked_at: float | None = None
         self._turn = 0.0
-        self._last_heard: list[float | None] = [heard_at] * count
+        self._last_heard = [-inf if heard_at is None else heard_at] * count
+        self._all_heard_at = -inf
         self._listened = [0.0] * count
-        self._busy_until = float("-inf")
+        self._busy_until = -inf
         self.counts = [0] * count
         """Replies missed in a row, by joint."""
         self.any_missed = False
@@ -56,7 +59,7 @@ class Silence:
             self._busy_until = now + BUSY_S
 
     def ask(self, now: float) -> None:
-        """Begin an exchange at `now` [s]."""
+        """Begin an exchange at `now` [s], unless all joints reply to it (`all_heard`)."""
         since = 0.0 if self._asked_at is None else now - self._asked_at
         self._turn = since if since < self._longest_turn else self._longest_turn
         self._asked_at = now
@@ -69,8 +72,8 @@ class Silence:
         self.any_missed = any(self.counts)
 
     def all_heard(self, now: float) -> None:
-        """Record that all joints replied, as they did in the previous exchange."""
-        self._last_heard = [now] * len(self.counts)
+        """Record an exchange, begun at `now` [s], in which all joints replied, as they did in the previous one."""
+        self._asked_at = self._all_heard_at = now
 
     def missed(self, joint: int, now: float, *, refused: bool = False, alone: bool = True) -> str | None:
         """Record a missing reply to the exchange that began at `now` [s]; return a description of a silence that is too
@@ -79,8 +82,8 @@ class Silence:
         refused: whether the servo answered with an error instead of its state; one such answer is enough. alone:
         whether only this servo is silent, i.e. another one was heard.
         """
-        last = self._last_heard[joint]
-        if last is None:
+        last = max(self._last_heard[joint], self._all_heard_at)
+        if last == -inf:
             last = self._last_heard[joint] = now
         self.any_missed = True
         self.counts[joint] += 1

@@ -9,7 +9,7 @@ of a stop allows it, the arm is braked before `run` raises; the caller that swit
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -21,21 +21,21 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
-from hil.drivers.torque_off import TRIP_S
 from hil.dry_run.ensemble import Ensemble
-from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop, StopRequested
+from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.estimator.data.periodicity import correlation_of_changes, decay_of
 from hil.experiment.apart import opposed
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
-from hil.experiment.lowering import Lowering, may_lower
 from hil.experiment.model_watch import ModelWatch
+from hil.experiment.pace import Pace
 from hil.experiment.repetition import Repetition
 from hil.experiment.stop_request import StopRequest
+from hil.experiment.stopping.lowering import may_lower
+from hil.experiment.stopping.way_down import Stopped, WayDown
 from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
-from hil.plan.silence import BRIDGED_S
 from hil.plan.stabiliser import Stabiliser, must_balance
 from hil.runs.recording import Phase, Recorder, missed
 from hil.setup.servo_session import has_moved
@@ -55,12 +55,6 @@ _BRAKING_WATCHDOG_S = 0.04
 """Bus Watchdog while the arm is braked [s]: should the cable be unplugged meanwhile, the current of a brake must not
 flow for as long as that of an experiment might, whose next command may be late.
 """
-
-_LATE_REPLIES_S = 0.008
-"""How much longer replies are awaited while the arm is lowered [s]."""
-
-_FORGETS = 0.98
-"""Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
 
 
 class Progress(NamedTuple):
@@ -97,37 +91,34 @@ class Stream:
         arms: Ensemble | ChainArms | None = None,
     ) -> None:
         self._bus = bus
-        self._exchange = bus.prepared
-        self._clock = bus.port.clock
         self._plan = plan
         self._config = config
-        self._safety = config.safety
         planned = _largest_goals(plan)
         self._left_by_a_run = has_moved()
-        self._turns = bus.exchanges_per_sample
-        self._apart = 1 / plan.rate / self._turns
+        apart = 1 / plan.rate / bus.exchanges_per_sample
         self._guard = Guard(
             config,
             planned,
-            interval=self._apart,
+            interval=apart,
             patience=bus.prepared.patience,
             heard_instead=lambda: bus.heard_instead,
             left_by_a_run=self._left_by_a_run,
         )
         self._model: ModelWatch | ChainWatch = (
-            ModelWatch(config, planned, arms, self._apart)
+            ModelWatch(config, planned, arms, apart)
             if not isinstance(arms, ChainArms) and not config.is_chain
-            else ChainWatch(config, planned, arms if isinstance(arms, ChainArms) else None, self._apart)
+            else ChainWatch(config, planned, arms if isinstance(arms, ChainArms) else None, apart)
         )
-        self._lowering = Lowering(config, plan, self._apart) if config.is_chain else None
+        self._way_down: WayDown | None = None
+        if config.is_chain:
+            model = self._model if isinstance(self._model, ChainWatch) else None
+            self._way_down = WayDown(bus, plan, config, recorder, stop, note, self._guard, model)
         self._stabiliser = None if config.stabiliser is None else Stabiliser(config)
         self._recorder = recorder
         self._stop = stop
         self._watch = watch
         self._note = note
-        self._interval = 1 / plan.rate
-        self._ticks = FixedRate(bus.port.clock, plan.rate)
-        self._index = 0
+        self._pace = Pace(bus, plan.rate, self._guard)
         self._watch_every = max(1, round(_WATCH_EVERY_S * plan.rate))
         self._goal = [0.0] * len(bus.joints)
         self._segment = 0
@@ -135,15 +126,11 @@ class Stream:
         self._whole: State | None = None
         """The latest state with replies of all servos."""
         self._sampled: State | None = None
-        self._deadline: float | None = None
-        self._takes = 0.0
-        self._sent_at: float | None = None
-        self._awake_at = float("-inf")
         self._is_undriven = True
         """Whether nothing has driven the arm yet; a stabiliser cannot drive it before the first sample."""
         self._ramps = [(segment.ramp_in, segment.ramp_out) for segment in plan.segments]
         longest = max(len(segment.period_current) for segment in plan.segments)
-        self._repetition = Repetition(longest, len(bus.joints), self._interval)
+        self._repetition = Repetition(longest, len(bus.joints), self._pace.interval)
 
         self.modes_seen_ago = float("inf")
         """Time from the latest correct read-back of the operating modes to a stop by the guard [s]."""
@@ -166,8 +153,9 @@ class Stream:
             if isinstance(error, SafetyStop) and error.cause in _BY_OTHER_GOALS and self._bus.commanded_by_another:
                 error.add_note(self._bus.commanded_by_another)
                 error.overruled = True
-            if self._lowering is not None and may_lower(self._config, error):
-                self._lower(self._lowering, error)
+            if self._way_down is not None and may_lower(self._config, error):
+                stopped = Stopped(self._state, self._whole, self._goal, self._pace.sent_at, self._segment)
+                self._way_down.lower(error, stopped)
             elif may_brake(self._config, error):
                 self._brake()
             raise
@@ -212,11 +200,11 @@ class Stream:
         moved = np.ptp(self._recorder.samples["position"][-window:], axis=0)
         lasting = np.abs(self._recorder.samples["velocity"][-2:]).min(axis=0)
         for joint, velocity, least, way in zip(self._bus.joints, state.velocity, lasting, moved, strict=True):
-            if least > self._safety.rest_velocity and way <= _STILL_STEPS * abs(joint.position_unit):
+            if least > self._config.safety.rest_velocity and way <= _STILL_STEPS * abs(joint.position_unit):
                 return (
                     f"{joint.title} reports a velocity of {velocity:.2f} rad/s before the start, but its position has "
-                    f"changed by {way:.4f} rad in the last {window * self._interval:.1f} s: one of the two readings is "
-                    "wrong. Check the encoder and its magnet; replace the servo if necessary."
+                    f"changed by {way:.4f} rad in the last {window * self._pace.interval:.1f} s: one of the two "
+                    "readings is wrong. Check the encoder and its magnet; replace the servo if necessary."
                 )
         return ""
 
@@ -252,8 +240,8 @@ class Stream:
             self._note(f"{segment.role}: still drifting slowly: {difference:.2%} per period; using the last periods")
             return
         raise NotSettled(
-            f"After {self._plan.max_settling_periods} periods of {samples * self._interval:g} s the motion is still "
-            f"drifting: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
+            f"After {self._plan.max_settling_periods} periods of {samples * self._pace.interval:g} s the motion is "
+            f"still drifting: {difference:.1%} of its RMS from one period to the next; experiment.settle_within allows "
             f"{self._plan.settle_within:.1%} ({self._plan.drift_within:.1%} if it drifts slowly). "
             + self._advice(differences, samples)
         )
@@ -266,7 +254,7 @@ class Stream:
         listed = ", ".join(f"{each:.1%}" for each in differences)
         played = len(differences) + decay.further
         if decay.is_warming(self._correlation(samples)):
-            seconds = (self._plan.warm_up_periods + played) * samples * self._interval
+            seconds = (self._plan.warm_up_periods + played) * samples * self._pace.interval
             return (
                 f"The change decreases slowly from period to period ({listed}), as happens while grease warms up: set "
                 f"experiment.warm_up = {math.ceil(seconds / 10) * 10:g}."
@@ -310,11 +298,11 @@ class Stream:
             speeds = np.abs(self._recorder.samples["velocity"][-window:])
             # Missing replies are ignored; a joint without any reply does not count as being at rest.
             fastest = np.fmax.reduce(speeds, axis=0)
-            if (fastest < self._safety.rest_velocity).all():
+            if (fastest < self._config.safety.rest_velocity).all():
                 self._note("at rest")
                 return
         told = ", ".join(f"{speed:.2f}" for speed in fastest)
-        self._note(f"still moving at {told} rad/s after {self._safety.rest_time:g} s without current")
+        self._note(f"still moving at {told} rad/s after {self._config.safety.rest_time:g} s without current")
 
     def _balance(self, stabiliser: Stabiliser) -> None:
         """Bring an upright arm as close to balance as friction allows, or it falls over when torque is cut."""
@@ -330,68 +318,37 @@ class Stream:
 
     def _play(self, goals: NDArray[np.float64], phase: Phase, period: int = -1) -> State:
         """Send goal currents (samples, joints) [A], one row per tick; return the last state."""
-        state = missed(self._goal, self._clock.now())
+        state = missed(self._goal, self._bus.port.clock.now())
         for row in goals:  # row by row: converting a long period at once would delay the loop
             state = self._sample(row.tolist(), phase, period)
         return state
 
     def _sample(self, goal: list[float], phase: Phase, period: int) -> State:
-        if self._turns > 1:
-            for state in self._between_samples():
+        pace = self._pace
+        if pace.turns > 1:
+            for state in pace.between(self._goal):
                 self._look(state, phase, between=True)
                 self._stop.check()
-        self._look_for_another_master(self._interval)
-        self._deadline, now, late = self._ticks.wait()
-        self._guard.woke_up(now, now - max(self._deadline, self._awake_at))
-        self._awake_at = now
+        deadline, now, late = pace.wait()
         if late:
             # A missed tick is skipped, never made up for in a burst: the servos keep the previous goal.
             state = missed(self._goal, now)
         else:
             wanted = goal if self._stabiliser is None else self._stabiliser.add(goal, self._sampled)
             self._goal = self._guard.clamp(wanted)
-            self._sampled = state = self._bus.exchange(self._goal)
-            self._sent_at, self._awake_at = state.time_before_write, state.time_after_read
-        deadline = self._deadline
+            self._sampled = state = pace.send(self._goal)
         self._recorder.keep(deadline, phase, self._segment, period, state)
-        self._index += 1
         if late:
-            self._guard.late(now - (deadline if self._sent_at is None else self._sent_at))
+            self._guard.late(now - (deadline if pace.sent_at is None else pace.sent_at))
         else:
             self._look(state, phase)
         self._stop.check()
         # Temperature and voltage come with only a few samples, which are always shown.
-        if self._index % self._watch_every == 0 or state.slow is not None:
+        taken = self._recorder.count
+        if taken % self._watch_every == 0 or state.slow is not None:
             role = self._plan.segments[self._segment].role
-            self._watch(Progress(self._index, self._plan.expected, phase, role, state))
+            self._watch(Progress(taken, self._plan.expected, phase, role, state))
         return state
-
-    def _between_samples(self) -> Iterator[State]:
-        """Exchange the same goals until the next sample is due; yield each state.
-
-        An exchange that might delay the next sample is left out: the adapter may be slow, or a servo silent.
-        """
-        if self._deadline is None:
-            return
-        following = self._deadline + self._interval
-        for turn in range(1, self._turns):
-            due = self._deadline + turn * self._apart
-            self._look_for_another_master(turn * self._apart)
-            self._clock.wait_until(due)
-            now = self._clock.now()
-            if now - due < self._apart and now + self._takes < following:
-                state = self._bus.exchange(self._goal, between=True)
-                self._sent_at, self._awake_at = state.time_before_write, state.time_after_read
-                self._takes = max(_FORGETS * self._takes, state.time_after_read - state.time_before_write)
-                yield state
-
-    def _look_for_another_master(self, later: float) -> None:
-        """If a read-back is due, do it just before the exchange that is due `later` [s] after the sample."""
-        deadline = self._deadline
-        if deadline is not None and self._exchange.read_back_at <= deadline + later:
-            self._bus.check_not_overruled(deadline + later)
-            if (lost := self._bus.goals_lost) is not None:
-                self._guard.goals_are_lost(*lost)
 
     def _look(self, state: State, phase: Phase, *, between: bool = False) -> None:
         former, self._state = self._state, state
@@ -408,16 +365,17 @@ class Stream:
 
     def _brake(self) -> None:
         """Brake until the arm is slow, a read fails, time is up, or a second signal arrives. Never raises."""
-        brake = Brake(self._config, self._apart, self._guard.recent)
+        apart, clock = self._pace.interval / self._pace.turns, self._bus.port.clock
+        brake = Brake(self._config, apart, self._guard.recent)
         state = self._state
-        ticks = FixedRate(self._clock, 1 / self._apart)
+        ticks = FixedRate(clock, 1 / apart)
         with suppress(DriverError):
-            for number in range(round(self._safety.damp_time / self._apart)):
+            for number in range(round(self._config.safety.damp_time / apart)):
                 goals = None if state is None else brake.goals(state)
                 if goals is None:
                     return
                 # The first brake is sent at once: until then the goals that led to the stop drive the arm.
-                deadline, _, late = ticks.wait() if number else (self._clock.now(), 0.0, False)
+                deadline, _, late = ticks.wait() if number else (clock.now(), 0.0, False)
                 if late or self._stop.insisted:
                     return
                 state = self._bus.exchange(goals, between=True)
@@ -425,72 +383,11 @@ class Stream:
                     self._bus.shorten_watchdogs(_BRAKING_WATCHDOG_S)
                 self._recorder.keep(deadline, Phase.BRAKING, self._segment, -1, state)
 
-    def _lower(self, lowering: Lowering, error: ExperimentError) -> None:
-        """Brake and lower the arm until it is at rest, a check fails, or a second signal arrives. Never raises."""
-        state = self._whole
-        if state is None or self._state is None or any(self._state.error) or lowering.lies(state):
-            return
-        if self._is_blind and self._clock.now() - state.time_before_write > BRIDGED_S:
-            return
-        since = 0.0 if self._sent_at is None else self._clock.now() - self._sent_at
-        if self._bus.is_watched and since >= self._safety.watchdog + TRIP_S:
-            self._told(error, "The arm could not be lowered: the servos' watchdogs had already acted, so it fell.")
-            return
-        self._note(f"lowering the arm after: {error}")
-        # The deadlines missed so far are not those of the way down.
-        self._ticks = FixedRate(self._clock, self._plan.rate)
-        self._deadline, self._sent_at = None, self._clock.now()
-        try:
-            state = self._way_down(lowering, state)
-        except (SafetyStop, StopRequested, DriverError) as ended:
-            fell = "Torque was cut while the arm was being lowered, so it fell the rest of the way"
-            self._told(error, f"{fell}: {ended}")
-            return
-        elsewhere = lowering.lies_elsewhere(state)
-        done = f"was lowered, but not to its rest pose: {elsewhere}" if elsewhere else "was lowered to its rest pose"
-        self._told(error, f"The arm {done}.")
-
-    def _way_down(self, lowering: Lowering, state: State) -> State:
-        """Follow the path home; return the last state. Raises SafetyStop, StopRequested, DriverError."""
-        asked = max(1, self._stop.count)
-        watch = self._model if isinstance(self._model, ChainWatch) else None
-        # Replies that are merely late are worth a missed deadline: without them, nothing corrects the way down.
-        self._exchange.wait_longer(_LATE_REPLIES_S)
-        # The path begins with the latest state that is known, which may be a few exchanges old.
-        passed = round((self._clock.now() - state.time_before_write) / self._interval) if self._is_blind else 0
-        for index in range(passed, lowering.begin(state, self._goal, self._guard.recent, watch)):
-            for checked in self._between_samples() if index > passed else ():
-                lowering.look(index - 1, checked, checked.time_before_write - state.time_before_write, between=True)
-                state = checked
-            self._look_for_another_master(self._interval)
-            deadline, now, late = self._ticks.wait()
-            self._deadline = deadline
-            self._stop.check_again(asked)
-            if late:
-                self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, missed(self._goal, now))
-                lowering.late(now - (deadline if self._sent_at is None else self._sent_at))
-                continue
-            self._goal = lowering.goals(index, state)
-            former, state = state.time_before_write, self._bus.exchange(self._goal)
-            self._sent_at = state.time_before_write
-            self._recorder.keep(deadline, Phase.LOWERING, self._segment, -1, state)
-            lowering.look(index, state, state.time_before_write - former)
-        return state
-
-    @property
-    def _is_blind(self) -> bool:
-        """Whether replies were missing in the latest exchange."""
-        return self._state is not None and any(self._state.missing)
-
-    def _told(self, error: ExperimentError, what: str) -> None:
-        error.add_note(what)
-        self._note(what)
-
     def _silence(self, samples: int) -> NDArray[np.float64]:
         return np.zeros((samples, len(self._bus.joints)))
 
     def _moving(self, state: State) -> str:
-        limit = self._safety.rest_velocity
+        limit = self._config.safety.rest_velocity
         return ", ".join(
             f"{joint} at {velocity:.2f} rad/s"
             for joint, velocity in zip(self._bus.joints, state.velocity, strict=True)

@@ -119,27 +119,29 @@ class Recorder:
 
     def keep(self, deadline: float, phase: Phase, segment: int, period: int, state: State) -> None:
         """Record one sample."""
-        if self.count == self._next_chunk:
+        count = self.count
+        if count == self._next_chunk:
             self._next_chunk += self._rows_a_chunk
             self._touched.put(self._next_chunk)
+        before, after, goal_current, current, velocity, position, error, missing, slow, _, _ = state
         self._row.pack_into(
             self._bytes,
-            self.count * self._row.size,
+            count * self._row.size,
             deadline,
-            state.time_before_write,
-            state.time_after_read,
+            before,
+            after,
             phase,
             segment,
             period,
-            *state.goal_current,
-            *state.current,
-            *state.velocity,
-            *state.position,
-            *state.error,
-            *state.missing,
-            *(self._nothing_slow if state.slow is None else chain(*state.slow)),
+            *goal_current,
+            *current,
+            *velocity,
+            *position,
+            *error,
+            *missing,
+            *(self._nothing_slow if slow is None else chain(*slow)),
         )
-        self.count += 1
+        self.count = count + 1
 
     def close(self) -> None:
         """Truncate the file to the recorded rows; may be called again.

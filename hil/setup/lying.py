@@ -10,7 +10,7 @@ import numpy as np
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import BusShared, DriverError, TorqueNotOff
-from hil.drivers.torque_off import and_list
+from hil.drivers.torque.off import and_list
 from hil.rest_pose_hint import within_limits
 from hil.setup.servo_session import has_moved
 

@@ -14,11 +14,11 @@ from hil.drivers.errors import BusShared, DriverError, NoReply, PortLost, PortNo
 from hil.drivers.joint import Joint
 from hil.drivers.latency import FACTORY_MS, WANTED_MS, command_to_set, latency_timer, read_latency_ms
 from hil.drivers.packet import MAX_ID, HardwareError
-from hil.drivers.preparation.hold import switched_on
 from hil.drivers.preparation.prepare import TIME_BASED_PROFILE, check_quiet, shuts_down
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED, arms_itself
 from hil.drivers.servo import Servo, describe_error
 from hil.drivers.servo_model import BAUD_RATES, FULL_PWM_TICKS, RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
+from hil.drivers.torque.held import switched_on
 from hil.errors import ConfigError
 from hil.estimator.errors import EstimationError
 from hil.plan.chain_plan import check_clearance, check_rest_pose, make_chain_plan, missing_path

@@ -21,7 +21,7 @@ from hil.drivers.errors import DriverError, TorqueNotOff, WrongModel
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import attainable, put_back, read_settings
 from hil.drivers.servo_model import Mode
-from hil.drivers.torque_off import and_list, by_reason, signals_held_back
+from hil.drivers.torque.off import and_list, by_reason, signals_held_back
 from hil.errors import ExperimentError, RunFolderError, StopRequested
 from hil.setup import settings_file
 from hil.setup.changed_settings import Settings, settings_now
@@ -210,7 +210,7 @@ class ServoSession:
         on = [joint for joint, is_on in self._torque.items() if is_on]
         if not on or max(self._on_again.get(joint, 0) for joint in on) >= _MOST_CUTS:
             return False
-        self.bus.cut_again(on)
+        self.bus.cut_foreign_torque(on)
         for joint in on:
             self._on_again[joint] = self._on_again.get(joint, 0) + 1
             failed.pop(joint, None)

@@ -184,6 +184,18 @@ def test_while_this_program_is_late_silence_of_all_may_be_the_computers(
     assert said.index(next(filter(None, said))) == replies - 1
 
 
+def test_a_silence_begins_with_the_latest_exchange_that_all_answered(arm: Arm) -> None:
+    silence = Silence(arm(), 1 / RATE)
+    silence.ask(0.0)
+    silence.heard(0, 0.0)
+    silence.all_heard(0.1)
+    said = []
+    for now in [0.1 + n / RATE for n in range(1, 7)]:
+        silence.ask(now)
+        said.append(silence.missed(0, now))
+    assert said == [None] * 5 + ["15 ms ago; safety.missing_time = 0.015 s allows 15 ms"]
+
+
 def test_a_computer_is_busy_for_a_while_only(arm: Arm) -> None:
     silence = Silence(arm(), 1 / RATE)
     silence.woke_up(0.0, 0.003)

@@ -340,6 +340,9 @@ def test_commands_are_clamped_slew_limited_and_never_nan(arm: Arm) -> None:
     for wrong in (nan, inf, -inf):
         with pytest.raises(SafetyStop, match="is not a finite number"):
             guard.clamp([wrong, 0.0])
+    for count in (1, 3):
+        with pytest.raises(ValueError, match=f"{count} goals for 2 joints"):
+            guard.clamp([0.1] * count)
 
 
 def test_a_look_costs_little_more_than_a_hundred_additions(arm: Arm) -> None:

@@ -19,8 +19,8 @@ from hil.experiment.stream import Progress, Watch
 from hil.fakes.protocol_fake import FakeSerial
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
-from tests.support.at_sample import at_sample
 from tests.support.short_experiment import CONFIG, short_config
+from tests.support.stream.at_sample import at_sample
 
 Arm = Callable[..., Config]
 

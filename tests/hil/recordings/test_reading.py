@@ -125,7 +125,7 @@ def spoilt(change: Callable[[list[str]], list[str]]) -> Converted:
         (lambda rows: [*rows[:300], *rows[340:]], "columns read: time: time", 1),
         (lambda rows: [*rows[:300], "nan,,,,", *rows[300:]], "1 rows without a time", 1),
         (lambda rows: [*rows[:300], rows[301], rows[300], *rows[302:]], "1 rows out of order were sorted", 1),
-        (lambda rows: [*rows[:300], rows[300].rpartition(",")[0] + ",", *rows[301:]], "torque was filled in where it is missing, in 1 row.", 1),
+        (lambda rows: [*rows[:300], rows[300].rpartition(",")[0] + ",", *rows[301:]], "torque was filled in", 1),
         (lambda rows: [*rows, *rows], "treated as 2 recordings", 2),
         (lambda rows: [*rows[:300], rows[300].replace("1.5,", "1.5001,"), *rows[300:]], "columns read", 1),
     ],

@@ -16,7 +16,7 @@ from hil.experiment.run import run_experiment
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 from hil.runs.timing import timing
-from tests.support.at_sample import at_sample
+from tests.support.stream.at_sample import at_sample
 
 Arm = Callable[..., Config]
 

@@ -12,12 +12,14 @@ from hil.drivers.errors import DriverError, NoReply, PortLost
 from hil.drivers.joint import Joint
 from hil.drivers.packet import BROADCAST_ID, Instruction, encode
 from hil.drivers.servo_model import Mode, servo_model
-from hil.drivers.torque_off import (
+from hil.drivers.torque.held import switched_on
+from hil.drivers.torque.off import (
     TorqueOff,
     and_list,
     by_reason,
     cut_torque,
     disarm_watchdogs,
+    is_torque_on,
     signals_held_back,
 )
 from hil.fakes.bus.clock import VirtualClock
@@ -187,3 +189,37 @@ def test_other_threads_touch_no_handler() -> None:
     thread.start()
     thread.join()
     assert inside == [before]
+
+
+class Misunderstood:
+    """A servo whose answers are given in turn, whatever is asked."""
+
+    def __init__(self, answers: list[int]) -> None:
+        self.id, self.title = 1, JOINTS[0].title
+        self._answers = iter(answers)
+
+    def read(self, _register: str) -> int:
+        answer = next(self._answers, None)
+        if answer is None:
+            raise NoReply("no reply")
+        return answer
+
+    read_despite_error = read
+
+
+@pytest.mark.parametrize(
+    ("answers", "on"), [([1, 1, 1], True), ([0, 1, 0], False), ([1, 3, 1], None), ([1, 1, 0], None), ([1], None)]
+)
+def test_torque_is_known_only_from_answers_to_the_question(answers: list[int], on: bool | None) -> None:
+    assert is_torque_on(Misunderstood(answers)) is on  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("answers", "is_named"), [([1, 1, 1, 1, 0], True), ([0], False), ([1, 1, 3, 1], False)])
+def test_no_other_program_is_accused_by_an_answer_to_another_question(answers: list[int], is_named: bool) -> None:
+    found = switched_on({JOINTS[0]: Misunderstood(answers)})  # type: ignore[dict-item]
+    assert found.startswith(JOINTS[0].title) is is_named and bool(found) is is_named
+
+
+def test_a_servo_that_falls_silent_before_torque_is_on_is_named() -> None:
+    with pytest.raises(NoReply):
+        switched_on({JOINTS[0]: Misunderstood([1, 1])})  # type: ignore[dict-item]

@@ -14,8 +14,8 @@ from hil.config.schema import load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.state import State
 from hil.errors import ExperimentError, SafetyStop, StopRequested
-from hil.experiment.lowering import Lowering
 from hil.experiment.run import run_experiment
+from hil.experiment.stopping.lowering import Lowering
 from hil.experiment.stream import Progress
 from hil.fakes.protocol_fake import FakeSerial
 from hil.plan.chain_plan import make_chain_plan

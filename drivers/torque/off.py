@@ -115,7 +115,7 @@ class TorqueOff:
         if self.unconfirmed:
             told.append(self._outcome_alone())
         elif self.confirmed:
-            told.append(f"Torque is off, read back, on {and_list(map(str, self.confirmed))}.")
+            told.append(f"Torque is off on {and_list(map(str, self.confirmed))}, confirmed by reading it back.")
         return " ".join(told)
 
     def _outcome_alone(self) -> str:
@@ -229,13 +229,21 @@ def cut_again(servo: Servo, *, armed: bool) -> bool:
 
 
 def is_torque_on(servo: Servo) -> bool | None:
-    """Whether a servo's torque is on; None if it does not answer, or if its answers may belong to other requests."""
+    """Whether a servo's torque is on; None if that is unknown (`has_torque`) or if it does not answer."""
     with suppress(DriverError):
-        first = servo.read_despite_error("Torque Enable")
-        is_its_own = servo.read_despite_error("ID") == servo.id
-        if is_its_own and servo.read_despite_error("Torque Enable") == first:
-            return bool(first)
+        return has_torque(servo)
     return None
+
+
+def has_torque(servo: Servo) -> bool | None:
+    """Read whether a servo's torque is on; None if its answers may belong to other requests.
+
+    A reply does not say which register it comes from, so Torque Enable is read twice, with another register in between.
+    Raises the same errors as `Servo.read`.
+    """
+    first = servo.read_despite_error("Torque Enable")
+    is_its_own = servo.read_despite_error("ID") == servo.id
+    return bool(first) if is_its_own and servo.read_despite_error("Torque Enable") == first else None
 
 
 def was_rebooted(servo: Servo) -> bool:

@@ -10,6 +10,7 @@ from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
+from hil.drivers.torque.off import has_torque
 
 FADE_S = 1.0
 """Time over which a held servo's output limit is reduced to zero [s]."""
@@ -45,11 +46,8 @@ def refuse_held(servos: Mapping[Joint, Servo]) -> None:
 
 
 def switched_on(servos: Mapping[Joint, Servo]) -> str:
-    """Say which servos have torque on, and with which current; "" if none has. Same errors as `Servo.read`.
-
-    Each is read twice, because a reply does not say which register it comes from.
-    """
-    on = [servo for servo in servos.values() if servo.read("Torque Enable") and servo.read("Torque Enable")]
+    """Say which servos have torque on, and with which current; "" if none has. Same errors as `Servo.read`."""
+    on = [servo for servo in servos.values() if servo.read("Torque Enable") and has_torque(servo)]
     return " and ".join(f"{servo.title}{_current(joint, servo)}" for joint, servo in servos.items() if servo in on)
 
 

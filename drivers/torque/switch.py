@@ -1,0 +1,210 @@
+"""Switching the torque of an arm's servos on and off."""
+
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+
+from hil.drivers.errors import BusShared, DriverError, ServoFault, ServoRefused, TorqueNotOff
+from hil.drivers.joint import Joint
+from hil.drivers.packet import HardwareError
+from hil.drivers.port import Port
+from hil.drivers.preparation.prepare import fault_text, shuts_down
+from hil.drivers.servo import Servo, describe_error
+from hil.drivers.servo_model import WATCHDOG_UNIT, Mode
+from hil.drivers.torque.held import switched_on
+from hil.drivers.torque.off import (
+    TorqueOff,
+    cut_again,
+    cut_torque,
+    disarm_watchdogs,
+    is_torque_on,
+    signals_held_back,
+    tell_torque_off,
+    tell_watchdogs,
+    was_rebooted,
+)
+
+WATCH_S = 0.1
+"""Interval at which Torque Enable is read while the arm must be without torque [s]."""
+
+
+class TorqueSwitch:
+    """Servos on one port, whose torque is switched on and off together.
+
+    servos: keyed by single-servo joints, in bus order. After any error the same object can still cut torque;
+    `torque_off_report` then says whether that succeeded.
+    """
+
+    def __init__(self, port: Port, servos: Mapping[Joint, Servo]) -> None:
+        self.port = port
+        self._servos = servos
+        self._without_watchdog: set[Joint] = set()
+        self._watchdog = 0.0
+        self._armed: set[Joint] = set()
+        """Servos whose Bus Watchdog has been armed and not disarmed since."""
+        self.torque_off_report: TorqueOff | None = None
+
+    @property
+    def drives(self) -> Mapping[Joint, Servo]:
+        """All servos, each keyed by a single-servo joint from `Joint.drives`, in bus order."""
+        return self._servos
+
+    def _silent(self) -> set[Joint]:
+        """The servos that did not answer when they were asked last."""
+        return set()
+
+    def refuse_switched_on(self) -> None:
+        """Check that torque is still off, after this program has found it off or switched it off.
+
+        If it is on, another program has switched it on: torque is cut on all servos. Raises BusShared, or TorqueNotOff.
+        """
+        if not (found := switched_on(self._servos)):
+            return
+        try:
+            raise BusShared(
+                f"{found}: torque was off and has been switched on by another program, which is driving the arm. End "
+                "that program, or unplug its controller, then start again."
+            )
+        finally:
+            report = self.torque_off()
+            if report.unconfirmed:
+                raise TorqueNotOff(str(report))
+
+    def wait_switched_off(self, until: float) -> None:
+        """Wait until `until` [s, on the port's clock] and call `refuse_switched_on` at least every WATCH_S."""
+        clock = self.port.clock
+        self.refuse_switched_on()
+        while (now := clock.now()) < until:
+            clock.wait_until(min(until, now + WATCH_S))
+            self.refuse_switched_on()
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether the watchdog of any servo is armed."""
+        return bool(self._armed)
+
+    @contextmanager
+    def torque(self, watchdog: float) -> Iterator[None]:
+        """Switch torque on for the block and off afterwards, however the block is left.
+
+        watchdog: time without packets after which a servo stops by itself [s] (in steps of 20 ms, at most 2.54 s).
+        Raises BusShared if another program has switched torque on; TorqueNotOff on exit if torque off could not be
+        confirmed; `torque_off_report` lists the servos.
+        """
+        self.refuse_switched_on()
+        self.torque_off_report = None
+        try:
+            self._torque_on(watchdog)
+            yield
+        finally:
+            # No statement may stand between `finally` and `try`, so that an interrupt before torque_off is caught here.
+            try:
+                report = self.torque_off()
+            except BaseException:
+                if self.torque_off_report is None:
+                    self.torque_off()
+                raise
+            if report.unconfirmed:
+                raise TorqueNotOff(str(report))
+
+    def _torque_on(self, watchdog: float) -> None:
+        ticks = round(watchdog / WATCHDOG_UNIT)
+        if not 1 <= ticks <= 127:
+            raise ValueError(f"watchdog must be 0.02 to 2.54 s, not {watchdog}")
+        self._watchdog = watchdog
+        for joint, servo in self._servos.items():
+            watched = joint not in self._without_watchdog
+            if watched:
+                servo.write("Bus Watchdog", 0)
+            # A change of Operating Mode leaves Goal Current at Current Limit, so it is zeroed before torque is on.
+            servo.write("Goal Current" if joint.mode is Mode.CURRENT else "Goal PWM", 0)
+            if watched:
+                servo.write("Bus Watchdog", ticks)
+                self._armed.add(joint)
+        for joint, servo in self._servos.items():
+            try:
+                servo.write("Torque Enable", 1)
+            except ServoRefused:
+                if servo.hardware_error() != HardwareError(0):
+                    raise ServoFault(self._fault(joint)) from None
+                raise
+
+    def torque_off(self) -> TorqueOff:
+        """Cut torque on every servo and read it back (`hil.drivers.torque.off`). All servos are tried, whatever fails.
+
+        Signals are held back meanwhile; an interrupt that still arrives is raised once all servos have been tried and
+        `torque_off_report` is set.
+        """
+        interrupts: list[BaseException] = []
+        with signals_held_back():
+            silent = self._silent()
+            confirmed, unconfirmed = cut_torque(self.port, self._servos, silent, self._watchdog, interrupts)
+            fell_silent = {joint: self._servos[joint] for joint in confirmed if joint in silent & self._armed}
+            rebooted = frozenset(joint for joint, servo in fell_silent.items() if was_rebooted(servo))
+            watched = {joint: self._servos[joint] for joint in confirmed if joint not in self._without_watchdog}
+            disarm_watchdogs(watched, interrupts)
+            self._armed.difference_update(watched)
+            unwatched = frozenset(self._without_watchdog)
+            self.torque_off_report = TorqueOff(confirmed, unconfirmed, unwatched, rebooted=rebooted)
+        if interrupts:
+            raise interrupts[0]
+        return self.torque_off_report
+
+    def shorten_watchdogs(self, seconds: float) -> None:
+        """Shorten the armed Bus Watchdogs to `seconds` [s], if they are longer, until torque is off.
+
+        Nothing is read back: a servo that misses the packet keeps its former time.
+        """
+        if seconds < self._watchdog:
+            tell_watchdogs(self.port, {drive: self._servos[drive] for drive in self._armed}, seconds)
+
+    def repeat_torque_off(self) -> None:
+        """Send torque off to all servos once more without waiting for an answer, in case a silent servo receives it."""
+        tell_torque_off(self.port, self._servos)
+
+    def torque_now(self) -> dict[Joint, bool | None]:
+        """Read whether torque is on at each servo that is not reported as unconfirmed; None where that is unknown."""
+        report = self.torque_off_report
+        unconfirmed = set() if report is None else {joint for joint, _ in report.unconfirmed}
+        return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
+
+    def cut_foreign_torque(self, on: Collection[Joint]) -> None:
+        """Cut torque that another program has switched on since `torque_off`; `torque_now` then shows the outcome."""
+        interrupts: list[BaseException] = []
+        with signals_held_back():
+            cut_torque(self.port, {joint: self._servos[joint] for joint in on}, (), 0.0, interrupts)
+        if interrupts:
+            raise interrupts[0]
+
+    def report_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> None:
+        """Let `torque_off_report` say that another program keeps torque on (`TorqueOff.with_driven`)."""
+        report = self.torque_off_report or TorqueOff(tuple(self._servos), ())
+        self.torque_off_report = report.with_driven(on, silent)
+
+    def confirm_later(self, drive: Joint) -> bool:
+        """Cut the torque of a servo (a key of `drives`) that `torque_off` could not confirm as off, and read it back.
+
+        Returns False if there was nothing to do; otherwise `torque_off_report` then lists the servo as confirmed.
+        Raises DriverError if the servo still does not answer.
+        """
+        report = self.torque_off_report
+        if report is None or drive not in [joint for joint, _ in report.unconfirmed]:
+            return False
+        rebooted = cut_again(self._servos[drive], armed=drive in self._armed)
+        self._armed.discard(drive)
+        self.torque_off_report = report.with_later(drive, rebooted=rebooted)
+        return True
+
+    def _fault(self, drive: Joint, *, alone: bool = True) -> str:
+        """Return the fault of one servo as text, or "" if it reports none and may not be the one that raised the alert.
+
+        alone: the joint has no other servo, so the alert is certainly this one's.
+        """
+        try:
+            error = self._servos[drive].hardware_error()
+            cause = describe_error(error)
+        except DriverError as problem:
+            return fault_text(drive, f"unknown; it could not be read ({problem})")
+        cuts = True
+        with suppress(DriverError):
+            cuts = not error or shuts_down(self._servos[drive], error)
+        return fault_text(drive, cause, shuts_down=cuts) if alone or error else ""

@@ -1,0 +1,80 @@
+"""When the exchanges of a stream are due: the samples, the exchanges between them, and the read-backs before each."""
+
+from collections.abc import Iterator, Sequence
+from math import inf
+
+from hil.drivers.bus import ServoBus
+from hil.drivers.rate import FixedRate, Tick
+from hil.drivers.state import State
+from hil.experiment.guard import Guard
+
+_FORGETS = 0.98
+"""Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
+
+
+class Pace:
+    """Sends goals when they are due. Every method but `interval` may raise what `ServoBus.exchange` raises.
+
+    rate: samples per second. guard: is told when this program wakes up, and about goals that do not arrive.
+    """
+
+    def __init__(self, bus: ServoBus, rate: float, guard: Guard) -> None:
+        self._bus = bus
+        self._exchange = bus.prepared
+        self._clock = bus.port.clock
+        self._guard = guard
+        self._ticks = FixedRate(bus.port.clock, rate)
+        self.interval = 1 / rate
+        """Time between two samples [s]."""
+        self.turns = bus.exchanges_per_sample
+        """Number of exchanges per sample."""
+        self._apart = self.interval / self.turns
+        self._deadline: float | None = None
+        self._takes = 0.0
+        self._awake_at = -inf
+        self.sent_at: float | None = None
+        """When the latest goals were sent [s]; None before the first ones."""
+
+    def wait(self) -> Tick:
+        """Wait until the next sample is due. If a read-back is due, it takes place just before."""
+        former = self._deadline
+        if former is not None and self._exchange.read_back_at <= former + self.interval:
+            self._read_back(former + self.interval)
+        tick = self._ticks.wait()
+        deadline, now, _ = tick
+        awake_at = self._awake_at
+        self._guard.woke_up(now, now - (deadline if deadline > awake_at else awake_at))
+        self._deadline, self._awake_at = deadline, now
+        return tick
+
+    def send(self, goal: Sequence[float]) -> State:
+        """Send the goals of a sample [A or V]; return the state."""
+        state = self._bus.exchange(goal)
+        self.sent_at, self._awake_at = state.time_before_write, state.time_after_read
+        return state
+
+    def between(self, goal: Sequence[float]) -> Iterator[State]:
+        """Exchange the same goals until the next sample is due; yield each state.
+
+        An exchange that might delay the next sample is left out: the adapter may be slow, or a servo silent.
+        """
+        if self._deadline is None:
+            return
+        following = self._deadline + self.interval
+        for turn in range(1, self.turns):
+            due = self._deadline + turn * self._apart
+            if self._exchange.read_back_at <= due:
+                self._read_back(due)
+            self._clock.wait_until(due)
+            now = self._clock.now()
+            if now - due < self._apart and now + self._takes < following:
+                state = self._bus.exchange(goal, between=True)
+                self.sent_at, self._awake_at = state.time_before_write, state.time_after_read
+                self._takes = max(_FORGETS * self._takes, state.time_after_read - state.time_before_write)
+                yield state
+
+    def _read_back(self, due: float) -> None:
+        """Look for another master just before the exchange that is due at `due` [s]."""
+        self._bus.check_not_overruled(due)
+        if (lost := self._bus.goals_lost) is not None:
+            self._guard.goals_are_lost(*lost)

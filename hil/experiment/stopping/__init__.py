@@ -1,0 +1,1 @@
+"""Stops that leave the arm at rest: a spatial arm is braked, then lowered to its rest pose."""

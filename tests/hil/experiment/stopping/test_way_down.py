@@ -1,0 +1,164 @@
+"""When the way down exchanges what, on a scripted bus, with a lowering that only notes what it is given."""
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.config.schema import load_config
+from hil.drivers.state import State
+from hil.errors import ExperimentError
+from hil.experiment.stop_request import StopRequest
+from hil.experiment.stopping import way_down as module
+from hil.experiment.stopping.way_down import Stopped, WayDown
+from hil.plan.plan import Plan, Segment
+from hil.runs.recording import Phase, Recorder
+from tests.support.paths import CONFIGS
+from tests.support.stream.scripted_bus import JOINTS, TAKES_S, Bus, Checks
+
+
+class Lowers(Checks):
+    """In place of the lowering: a path of three samples, during which it notes what it is given."""
+
+    elsewhere = ""
+    lies_already = False
+
+    def lies(self, _state: State) -> bool:
+        return self.lies_already
+
+    def begin(self, _state: State, _goal: list[float], _recent: object, _watch: object) -> int:
+        return 3
+
+    def goals(self, index: int, _state: State) -> list[float]:
+        return [0.5 + 0.1 * index] * JOINTS
+
+    def look(self, index: int, _state: State, gap: float, *, between: bool = False) -> None:  # type: ignore[override]
+        self.calls.append(("look", index, round(gap, 6), between))
+
+    def lies_elsewhere(self, _state: State) -> str:
+        return self.elsewhere
+
+
+class Made:
+    """A way down whose stream was stopped right after its first exchange, at 0.05 s."""
+
+    def __init__(self, way: WayDown, bus: Bus) -> None:
+        self.way, self.bus = way, bus
+        lowering: Any = way._lowering
+        self.lowering: Lowers = lowering
+        bus.clock.wait_until(0.05)
+        state = bus.exchange([0.1] * JOINTS)
+        self.stopped = Stopped(state, state, [0.1] * JOINTS, state.time_before_write, 0)
+        bus.calls.clear()
+
+    def lower(self, **changes: Any) -> list[str]:
+        """Lower the arm; return what the error is told."""
+        error = ExperimentError("stopped")
+        self.way.lower(error, self.stopped._replace(**changes))
+        return getattr(error, "__notes__", [])
+
+
+Make = Callable[..., Made]
+
+
+@pytest.fixture
+def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
+    """Return a function that makes a way down at 20 Hz."""
+    monkeypatch.setattr(module, "Lowering", Lowers)
+    config = load_config(CONFIGS / "fake_two_link_ideal.toml")
+    segment = Segment("identify", None, np.full((8, JOINTS), 0.1), 4)  # type: ignore[arg-type]
+    plan = Plan(20.0, (segment,), 4, 8, 9, 4, 3, 0.01, 0.05)
+    opened: list[Recorder] = []
+
+    def made(turns: int = 1, takes: list[float] | None = None) -> Made:
+        recorder = Recorder(tmp_path / "samples.npy", JOINTS, 500)
+        opened.append(recorder)
+        bus: Any = Bus(config, turns, [TAKES_S, *(takes or [TAKES_S])])
+        guard: Any = Checks()
+        return Made(WayDown(bus, plan, config, recorder, StopRequest(), lambda _: None, guard, None), bus)
+
+    yield made
+    for recorder in opened:
+        recorder.close()
+
+
+@pytest.mark.parametrize("turns", [1, 2])
+def test_an_arm_is_lowered_at_the_usual_rate(make: Make, turns: int) -> None:
+    made = make(turns=turns)
+    bus, lowering = made.bus, made.lowering
+    bus.read_back_at = -math.inf
+    assert made.lower() == ["The arm was lowered to its rest pose."]
+    first = 0.05 + TAKES_S + 0.05  # the ticks begin with the way down
+    at = [round(first + 0.05 * index, 6) for index in range(3)]
+    assert bus.times("sample") == at
+    assert bus.times("between") == ([] if turns == 1 else [round(each + 0.025, 6) for each in at[:2]])
+    assert [call[2] for call in bus.calls if call[0] == "sample"] == pytest.approx([0.5, 0.6, 0.7])
+    between = [(0, 0.025, True), (1, 0.025, True)] if turns == 2 else [None, None]
+    apart = 0.05 / turns
+    wanted = [(0, 0.051, False), between[0], (1, apart, False), between[1], (2, apart, False)]
+    assert lowering.of("look") == [each for each in wanted if each is not None]
+    assert bus.times("read back")[-1] == at[-1]
+    samples = made.way._recorder.samples
+    assert len(samples) == 3 and set(samples["phase"]) == {Phase.LOWERING} and set(samples["period"]) == {-1}
+    lowering.elsewhere = "elsewhere"
+    assert made.lower(sent_at=None) == ["The arm was lowered, but not to its rest pose: elsewhere."]
+
+
+def test_ticks_missed_while_it_is_lowered_are_told_and_recorded(make: Make) -> None:
+    made = make(takes=[0.13, TAKES_S])
+    made.lower()
+    assert made.lowering.of("late") == [(0.13,)]
+    assert made.bus.times("sample") == [0.101, 0.231]
+    samples = made.way._recorder.samples
+    assert samples["missing"][:, 0].tolist() == [0, 1, 0]
+    assert set(samples["phase"]) == {Phase.LOWERING} and set(samples["period"]) == {-1}
+
+
+@pytest.mark.parametrize(
+    ("is_watched", "since", "is_lowered"), [(True, 0.1, True), (True, 0.11, False), (False, 0.11, True)]
+)
+def test_an_arm_whose_watchdogs_have_acted_cannot_be_lowered(
+    make: Make, is_watched: bool, since: float, is_lowered: bool
+) -> None:
+    """They act 25 ms after their 80 ms at the latest."""
+    made = make()
+    made.bus.is_watched = is_watched
+    made.bus.clock.wait_until(0.05 + since)
+    (told,) = made.lower()
+    assert ("was lowered" in told) is is_lowered and ("had already acted" in told) is not is_lowered
+    assert len(made.bus.calls) == (3 if is_lowered else 0)
+
+
+@pytest.mark.parametrize(("silent", "is_lowered"), [(0.05, True), (0.07, False)])
+def test_an_arm_is_lowered_without_replies_only_from_where_it_was_just_seen(
+    make: Make, silent: float, is_lowered: bool
+) -> None:
+    made = make()
+    state = made.stopped.whole
+    assert state is not None
+    made.bus.clock.wait_until(state.time_before_write + silent)
+    assert bool(made.lower(latest=state._replace(missing=(False, True)))) is is_lowered
+
+
+def test_an_arm_that_lies_or_was_not_seen_is_not_lowered(make: Make) -> None:
+    made = make()
+    assert made.lower(latest=None, whole=None) == [], "no state"
+    made.lowering.lies_already = True
+    assert made.lower() == []
+    made.lowering.lies_already = False
+    assert made.stopped.latest is not None
+    assert made.lower(latest=made.stopped.latest._replace(error=(128, 0))) == [] and not made.bus.calls
+    assert made.lower(sent_at=None) == ["The arm was lowered to its rest pose."]
+
+
+@pytest.mark.parametrize(("count", "asked"), [(0, 1), (1, 1), (2, 2)])
+def test_the_signals_so_far_do_not_end_the_lowering(make: Make, count: int, asked: int) -> None:
+    made = make()
+    told: list[int] = []
+    made.way._stop = SimpleNamespace(count=count, check_again=told.append)  # type: ignore[assignment]
+    made.lower()
+    assert told == [asked] * 3
