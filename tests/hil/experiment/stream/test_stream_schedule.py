@@ -46,6 +46,8 @@ class Bus:
         self.takes = takes
         self.calls: list[Call] = []
         self.velocity = NOTHING
+        self.moves_every = 1
+        """Number of exchanges of which the last one shows a velocity."""
         self.wobble = 0.0
         """Difference of two successive positions [rad]."""
         self.slow: Slow | None = None
@@ -60,7 +62,8 @@ class Bus:
         self.clock.wait_until(now + (self.takes.pop(0) if len(self.takes) > 1 else self.takes[0]))
         position, fine = (HELD + self.wobble * (len(self.calls) % 2),) * JOINTS, (False,) * JOINTS
         after, sent = self.clock.now(), tuple(goals)
-        return State(now, after, sent, sent, self.velocity, position, (0,) * JOINTS, fine, self.slow, self.status)
+        velocity = NOTHING if len(self.calls) % self.moves_every else self.velocity
+        return State(now, after, sent, sent, velocity, position, (0,) * JOINTS, fine, self.slow, self.status)
 
     def check_not_overruled(self, due: float) -> None:
         self.calls.append(("read back", round(due, 6)))
@@ -276,6 +279,14 @@ def test_an_arm_that_an_earlier_run_left_may_take_longer_to_come_to_rest(make: M
 def test_a_velocity_is_false_if_the_position_changes_by_one_step_at_most(make: Make, steps: int, message: str) -> None:
     stream, bus, _ = make()
     bus.velocity, bus.wobble = (0.0, 0.5), 0.99 * steps * abs(bus.joints[1].position_unit)
+    with pytest.raises(ExperimentError, match=message):
+        stream._rest()
+
+
+@pytest.mark.parametrize(("earlier", "message"), [(2, "one of the two readings is wrong"), (4, "The arm is moving")])
+def test_a_noisy_velocity_is_false_unless_it_has_only_just_begun(make: Make, earlier: int, message: str) -> None:
+    stream, bus, _ = make()
+    bus.velocity, bus.moves_every = (0.0, 0.5), earlier
     with pytest.raises(ExperimentError, match=message):
         stream._rest()
 
