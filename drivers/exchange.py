@@ -259,7 +259,11 @@ class Exchange:
             received = port.ask(read.request, read.reply_size, due - before, before)
         if port.overheard:
             self._overhear()
-        servos = read.unpack(received) or read.search(received)[0]
+        servos = read.unpack(received)
+        if servos is None:
+            # A master that writes between two cycles is heard here, and nowhere else if the next reply is complete.
+            servos = read.search(received)[0]
+            self.heard.beside(received, echoes=self._echoes)
         now = self._now()
         self.read_back_at = now
         if None in servos:

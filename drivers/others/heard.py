@@ -66,9 +66,7 @@ class Heard:
 
     def instead(self, read: GroupRead, received: bytes, answers: Sequence[Answer], now: float, *, echoes: bool) -> None:
         """Examine bytes received instead of the regular reply to `read`; `answers` were found in them."""
-        self._count_strangers(_packets_within(received), echoes=echoes)
-        if not echoes:
-            self.strangers += sum(self._is_anothers(*front) for front in _fronts_of_instructions(received))
+        self.beside(received, echoes=echoes)
         if any(front in self._expected - read.expected for front in _fronts_of_replies(received)):
             self._was_late(now)  # the beginning of a reply to an earlier request
         complete = sum(answer is not None for answer in answers) / len(answers)
@@ -76,6 +74,12 @@ class Heard:
             self.damaged_at, self.senders = now, read.senders(received)
             is_whole = len(received) == read.reply_size and len(self.senders) == len(self._ids)
             self.mixed_up += is_whole and set(self.senders) <= set(self._ids) and tuple(self.senders) != self._ids
+
+    def beside(self, received: bytes, *, echoes: bool) -> None:
+        """Count the packets of other masters among bytes received instead of a regular reply."""
+        self._count_strangers(_packets_within(received), echoes=echoes)
+        if not echoes:
+            self.strangers += sum(self._is_anothers(*front) for front in _fronts_of_instructions(received))
 
     def continued(self, before: bytes, received: bytes, now: float) -> None:
         """Examine bytes that may be the rest of a reply that was incomplete when time was up.

@@ -25,9 +25,10 @@ _STILL_TICKS = 2  # Present Velocity below which a joint counts as still
 def is_held(servo: Servo) -> bool:
     """Return whether the servo's torque is on and holds or drives its joint. Raises the same errors as `Servo.read`.
 
-    A tripped Bus Watchdog has zeroed the goal, so that in current and PWM mode the joint moves freely.
+    A tripped Bus Watchdog has zeroed the goal, so that in current and PWM mode the joint moves freely. Torque Enable is
+    read twice, because a reply does not tell which register it is about.
     """
-    if not servo.read("Torque Enable"):
+    if not (servo.read("Torque Enable") and servo.read("Torque Enable")):
         return False
     tripped = servo.read("Bus Watchdog") == WATCHDOG_TRIPPED
     return not (tripped and servo.read("Operating Mode") in (Mode.CURRENT, Mode.PWM))

@@ -42,8 +42,10 @@ from hil.setup.servo_session import has_moved
 
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4
-_STILL_STEPS = 1
-"""Largest change in the reading of a joint at rest, in encoder steps: the joint may rest between two steps."""
+_STILL_STEPS, _FALSE_STEPS = 1, 4
+"""Largest change in the reading of a joint at rest, in encoder steps: the joint may rest between two steps. Second
+value: distance that reported velocities must add up to before they count as false.
+"""
 
 _BY_OTHER_GOALS = {
     *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED, Cause.UNEXPECTED),
@@ -195,12 +197,17 @@ class Stream:
     def _false_velocity(self, state: State, window: int) -> str:
         """Which joint reports a velocity although its position has not changed in the last `window` samples.
 
-        One sample does not show it: at a low rate, a joint may have begun to move right before it.
+        The last sample does not show it: at a low rate, a joint may have begun to move right before it. Either the one
+        before has a velocity too, or earlier ones have some that would add up to several encoder steps.
         """
         moved = np.ptp(self._recorder.samples["position"][-window:], axis=0)
-        lasting = np.abs(self._recorder.samples["velocity"][-2:]).min(axis=0)
-        for joint, velocity, least, way in zip(self._bus.joints, state.velocity, lasting, moved, strict=True):
-            if least > self._config.safety.rest_velocity and way <= _STILL_STEPS * abs(joint.position_unit):
+        speed = np.abs(self._recorder.samples["velocity"][-window:])
+        fast = speed > self._config.safety.rest_velocity
+        distance = self._pace.interval * np.where(fast, speed, 0.0)[:-1].sum(axis=0)
+        for index, (joint, velocity, way) in enumerate(zip(self._bus.joints, state.velocity, moved, strict=True)):
+            step = abs(joint.position_unit)
+            is_false = fast[-2:, index].all() or (fast[-1, index] and distance[index] > _FALSE_STEPS * step)
+            if is_false and way <= _STILL_STEPS * step:
                 return (
                     f"{joint.title} reports a velocity of {velocity:.2f} rad/s before the start, but its position has "
                     f"changed by {way:.4f} rad in the last {window * self._pace.interval:.1f} s: one of the two "

@@ -387,6 +387,19 @@ def test_another_masters_instructions_before_a_read_back_are_counted() -> None:
     assert cycles.heard.strangers == 1
 
 
+@pytest.mark.parametrize("size", [None, 9])
+def test_another_masters_instructions_instead_of_a_read_back_are_counted(size: int | None) -> None:
+    wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])
+    cycles = read_back_of(wire)
+    cycles.cycle([0, 0])
+    assert cycles._read_back is not None
+    read = cycles._read_back.read
+    reply = b"".join(encode_status(servo, 0, bytes(read.reply_size // 2 - 11)) for servo in (1, 2))
+    wire.answers = [(encode(2, Instruction.WRITE, b"\x66\x00\x10\x00")[:size] + reply)[: read.reply_size]]
+    cycles.overruled(wire.now() + 0.1)
+    assert cycles.heard.strangers == 1
+
+
 def test_modes_are_read_back_before_goals_if_there_is_time_for_both() -> None:
     for available, asked in ((ONE_READ_BACK_S, [1]), (0.1, [1, 0])):
         wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])

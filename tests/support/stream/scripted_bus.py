@@ -32,6 +32,8 @@ class Bus:
         self.takes = takes
         self.calls: list[Call] = []
         self.velocity = NOTHING
+        self.moves_every = 1
+        """Number of exchanges of which the last one shows a velocity."""
         self.wobble = 0.0
         """Difference of two successive positions [rad]."""
         self.slow: Slow | None = None
@@ -46,7 +48,8 @@ class Bus:
         self.clock.wait_until(now + (self.takes.pop(0) if len(self.takes) > 1 else self.takes[0]))
         position, fine = (HELD + self.wobble * (len(self.calls) % 2),) * JOINTS, (False,) * JOINTS
         after, sent = self.clock.now(), tuple(goals)
-        return State(now, after, sent, sent, self.velocity, position, (0,) * JOINTS, fine, self.slow, self.status)
+        velocity = NOTHING if len(self.calls) % self.moves_every else self.velocity
+        return State(now, after, sent, sent, velocity, position, (0,) * JOINTS, fine, self.slow, self.status)
 
     def check_not_overruled(self, due: float) -> None:
         self.calls.append(("read back", round(due, 6)))

@@ -201,6 +201,14 @@ def test_a_velocity_is_false_if_the_position_changes_by_one_step_at_most(make: M
         stream._rest()
 
 
+@pytest.mark.parametrize(("earlier", "message"), [(2, "one of the two readings is wrong"), (4, "The arm is moving")])
+def test_a_noisy_velocity_is_false_unless_it_has_only_just_begun(make: Make, earlier: int, message: str) -> None:
+    stream, bus, _ = make()
+    bus.velocity, bus.moves_every = (0.0, 0.5), earlier
+    with pytest.raises(ExperimentError, match=message):
+        stream._rest()
+
+
 def settle(stream: Stream, differences: list[float], moved: float = 1.0, since: int = 0) -> list[int]:
     """Let the periods differ from the one before by `differences`; return which periods were played.
 
