@@ -17,9 +17,8 @@ from hil.estimation.plausibility import torque_scale_std
 from hil.estimation.result_checks import describe_segment_choice, describe_verdict
 from hil.estimation.slips.position_jumps import jump_warnings
 from hil.estimation.torque_constants import Source, contradictions, ratios_of, ratios_said
-from hil.estimation.unsettled.agreement import disagreement
 from hil.estimation.unsettled.angle_scale import angle_scale
-from hil.estimation.unsettled.causes import causes
+from hil.estimation.unsettled.causes import Fitted, causes
 from hil.estimation.unsettled.plausibility import implausible, undetermined
 from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.idim import fit_inverse_dynamics
@@ -121,14 +120,15 @@ def estimate_any(
     estimate, choice, held_out = _fitted(recordings, wanted, start, segment, zeros)
     estimate = considered(recordings, estimate)
     predicted = predicted_positions(recordings, estimate)
-    apart = () if given.jumps else disagreement(recordings, given.names, estimate, segment, zeros)
-    why = () if given.jumps or apart else causes(recordings, given.names, predicted, estimate)
+    plain = estimate if choice is None else choice.plain
+    fitted = Fitted(recordings, given.names, predicted, plain, estimate, gravity > 0.0)
+    why = () if given.jumps else causes(fitted)
     found = doubts_of(recordings, estimate, bool(why))
     conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
     ratios = ratios_of(estimate.names, estimate.value, estimate.std)
     contradictory = contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
-    scales = () if given.jumps or apart or why else angle_scale(recordings, estimate, given.origin)
-    odd = (*apart, *why, *scales, *contradictory, *implausible(recordings, estimate, gravity), *undetermined(estimate))
+    scales = () if given.jumps or why else angle_scale(recordings, estimate, given.origin)
+    odd = (*why, *scales, *contradictory, *implausible(recordings, estimate, gravity), *undetermined(estimate))
     if given.jumps:
         odd = (JUMPED, *odd)
     verdict = judge_segments(
@@ -136,12 +136,12 @@ def estimate_any(
         estimate,
         SegmentEvidence(
             held_out,
-            () if given.jumps or apart or why else missing_terms(recordings, estimate),
+            () if given.jumps or why else missing_terms(recordings, estimate),
             odd,
             bool(found.faults),
             bool(found.doubts),
             conflicts_found,
-            bool(given.jumps or apart or why),
+            bool(given.jumps or why),
             ratios_said(joints, ratios, given.torque_source, contradictory),
         ),
     )
