@@ -39,6 +39,7 @@ class Altered:
         self.estimate = estimate = _with_every_friction(found)
         self._recordings = recordings
         self._parts: dict[tuple[object, ...], Array | None] = {}
+        self._fits: dict[tuple[object, ...] | None, AlteredFit] = {}
         self.problem = Shooting(
             recordings,
             estimate.model,
@@ -94,6 +95,12 @@ class Altered:
 
     def fit(self, hypothesis: Hypothesis | None) -> AlteredFit:
         """Fit parameters, zeros and the defect. Raises ConvergenceError."""
+        key = None if hypothesis is None else (hypothesis.kind, hypothesis.joints, hypothesis.course)
+        if key not in self._fits:
+            self._fits[key] = self._fit(hypothesis)
+        return self._fits[key]
+
+    def _fit(self, hypothesis: Hypothesis | None) -> AlteredFit:
         posed, estimate = _Posed(self, hypothesis), self.estimate
         first = self._minimum(posed, estimate.value, np.zeros(posed.unknowns), estimate.own)
         unknowns = first.shared[first.shared.size - posed.unknowns :]
@@ -102,8 +109,7 @@ class Altered:
         ends = [first]
         if without is not None:
             with suppress(ConvergenceError):
-                begun = unknowns if hypothesis is not None and hypothesis.kind == "scale" else np.zeros(posed.unknowns)
-                ends.append(self._minimum(posed, without, begun, self.problem.start()))
+                ends.append(self._minimum(posed, without, unknowns, self.problem.start()))
         best = min(ends, key=lambda each: each.cost)
         rows = [posed.residual(k, best.shared, own) for k, own in enumerate(best.own)]
         used = np.full(self.segments, True) if hypothesis is None else hypothesis.used

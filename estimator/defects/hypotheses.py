@@ -88,7 +88,7 @@ def _may_develop(kind: Kind, course: CourseKind) -> bool:
 def _changes(
     joints: int, values: Mapping[str, float], torque: float
 ) -> Iterator[tuple[Kind, tuple[int, ...], tuple[Direction, ...]]]:
-    yield "load", (), _load(joints, values)
+    yield "load", (), _load(joints)
     friction: list[dict[str, float]] = []
     for joint in range(1, joints + 1):
         viscous, dry = {f"viscous_{joint}": 1.0}, {f"coulomb_{joint}": 1.0, f"load_{joint}": 1.0}
@@ -102,19 +102,11 @@ def _changes(
     yield "arm", (), tuple({name: 1.0} for name in base)
 
 
-def _load(joints: int, values: Mapping[str, float]) -> tuple[Direction, ...]:
-    """A mass anywhere on the last link: for two joints, by its mass and its first and second moment."""
+def _load(joints: int) -> tuple[Direction, ...]:
+    """A mass anywhere on the last link; of two joints, the second feels its first and second moment."""
     if joints == 1:
         return ({"inertia_1": 1.0}, {"gravity_1": 1.0})
-    coupling, weight = values["coupling"], values["gravity_2"]
-    if not weight:
-        return tuple({name: 1.0} for name in ("inertia_1", "coupling", "inertia_2"))
-    lever = coupling / weight  # length of link 1 over gravity
-    return (
-        {"gravity_1": 1.0, "inertia_1": values["gravity_1"] * lever / values["inertia_1"]},
-        {"gravity_2": 1.0, "coupling": 1.0},
-        {"inertia_2": 1.0},
-    )
+    return ({"inertia_1": 1.0}, {"gravity_1": 1.0}, {"gravity_2": 1.0, "coupling": 1.0}, {"inertia_2": 1.0})
 
 
 def _torque_gain(joint: int, values: Mapping[str, float]) -> Direction:
@@ -122,7 +114,7 @@ def _torque_gain(joint: int, values: Mapping[str, float]) -> Direction:
     if joint > 1:
         return {"torque_scale_2": 1.0}
     less = [name for name in values if term_of(name).unit in TORQUE_UNITS or name == "torque_scale_2"]
-    return dict.fromkeys(less, -1.0)
+    return {name: -values[name] if kind_of(name) == "offset" else -1.0 for name in less}
 
 
 def _courses(

@@ -16,7 +16,7 @@ from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 from hil.estimator.defects.altered import Altered, AlteredFit
-from hil.estimator.defects.hypotheses import Hypothesis, Kind, hypotheses
+from hil.estimator.defects.hypotheses import Course, Hypothesis, Kind, hypotheses
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.selection.candidates import colour
@@ -74,7 +74,21 @@ def probable_defect(recordings: Sequence[Recording], estimate: ShootingEstimate,
     found = _best(altered, likely, given, linear.independent)
     if found is None or found.hypothesis.course.kind != "step" or found.fit.left < EXPLAINED:
         return found
-    return _best(altered, [found.hypothesis, *_neighbours(found.hypothesis, every)], given, linear.independent)
+    nearer = _best(altered, _neighbours(found.hypothesis, every), given, linear.independent)
+    if nearer is None or nearer.fit.left > found.fit.left:
+        return found
+    # The others were fitted with the change at a wrong time.
+    then = [each for other in likely for each in every if _is_same(other, each, nearer.hypothesis.course)]
+    return _best(altered, then, given, linear.independent) or found
+
+
+def _is_same(hypothesis: Hypothesis, other: Hypothesis, course: Course) -> bool:
+    """Return whether `other` is the same as `hypothesis` but for its `course`, both being sudden changes."""
+    return (
+        hypothesis.course.kind == "step"
+        and other.course == course
+        and (other.kind, other.joints) == (hypothesis.kind, hypothesis.joints)
+    )
 
 
 def _different(scores: Sequence[_Score]) -> list[Hypothesis]:

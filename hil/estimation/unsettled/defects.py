@@ -74,7 +74,7 @@ def _scale(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tupl
 
 
 def _load(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
-    heavier = unknowns[-1] > 0.0 if len(unknowns) == 2 else unknowns[0] + unknowns[1] > 0.0
+    heavier = sum(unknowns) > 0.0
     if hypothesis.course.kind == "recording":
         change = f"The load seems to differ {when}"
     else:

@@ -126,7 +126,9 @@ def estimate_any(
     found = doubts_of(recordings, estimate, bool(why))
     conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
     ratios = ratios_of(estimate.names, estimate.value, estimate.std)
-    contradictory = contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
+    contradictory = (
+        () if why else contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
+    )
     scales = () if given.jumps or why else angle_scale(recordings, estimate, given.origin)
     odd = (*why, *scales, *contradictory, *implausible(recordings, estimate, gravity), *undetermined(estimate))
     if given.jumps:
