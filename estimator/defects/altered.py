@@ -18,6 +18,7 @@ from hil.estimator.options import ShootingOptions
 
 OPTIONS = ShootingOptions()
 QUICK = ShootingOptions(ftol=1e-3, max_step=OPTIONS.coarse_step, reweightings=1)
+NEARLY = 1.2  # mean square of the residual relative to the noise up to which a fit counts as converged
 IGNORED = 1e-3  # weight of a segment in which a sudden change happens
 
 
@@ -52,7 +53,6 @@ class Altered:
         zeros = () if estimate.zeros.size else tuple(f"zero_{joint}" for joint in range(1, joints + 1))
         added = (*(("torque_scale_2",) if joints == 2 else ()), *zeros)
         self.names = (*estimate.names, *(name for name in added if name not in estimate.names))
-        self.absolute = np.array([kind_of(name) in {"offset", "zero"} for name in self.names])
         self.values = {name: term_of(name).absent for name in self.names} | estimate.parameters
         self.offsets = estimate.zeros.reshape(-1) / OPTIONS.angle_scale
 
@@ -89,9 +89,10 @@ class Altered:
             return np.array([[float(name == zero) for zero in zeros] for name in self.names])
         return np.array([[each.get(name, 0.0) for each in hypothesis.directions] for name in self.names])
 
-    def sizes(self, value: Array) -> Array:
-        """Parameters (names,), with 1 for those that change by absolute amounts."""
-        return np.where(self.absolute, 1.0, value)
+    @staticmethod
+    def sizes(hypothesis: Hypothesis, value: Array) -> Array:
+        """What the changes of `direction` refer to: the parameters `value` (names,), or 1 if they are absolute."""
+        return np.ones_like(value) if hypothesis.is_absolute else value
 
     def fit(self, hypothesis: Hypothesis | None) -> AlteredFit:
         """Fit parameters, zeros and the defect. Raises ConvergenceError."""
@@ -102,15 +103,18 @@ class Altered:
 
     def _fit(self, hypothesis: Hypothesis | None) -> AlteredFit:
         posed, estimate = _Posed(self, hypothesis), self.estimate
-        first = self._minimum(posed, estimate.value, np.zeros(posed.unknowns), estimate.own)
+        first = posed.minimum(posed.begun(estimate.value, np.zeros(posed.unknowns)), estimate.own)
         unknowns = first.shared[first.shared.size - posed.unknowns :]
         # Friction at low speed was fitted to a recording with the defect, which may have led to a local minimum.
         without = None if hypothesis is None else self._without(hypothesis, unknowns)
         ends = [first]
         if without is not None:
             with suppress(ConvergenceError):
-                ends.append(self._minimum(posed, without, unknowns, self.problem.start()))
+                ends.append(posed.minimum(posed.begun(without, unknowns), self.problem.start()))
         best = min(ends, key=lambda each: each.cost)
+        if best.cost > NEARLY * sum(self.samples(k) for k in range(self.segments)):  # perhaps it has not converged
+            with suppress(ConvergenceError):
+                best = posed.minimum(best.shared, best.own, OPTIONS.ftol)
         rows = [posed.residual(k, best.shared, own) for k, own in enumerate(best.own)]
         used = np.full(self.segments, True) if hypothesis is None else hypothesis.used
         samples = sum(self.samples(k) for k in range(self.segments) if used[k])
@@ -119,21 +123,6 @@ class Altered:
             dict(zip(estimate.names, values.tolist(), strict=True)),
             best.shared[best.shared.size - posed.unknowns :],
             float(sum(row @ row for row, shown in zip(rows, used, strict=True) if shown)) / samples,
-        )
-
-    def _minimum(self, posed: "_Posed", value: Array, unknowns: Array, own: Array) -> Segmented:
-        start = np.concatenate((posed.coordinates.coordinates(value), self.offsets))
-        known = self.problem.expected(posed.coordinates, start, own)
-        extra = np.zeros(posed.unknowns)
-        prior = Expected(np.concatenate((known.centre, extra)), np.concatenate((known.precision, extra)), known.weight)
-        return minimise_segmented(
-            posed.residual,
-            posed.derivative,
-            np.concatenate((start, unknowns)),
-            own,
-            OPTIONS.ftol_refine,
-            OPTIONS.minimiser,
-            prior,
         )
 
     def _without(self, hypothesis: Hypothesis, unknowns: Array) -> Array | None:
@@ -173,6 +162,24 @@ class _Posed:
         self._scaled = hypothesis.joints if hypothesis is not None and hypothesis.kind == "scale" else ()
         self.unknowns = self._direction.shape[1] + len(self._scaled)
 
+    @property
+    def _is_absolute(self) -> bool:
+        return self._hypothesis is not None and self._hypothesis.is_absolute
+
+    def _sizes(self, value: Array) -> Array:
+        return value if self._hypothesis is None else self._altered.sizes(self._hypothesis, value)
+
+    def begun(self, value: Array, unknowns: Array) -> Array:
+        """Shared coordinates with these parameters and unknowns."""
+        return np.concatenate((self.coordinates.coordinates(value), self._altered.offsets, unknowns))
+
+    def minimum(self, shared: Array, own: Array, ftol: float = OPTIONS.ftol_refine) -> Segmented:
+        """Fit from these coordinates. Raises ConvergenceError."""
+        extra = np.zeros(self.unknowns)
+        known = self._altered.problem.expected(self.coordinates, shared[: shared.size - self.unknowns], own)
+        prior = Expected(np.concatenate((known.centre, extra)), np.concatenate((known.precision, extra)), known.weight)
+        return minimise_segmented(self.residual, self.derivative, shared, own, ftol, OPTIONS.minimiser, prior)
+
     def residual(self, number: int, shared: Array, own: Array) -> Array:
         problem, segment = self._altered.problem, self._altered.problem.segments[number]
         values, offsets = self._moved(number, shared)
@@ -187,9 +194,9 @@ class _Posed:
         rows, columns = problem.derivative_by_values(number, values, offsets, own, altered.names)
         shape, names = problem.segments[number].position.shape, len(altered.names)
         with np.errstate(over="ignore", invalid="ignore"):
-            growth = np.where(altered.absolute, 1.0, 1.0 + self._change(number, shared))[:count]
+            growth = 1.0 + (0.0 if self._is_absolute else 1.0) * self._change(number, shared)[:count]
             by_value = columns[:, :count] * growth @ self.coordinates.slopes(shared[:count])
-            by_defect = columns[:, :names] * altered.sizes(value) @ self._direction * self._strength(number)
+            by_defect = columns[:, :names] * self._sizes(value) @ self._direction * self._strength(number)
         scaled, angle = self._scaled_rows(number, rows.reshape(shape), shared)
         factor = np.broadcast_to(self._factors(shared)[:, None], shape).reshape(-1, 1)
         by_scale = np.zeros((*shape, len(self._scaled)))
@@ -217,7 +224,7 @@ class _Posed:
     def _moved(self, number: int, shared: Array) -> tuple[dict[str, float], Array]:
         """Parameters by name, and offsets of the zeros, in a segment."""
         altered, value = self._altered, self._constant(shared)
-        value = value + altered.sizes(value) * self._change(number, shared)
+        value = value + self._sizes(value) * self._change(number, shared)
         count = len(altered.estimate.names)
         return dict(zip(altered.names, value.tolist(), strict=True)), shared[count : count + altered.problem.zeros]
 

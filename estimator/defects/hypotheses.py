@@ -18,7 +18,7 @@ from hil.estimator.models.terms import kind_of, term_of
 Kind = Literal["scale", "load", "friction", "torque", "offset", "arm"]
 CourseKind = Literal["always", "step", "linear", "decay", "recording"]
 Direction = Mapping[str, float]
-"""Change of each parameter per unit of an unknown: relative to its value, for offsets and zeros absolute [its unit]."""
+"""Change of each parameter per unit of an unknown, relative to its value; of an offset, absolute [N m]."""
 
 MOST_STEPS = 24  # instants at which a sudden change is tried
 EDGE = 2  # segments before and after a sudden change
@@ -51,6 +51,11 @@ class Hypothesis:
     """The course during each segment (segments,)."""
     used: Mask
     """Segments that show it (segments,): not the one in which a sudden change happens."""
+
+    @property
+    def is_absolute(self) -> bool:
+        """Whether the changes of the parameters are not relative to their values."""
+        return self.kind in {"offset", "scale"}
 
     @property
     def unknowns(self) -> int:
@@ -114,7 +119,7 @@ def _torque_gain(joint: int, values: Mapping[str, float]) -> Direction:
     if joint > 1:
         return {"torque_scale_2": 1.0}
     less = [name for name in values if term_of(name).unit in TORQUE_UNITS or name == "torque_scale_2"]
-    return {name: -values[name] if kind_of(name) == "offset" else -1.0 for name in less}
+    return dict.fromkeys(less, -1.0)
 
 
 def _courses(

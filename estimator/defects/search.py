@@ -186,7 +186,7 @@ class _Linear:
 def _added(hypothesis: Hypothesis, altered: Altered, size: int) -> Array:
     """Return the derivative of all linear unknowns with respect to those of the hypothesis (size, unknowns)."""
     value = np.array([altered.values[name] for name in altered.names])
-    direction = altered.direction(hypothesis) * altered.sizes(value)[:, None]
+    direction = altered.direction(hypothesis) * altered.sizes(hypothesis, value)[:, None]
     added = np.concatenate((direction, np.zeros((size - len(direction), direction.shape[1]))))
     if hypothesis.kind != "scale":
         return added

@@ -101,13 +101,15 @@ def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> t
 
 
 def _torque(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
-    change, whose = 100.0 * unknowns[0], _joints(hypothesis)
+    # For the first joint, the unknown is the decrease of everything else.
+    factor = 1.0 / max(1.0 - unknowns[0], 0.1) if hypothesis.joints == (1,) else 1.0 + unknowns[0]
+    change, whose = 100.0 * (factor - 1.0), _joints(hypothesis)
     match hypothesis.course.kind:
         case "linear":
             said = f"The motor torque of {whose}, relative to its column, seems to change {when}, by {change:+.2g} %"
             return said, "A motor that heats up loses torque: record for a shorter time, or with less torque."
         case "recording":
-            said = f"The motor torque of {whose} seems to be {1.0 + unknowns[0]:.4g} times that of its column {when}"
+            said = f"The motor torque of {whose} seems to be {factor:.4g} times that of its column {when}"
             said += ", compared with the other recordings"
             return said, "Check the unit, the gear ratio and the torque constant behind that column."
         case _:

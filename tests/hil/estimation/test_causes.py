@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.estimation.unsettled.causes import causes
+from hil.estimation.unsettled import causes as looked_for
+from hil.estimation.unsettled.causes import Fitted, causes
 from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.torque_faults import suspect_clipped
 from hil.estimator.data.recording import Recording
@@ -26,8 +27,16 @@ def healthy(limit: float = np.inf) -> Recording:
 
 
 def found(recording: Recording, predicted: np.ndarray, left: float = 20.0) -> tuple[str, ...]:
-    estimate: Any = SimpleNamespace(residual_over_noise=np.array([1.0, left]), segment_length=1.0)
-    return causes([recording], ("arm.csv",), [predicted], estimate)
+    estimate: Any = SimpleNamespace(
+        residual_over_noise=np.array([1.0, left]), segment_length=1.0, zeros=np.empty((0, 2))
+    )
+    return causes(Fitted([recording], ("arm.csv",), [predicted], estimate, estimate, gravity=True))
+
+
+@pytest.fixture(autouse=True)
+def _without_defects_of_the_whole_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    """These need a fit: see test_defects."""
+    monkeypatch.setattr(looked_for, "likely_defect", lambda *_: None)
 
 
 def frozen(recording: Recording) -> Recording:
