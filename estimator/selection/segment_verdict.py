@@ -70,6 +70,12 @@ def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate) ->
     return relative
 
 
+def explains_well(recordings: Sequence[Recording], estimate: ShootingEstimate) -> bool:
+    """Whether the motion is explained down to the noise and determines every base parameter well."""
+    well = max(relative_std(recordings, estimate).values()) <= WELL_KNOWN
+    return well and float(estimate.residual_over_noise.max()) <= EXPLAINED
+
+
 def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, evidence: SegmentEvidence) -> Verdict:
     """Return the verdict on `estimate`, whose standard errors include the effect of omitted terms."""
     relative = relative_std(recordings, estimate)
