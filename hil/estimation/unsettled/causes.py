@@ -64,7 +64,7 @@ def _late(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return (
         f"The torque of joint {late.joint} seems to be logged about {1e3 * abs(late.delay):.2g} ms too {than}, "
         f"compared with the other joint: shifted by that, inverse dynamics leaves {100 * late.residual:.2g} % of the "
-        f"torque unexplained instead of {100 * late.residual_given:.2g} %. Shift its column, or log both at the same time.",
+        f"torque unexplained instead of {100 * late.residual_given:.2g} %. Shift its column, or log both together.",
     )
 
 
