@@ -24,7 +24,7 @@ from hil.estimator.selection.candidates import colour
 FEWEST_SEGMENTS = 6
 MOST_SEGMENTS = 400  # more would take too long
 EXPLAINED = 1.2  # mean square of the residual, relative to the noise
-FITTED = 4  # hypotheses, each of another kind or joint
+FITTED = 3  # hypotheses, each of another kind or joint
 CERTAIN = 2.0  # decrease of the sum of squares relative to that expected by chance
 LEAST = {"scale": 0.01, "load": 0.02, "friction": 0.04, "torque": 0.01, "offset": 0.01, "arm": 0.03}
 """Smallest change that matters: relative, for an offset relative to the RMS torque."""

@@ -16,7 +16,7 @@ from hil.estimator.selection.unsettled import QUICK
 from tests.support.recorded_arm import STEP
 from tests.support.recorded_motion import two_joints
 
-RATE, SECONDS, PARTS = 100.0, 10.0, 20
+RATE, SECONDS, PARTS = 100.0, 8.0, 20
 MIDDLE = 0.5 * SECONDS
 
 
