@@ -103,14 +103,17 @@ class Altered:
 
     def _fit(self, hypothesis: Hypothesis | None) -> AlteredFit:
         posed, estimate = _Posed(self, hypothesis), self.estimate
-        first = posed.minimum(posed.begun(estimate.value, np.zeros(posed.unknowns)), estimate.own)
-        unknowns = first.shared[first.shared.size - posed.unknowns :]
+        ends, unknowns = [], np.zeros(posed.unknowns)
+        with suppress(ConvergenceError):
+            ends.append(posed.minimum(posed.begun(estimate.value, unknowns), estimate.own))
+            unknowns = ends[0].shared[ends[0].shared.size - posed.unknowns :]
         # Friction at low speed was fitted to a recording with the defect, which may have led to a local minimum.
         without = None if hypothesis is None else self._without(hypothesis, unknowns)
-        ends = [first]
         if without is not None:
             with suppress(ConvergenceError):
                 ends.append(posed.minimum(posed.begun(without, unknowns), self.problem.start()))
+        if not ends:
+            raise ConvergenceError("the recordings cannot be fitted with this defect")
         best = min(ends, key=lambda each: each.cost)
         if best.cost > NEARLY * sum(self.samples(k) for k in range(self.segments)):  # perhaps it has not converged
             with suppress(ConvergenceError):

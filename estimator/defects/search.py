@@ -61,16 +61,19 @@ def probable_defect(recordings: Sequence[Recording], estimate: ShootingEstimate,
     altered = Altered(recordings, estimate)
     if not FEWEST_SEGMENTS <= altered.segments <= MOST_SEGMENTS:
         return None
+    try:
+        return _searched(altered, hypotheses(recordings, altered.problem.segments, altered.values, gravity))
+    except ConvergenceError:
+        return None
+
+
+def _searched(altered: Altered, every: Sequence[Hypothesis]) -> Defect | None:
     linear = _Linear.of(altered)
-    every = hypotheses(recordings, altered.problem.segments, altered.values, gravity)
     scores = sorted((linear.score(altered, each, len(every)) for each in every), key=lambda each: each.left)
     likely = _different([each for each in scores if each.evidence > CERTAIN])
     if not likely:
         return None
-    try:
-        given = altered.fit(None)
-    except ConvergenceError:
-        return None
+    given = altered.fit(None)
     found = _best(altered, likely, given, linear.independent)
     if found is None or found.hypothesis.course.kind != "step" or found.fit.left < EXPLAINED:
         return found
