@@ -18,7 +18,7 @@ from hil.estimator.options import ShootingOptions
 
 OPTIONS = ShootingOptions()
 QUICK = ShootingOptions(ftol=1e-3, max_step=OPTIONS.coarse_step, reweightings=1)
-NEARLY = 1.2  # mean square of the residual relative to the noise up to which a fit counts as converged
+HOPELESS = 100.0  # mean square of the residual relative to the noise above which a fit is not refined
 IGNORED = 1e-3  # weight of a segment in which a sudden change happens
 
 
@@ -94,12 +94,22 @@ class Altered:
         """What the changes of `direction` refer to: the parameters `value` (names,), or 1 if they are absolute."""
         return np.ones_like(value) if hypothesis.is_absolute else value
 
-    def fit(self, hypothesis: Hypothesis | None) -> AlteredFit:
-        """Fit parameters, zeros and the defect. Raises ConvergenceError."""
+    def fit(self, hypothesis: Hypothesis | None, near: AlteredFit | None = None) -> AlteredFit:
+        """Fit parameters, zeros and the defect. near: fit with another defect, whose parameters are a further initial
+        guess. Raises ConvergenceError.
+        """
         key = None if hypothesis is None else (hypothesis.kind, hypothesis.joints, hypothesis.course)
         if key not in self._fits:
             self._fits[key] = self._fit(hypothesis)
-        return self._fits[key]
+        found = self._fits[key]
+        if near is None or near.left > found.left:
+            return found
+        posed = _Posed(self, hypothesis)
+        value = np.array([near.values[name] for name in self.estimate.names])
+        with suppress(ConvergenceError):
+            again = posed.minimum(posed.begun(value, found.unknowns), self.problem.start(), OPTIONS.ftol)
+            found = min(found, self._result(posed, hypothesis, again), key=lambda each: each.left)
+        return found
 
     def _fit(self, hypothesis: Hypothesis | None) -> AlteredFit:
         posed, estimate = _Posed(self, hypothesis), self.estimate
@@ -115,15 +125,18 @@ class Altered:
         if not ends:
             raise ConvergenceError("the recordings cannot be fitted with this defect")
         best = min(ends, key=lambda each: each.cost)
-        if best.cost > NEARLY * sum(self.samples(k) for k in range(self.segments)):  # perhaps it has not converged
+        if best.cost < HOPELESS * sum(self.samples(k) for k in range(self.segments)):
             with suppress(ConvergenceError):
                 best = posed.minimum(best.shared, best.own, OPTIONS.ftol)
+        return self._result(posed, hypothesis, best)
+
+    def _result(self, posed: "_Posed", hypothesis: Hypothesis | None, best: Segmented) -> AlteredFit:
         rows = [posed.residual(k, best.shared, own) for k, own in enumerate(best.own)]
         used = np.full(self.segments, True) if hypothesis is None else hypothesis.used
         samples = sum(self.samples(k) for k in range(self.segments) if used[k])
-        values = posed.coordinates.values(best.shared[: len(estimate.names)])
+        values = posed.coordinates.values(best.shared[: len(self.estimate.names)])
         return AlteredFit(
-            dict(zip(estimate.names, values.tolist(), strict=True)),
+            dict(zip(self.estimate.names, values.tolist(), strict=True)),
             best.shared[best.shared.size - posed.unknowns :],
             float(sum(row @ row for row, shown in zip(rows, used, strict=True) if shown)) / samples,
         )

@@ -75,14 +75,14 @@ def _searched(altered: Altered, every: Sequence[Hypothesis]) -> Defect | None:
         return None
     given = altered.fit(None)
     found = _best(altered, likely, given, linear.independent)
-    if found is None or found.hypothesis.course.kind != "step" or found.fit.left < EXPLAINED:
+    if found is None or found.hypothesis.course.kind != "step":
         return found
-    nearer = _best(altered, _neighbours(found.hypothesis, every), given, linear.independent)
-    if nearer is None or nearer.fit.left > found.fit.left:
-        return found
-    # The others were fitted with the change at a wrong time.
-    then = [each for other in likely for each in every if _is_same(other, each, nearer.hypothesis.course)]
-    return _best(altered, then, given, linear.independent) or found
+    if found.fit.left > EXPLAINED:
+        near = [found.hypothesis, *_neighbours(found.hypothesis, every)]
+        found = _best(altered, near, given, linear.independent) or found
+    # Hypotheses with the change in different segments were compared on different data.
+    then = [each for other in likely for each in every if _is_same(other, each, found.hypothesis.course)]
+    return _best(altered, then, given, linear.independent, found.fit) or found
 
 
 def _is_same(hypothesis: Hypothesis, other: Hypothesis, course: Course) -> bool:
@@ -113,12 +113,18 @@ def _neighbours(hypothesis: Hypothesis, every: Sequence[Hypothesis]) -> list[Hyp
     return [*alike[max(0, at - 1) : at], *alike[at + 1 : at + 2]]
 
 
-def _best(altered: Altered, likely: Sequence[Hypothesis], given: AlteredFit, independent: float) -> Defect | None:
+def _best(
+    altered: Altered,
+    likely: Sequence[Hypothesis],
+    given: AlteredFit,
+    independent: float,
+    near: AlteredFit | None = None,
+) -> Defect | None:
     """Return the hypothesis that is most probable when fitted. independent: number of independent samples."""
     found: list[Defect] = []
     for hypothesis in likely:
         with suppress(ConvergenceError):
-            fit = altered.fit(hypothesis)
+            fit = altered.fit(hypothesis, near)
             if float(np.abs(fit.unknowns[-hypothesis.unknowns :]).max()) >= LEAST[hypothesis.kind]:
                 found.append(Defect(hypothesis, fit, given))
 
