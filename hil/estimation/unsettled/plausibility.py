@@ -12,7 +12,7 @@ from hil.estimator.models.terms import kind_of, term_of
 from hil.estimator.simulation.back_emf import limited
 
 TORQUE = (2e-3, 60.0)  # N m: the largest torque of the smallest and of the largest servos (PH54: 45 N m continuous)
-PENDULUM = (3e-3, 3.0)  # m: length of a pendulum with the joint's inertia and gravity
+PENDULUM = (0.01, 3.0)  # m: length of a pendulum with the joint's inertia and gravity
 LINK = (0.01, 2.0)  # m: length of link 1, which coupling and gravity_2 give
 SURE = 4.0  # standard errors
 UNKNOWN = 0.5  # standard error over value

@@ -16,3 +16,13 @@ def test_a_length_that_no_arm_has_is_named(time: float, named: bool) -> None:
     estimate: Any = SimpleNamespace(parameters=value, names=tuple(value), value=values, std=0.01 * values)
     found = implausible([SimpleNamespace(joints=0)], estimate, 9.81)  # type: ignore[list-item]
     assert any("link 1 would be" in said for said in found) is named
+
+
+@pytest.mark.parametrize(("inertia", "named"), [(0.0142, False), (1.42e-4, True)])
+def test_a_pendulum_of_a_few_millimetres_is_named(inertia: float, named: bool) -> None:
+    """Times of 0.1 times the true ones make inertia a hundred times smaller."""
+    value = {"inertia_1": inertia, "gravity_1": 0.46}
+    values = np.array(list(value.values()))
+    estimate: Any = SimpleNamespace(parameters=value, names=tuple(value), value=values, std=0.01 * values)
+    found = implausible([SimpleNamespace(joints=0)], estimate, 9.81)  # type: ignore[list-item]
+    assert any("pendulum 0.003 m long" in said for said in found) is named
