@@ -1,5 +1,5 @@
-"""Detection of motor torques that differ from the torque column: clipped by the drive, or timestamped by a different
-clock.
+"""Detection of motor torques that differ from the torque column: clipped by the drive, timestamped by a different
+clock, or of one joint late.
 
 As in the detection of reversed columns (`hil.estimator.baselines.signs`), the residual of inverse dynamics with the
 torque as given is compared with the residual with a modified torque.
@@ -20,6 +20,7 @@ BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
 """Clipping is tried at the torques that these fractions of the samples exceed."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
+LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
 EVALUATIONS = 30  # of the search for delay and drift
 MOST_SAMPLES = 30_000  # more would take too long
 
@@ -55,6 +56,19 @@ class ClockDrift:
     residual_given: float
 
 
+@dataclass(frozen=True)
+class Late:
+    """A joint whose torque column seems to be `delay` [s] later than those of the others; negative if earlier.
+
+    residual, residual_given: relative RMS of the worst joint's torque residual, with and without that correction.
+    """
+
+    joint: int
+    delay: float
+    residual: float
+    residual_given: float
+
+
 def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
     """Return the joints whose motion is explained much better by a limited torque."""
     given = _residuals(recordings)
@@ -76,6 +90,37 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
         if best is not None and best.residual < LESS_RESIDUAL * best.residual_given:
             found.append(best)
     return tuple(found)
+
+
+def suspect_late(recordings: Sequence[Recording]) -> Late | None:
+    """Return the joint whose torque has another delay than that of the others, if that explains the motion much better
+    than any delay of all.
+    """
+    joints = recordings[0].joints
+    if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
+        return None
+    unit = float(np.median([each.interval for each in recordings]))
+
+    def left(delays: Array) -> float:
+        found = _residuals([_delayed(each, delays) for each in recordings])
+        return np.inf if found is None else float(found.max())
+
+    common = min((left(np.full(joints, -unit * each)), each) for each in INTERVALS.tolist())
+    most = max(1, min(24, round(LATEST / unit)))
+    tried = [
+        Late(joint + 1, unit * steps, left(np.where(np.arange(joints) == joint, -unit * steps, 0.0)), common[0])
+        for joint in range(joints)
+        for steps in (*range(-most, 0), *range(1, most + 1))
+    ]
+    best = min(tried, key=lambda each: each.residual)
+    return best if best.residual < LESS_RESIDUAL * common[0] else None
+
+
+def _delayed(recording: Recording, delays: Array) -> Recording:
+    """Return the recording with each joint's torque delayed by `delays` (joints,) [s]."""
+    time = recording.time
+    rows = [np.interp(time - late, time, row) for late, row in zip(delays, recording.torque, strict=True)]
+    return replace(recording, torque=np.stack(rows))
 
 
 def suspect_drift(recordings: Sequence[Recording]) -> ClockDrift | None:

@@ -22,6 +22,7 @@ from hil.estimator.selection.verdict import (
     Verdict,
 )
 
+NEARLY_EXPLAINED = 1.5  # ratio of residual to noise up to which undetermined friction near standstill does no harm
 LITTLE_TORQUE = 0.1  # fraction of the RMS torque; gravity torques below this are negligible
 IMPROVEMENT = {
     "inertia": "faster motion",
@@ -68,6 +69,12 @@ def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate) ->
             size = max(abs(float(value)), least)
             relative[name] = float(std) / size if size else np.inf
     return relative
+
+
+def explains_well(recordings: Sequence[Recording], estimate: ShootingEstimate) -> bool:
+    """Whether the motion is nearly explained and determines every base parameter well."""
+    well = max(relative_std(recordings, estimate).values()) <= WELL_KNOWN
+    return well and float(estimate.residual_over_noise.max()) <= NEARLY_EXPLAINED
 
 
 def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, evidence: SegmentEvidence) -> Verdict:

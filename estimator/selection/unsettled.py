@@ -59,6 +59,8 @@ class SegmentChoice:
     trials: tuple[SegmentTrial, ...]
     chosen: SegmentTrial
     estimate: ShootingEstimate
+    plain: ShootingEstimate
+    """The first fit, without terms that could imitate a defect of the recordings."""
 
     @property
     def gained(self) -> float:
@@ -199,7 +201,7 @@ class _Search:
             best, chosen = self.fit(simple, plain) or best, plainest
         if not np.isfinite(chosen.score):
             raise ConvergenceError("no friction model could be fitted to half of the segments: record for longer")
-        return SegmentChoice(tuple(self._trials.values()), chosen, best)
+        return SegmentChoice(tuple(self._trials.values()), chosen, best, plain)
 
     def _seen(self, estimate: ShootingEstimate) -> bool:
         found = missing_terms(self._recordings, estimate)

@@ -16,6 +16,8 @@ Values = NDArray[np.float64]
 RATIO = "torque_scale"
 USUAL_RATIO_STD = math.hypot(USUAL_TORQUE_SPREAD, USUAL_TORQUE_SPREAD)
 CONTRADICTORY = 2.0  # standard deviations, those of the torque constants and of the ratio combined
+COLUMNS_APART = 1.0
+"""The same for torque columns of unknown accuracy: nobody vouches for the scale of either."""
 Source = Literal["constant", "column"]
 """Where a joint's torque comes from: its torque constant, or a column of a recording."""
 _STATES: dict[Source, str] = {"constant": "torque constants", "column": "torque columns"}
@@ -100,9 +102,10 @@ def contradictions(
     said = {each.name for each in known}
     found = []
     for joint, name, ratio in _ratios(joints, extra):
+        apart = COLUMNS_APART if source == "column" and name not in ratio_std else CONTRADICTORY
         spread = ratio_std.get(name) or USUAL_RATIO_STD
         value = max(ratio.value, 1e-6)
-        if name in said or not abs(math.log(value)) > CONTRADICTORY * math.hypot(spread, ratio.std / value):
+        if name in said or not abs(math.log(value)) > math.hypot(apart * spread, CONTRADICTORY * ratio.std / value):
             continue
         found.append(
             f"The {_STATES[source]} of {joints[0]} and {joint} contradict each other by a factor of "

@@ -16,6 +16,9 @@ from hil.recordings.missing_codes import without_codes
 from hil.recordings.plausible import refuse_degrees
 from hil.recordings.table import Table
 from hil.recordings.units import UNITS, unit_of, wrapped
+from hil.recordings.velocity import doubts as velocity_doubts
+from hil.recordings.velocity import notes as velocity_notes
+from hil.recordings.velocity import rates
 
 Values = NDArray[np.float64]
 
@@ -27,7 +30,7 @@ class Converted:
     """Recordings in SI units.
 
     names: one per recording. stepped: whether each joint's encoder resolution is known. columns: their description,
-    including guesses. notes: one sentence per guess or correction.
+    including guesses. notes: one sentence per guess or correction. doubts: one per contradiction among the columns.
     """
 
     recordings: tuple[Recording, ...]
@@ -35,6 +38,7 @@ class Converted:
     stepped: tuple[bool, ...]
     columns: Columns
     notes: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
 
 
 def convert(table: Table, columns: Columns) -> Converted:
@@ -53,6 +57,8 @@ def convert(table: Table, columns: Columns) -> Converted:
     )
     if columns.position_unit is None:  # that of `whole` may be guessed
         refuse_degrees(table.source, whole.position, time, position)
+    found = rates(table, time, position)
+    notes += velocity_notes(found)
     if whole.angles == "absolute":
         position = np.diff(position, axis=0, prepend=0.0)
     torque = np.stack([_torque(table, whole, joint, notes) for joint in range(len(whole.position))])
@@ -78,7 +84,9 @@ def convert(table: Table, columns: Columns) -> Converted:
     names = tuple(
         table.source if len(long) == 1 else f"{table.source}, part {number}" for number in range(1, len(long) + 1)
     )
-    return Converted(recordings, names, tuple(each is not None for each in steps), whole, tuple(notes))
+    return Converted(
+        recordings, names, tuple(each is not None for each in steps), whole, tuple(notes), velocity_doubts(found)
+    )
 
 
 def _is_long_enough(part: Rows, segment: float) -> bool:

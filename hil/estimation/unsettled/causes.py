@@ -1,26 +1,49 @@
 """Why a fit leaves much of the motion unexplained, if the recording itself shows it."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+from hil.estimation.unsettled.agreement import disagreement
+from hil.estimation.unsettled.defects import defect_said, is_certain, is_other_arm, likely_defect
 from hil.estimation.unsettled.local_defects import Array, local_defects, local_residual
-from hil.estimator.baselines.torque_faults import suspect_clipped, suspect_drift
+from hil.estimator.baselines.torque_faults import suspect_clipped, suspect_drift, suspect_late
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.selection.verdict import MUCH_LEFT
 
 
-def causes(
-    recordings: Sequence[Recording], names: Sequence[str], predicted: Sequence[Array], estimate: ShootingEstimate
-) -> tuple[str, ...]:
-    """Sentences on the cause: a local defect, a clipped torque or a clock that drifts; otherwise, where the residual is
-    large.
-
-    predicted: simulated positions of each recording (joints, samples) [rad].
+@dataclass(frozen=True)
+class Fitted:
+    """Fits of recordings. names: of the recordings. predicted: simulated positions of each (joints, samples) [rad].
+    plain: of a model without terms that could imitate a defect; estimate: of the chosen one. gravity: in the arm's
+    plane [m/s^2].
     """
+
+    recordings: Sequence[Recording]
+    names: Sequence[str]
+    predicted: Sequence[Array]
+    plain: ShootingEstimate
+    estimate: ShootingEstimate
+    gravity: float
+
+
+def causes(fitted: Fitted) -> tuple[str, ...]:
+    """Sentences on the cause: a defect of whole recordings, or several that disagree, a local defect, a clipped torque
+    or a clock that drifts; otherwise, where the residual is large.
+    """
+    recordings, names, estimate = fitted.recordings, fitted.names, fitted.estimate
+    defect = likely_defect(recordings, fitted.plain, estimate, fitted.gravity > 0.0)
+    said = () if defect is None else (defect_said(defect, names),)
+    if defect is not None and is_certain(defect) and not is_other_arm(defect):
+        return said
+    apart = disagreement(recordings, names, estimate, estimate.segment_length, estimate.zeros.size > 0)
+    if apart or (defect is not None and is_certain(defect)):
+        return apart or said
     if float(estimate.residual_over_noise.max()) <= MUCH_LEFT:
-        return ()
-    where = recordings, names, predicted, estimate.segment_length
-    return local_defects(*where) or _clipped(recordings) or _drifting(recordings) or local_residual(*where)
+        return said
+    where = recordings, names, fitted.predicted, estimate.segment_length
+    found = local_defects(*where) or _clipped(recordings) or _late(recordings) or _drifting(recordings)
+    return found or said or local_residual(*where)
 
 
 def _clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
@@ -30,6 +53,18 @@ def _clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
         f"{100 * each.residual:.2g} % of the torque unexplained instead of {100 * each.residual_given:.2g} %. A "
         "current limit or the supply voltage clips it (saturation): use the measured current, or smaller commands."
         for each in suspect_clipped(recordings)
+    )
+
+
+def _late(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    late = suspect_late(recordings)
+    if late is None:
+        return ()
+    than = "late" if late.delay > 0.0 else "early"
+    return (
+        f"The torque of joint {late.joint} seems to be logged about {1e3 * abs(late.delay):.2g} ms too {than}, "
+        f"compared with the other joint: shifted by that, inverse dynamics leaves {100 * late.residual:.2g} % of the "
+        f"torque unexplained instead of {100 * late.residual_given:.2g} %. Shift its column, or log both together.",
     )
 
 

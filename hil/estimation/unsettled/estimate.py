@@ -17,19 +17,19 @@ from hil.estimation.plausibility import torque_scale_std
 from hil.estimation.result_checks import describe_segment_choice, describe_verdict
 from hil.estimation.slips.position_jumps import jump_warnings
 from hil.estimation.torque_constants import Source, contradictions, ratios_of, ratios_said
-from hil.estimation.unsettled.agreement import disagreement
 from hil.estimation.unsettled.angle_scale import angle_scale
-from hil.estimation.unsettled.causes import causes
+from hil.estimation.unsettled.causes import Fitted, causes
 from hil.estimation.unsettled.plausibility import implausible, undetermined
-from hil.estimation.unsettled.warnings import doubts_of
+from hil.estimation.unsettled.warnings import Doubts, doubts_of
 from hil.estimator.baselines.idim import fit_inverse_dynamics
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
 from hil.estimator.models.conflicts import Conflict, conflicts
-from hil.estimator.selection.segment_verdict import SegmentEvidence, judge_segments
+from hil.estimator.selection.segment_verdict import SegmentEvidence, explains_well, judge_segments
 from hil.estimator.selection.segments import considered, missing_terms, predicted_positions
 from hil.estimator.selection.unsettled import SegmentChoice, choose_by_shooting, held_out_error
+from hil.estimator.selection.verdict import Verdict
 from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Validation, Zeros
 from hil.results.result import ShootingResult
 from hil.runs.recording import load_samples
@@ -121,30 +121,11 @@ def estimate_any(
     estimate, choice, held_out = _fitted(recordings, wanted, start, segment, zeros)
     estimate = considered(recordings, estimate)
     predicted = predicted_positions(recordings, estimate)
-    apart = () if given.jumps else disagreement(recordings, given.names, estimate, segment, zeros)
-    why = () if given.jumps or apart else causes(recordings, given.names, predicted, estimate)
+    plain = estimate if choice is None else choice.plain
+    fitted = Fitted(recordings, given.names, predicted, plain, estimate, gravity)
+    why = () if given.jumps else causes(fitted)
     found = doubts_of(recordings, estimate, bool(why))
-    conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
-    ratios = ratios_of(estimate.names, estimate.value, estimate.std)
-    contradictory = contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
-    scales = () if given.jumps or apart or why else angle_scale(recordings, estimate, given.origin)
-    odd = (*apart, *why, *scales, *contradictory, *implausible(recordings, estimate, gravity), *undetermined(estimate))
-    if given.jumps:
-        odd = (JUMPED, *odd)
-    verdict = judge_segments(
-        recordings,
-        estimate,
-        SegmentEvidence(
-            held_out,
-            () if given.jumps or apart or why else missing_terms(recordings, estimate),
-            odd,
-            bool(found.faults),
-            bool(found.doubts),
-            conflicts_found,
-            bool(given.jumps or apart or why),
-            ratios_said(joints, ratios, given.torque_source, contradictory),
-        ),
-    )
+    verdict = _judged(fitted, given, why, held_out, found)
     result = _result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3), stepped)
     result = replace(
         result,
@@ -160,6 +141,39 @@ def estimate_any(
     for warning in result.warnings:
         log.warning("%s: %s", shown_path, warning)
     return Estimated(result, predicted, estimate)
+
+
+def _judged(
+    fitted: Fitted, given: Given, why: tuple[str, ...], held_out: NDArray[np.float64] | None, found: Doubts
+) -> Verdict:
+    """The verdict. why: sentences on what is wrong with the recordings."""
+    recordings, estimate = fitted.recordings, fitted.estimate
+    conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
+    ratios = ratios_of(estimate.names, estimate.value, estimate.std)
+    spoiled = bool(given.jumps or why)
+    contradictory = (
+        () if why else contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
+    )
+    scales = () if spoiled else angle_scale(recordings, estimate, given.origin)
+    unknown, known_well = undetermined(estimate), explains_well(recordings, estimate)
+    odd = (*why, *scales, *contradictory, *implausible(recordings, estimate, fitted.gravity))
+    return judge_segments(
+        recordings,
+        estimate,
+        SegmentEvidence(
+            held_out,
+            () if spoiled else missing_terms(recordings, estimate),
+            (*((JUMPED,) if given.jumps else ()), *odd, *(() if known_well else unknown)),
+            bool(found.faults),
+            bool(found.doubts),
+            conflicts_found,
+            spoiled,
+            (
+                *(unknown if known_well else ()),
+                *(() if why else ratios_said(joints, ratios, given.torque_source, contradictory)),
+            ),
+        ),
+    )
 
 
 def conflicts_in(estimate: ShootingEstimate, given: Given) -> tuple[Conflict, ...]:

@@ -1,5 +1,6 @@
 """Detection of values that are impossible for a servo arm, for imported recordings; the usual cause is a wrong unit."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +12,8 @@ from hil.estimator.models.terms import kind_of, term_of
 from hil.estimator.simulation.back_emf import limited
 
 TORQUE = (2e-3, 60.0)  # N m: the largest torque of the smallest and of the largest servos (PH54: 45 N m continuous)
-PENDULUM = (3e-3, 3.0)  # m: length of a pendulum with the joint's inertia and gravity
+PENDULUM = (0.01, 3.0)  # m: length of a pendulum with the joint's inertia and gravity
+LINK = (0.01, 2.0)  # m: length of link 1, which coupling and gravity_2 give
 SURE = 4.0  # standard errors
 UNKNOWN = 0.5  # standard error over value
 SHOWN = 1e-3  # of the largest torque of a joint, or of a ratio: less counts as zero
@@ -23,6 +25,7 @@ def implausible(recordings: Sequence[Recording], estimate: ShootingEstimate, gra
     return [
         *_torques(recordings),
         *_pendulum(estimate, gravity),
+        *_link(estimate, gravity),
         *_weight(estimate, gravity),
         *([bound_sentence(late)] if late else []),
     ]
@@ -72,6 +75,22 @@ def _pendulum(estimate: ShootingEstimate, gravity: float) -> list[str]:
     return [
         f"Inertia and weight of joint 1 are those of a pendulum {length:.2g} m long: check the units of time and "
         "angle, and arm.gravity."
+    ]
+
+
+def _link(estimate: ShootingEstimate, gravity: float) -> list[str]:
+    """Check coupling * gravity / gravity_2, the length of link 1 whatever the unit of torque."""
+    value, names = estimate.parameters, list(estimate.names)
+    if gravity <= 0.0 or "coupling" not in value:
+        return []
+    if any(abs(value[name]) < SURE * float(estimate.std[names.index(name)]) for name in ("coupling", "gravity_2")):
+        return []
+    length = abs(value["coupling"] * gravity / value["gravity_2"]) if value["gravity_2"] else math.inf
+    if LINK[0] < length < LINK[1]:
+        return []
+    return [
+        f"By coupling and gravity_2, link 1 would be {length:.2g} m long: check the units of time and angle, and "
+        "arm.gravity."
     ]
 
 

@@ -34,13 +34,16 @@ MOST_RECORDINGS = 200
 
 @dataclass(frozen=True)
 class _Read:
-    """All recordings of one arm. notes: what was guessed, corrected or averaged, in sentences."""
+    """All recordings of one arm. notes: what was guessed, corrected or averaged, in sentences. doubts: contradictions
+    among the columns.
+    """
 
     recordings: tuple[Recording, ...]
     names: tuple[str, ...]
     stepped: tuple[bool, ...]
     columns: Columns
     notes: tuple[str, ...]
+    doubts: tuple[str, ...]
 
 
 def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder: Path | None) -> ShootingResult:
@@ -61,7 +64,7 @@ def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder:
     jumps = jump_sentences(whole.recordings, whole.names, whole.stepped)
     given = Given(names=read.names, jumps=jumps, origin=tuple(columns.zero or ()))
     found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped, given)
-    result = _named(found, read, gravity)
+    result = _doubted(_named(found, read, gravity), read.doubts)
     if config.known is not None:
         result = replace(result, physical=physical_of(result, config.known.quantities(), gravity))
     if folder is not None:
@@ -84,6 +87,7 @@ def _estimate_chain(
     jumps = jump_sentences(read.recordings, read.names, read.stepped, names)
     warnings = (*jumps, *found.result.warnings)
     result = replace(found.result, recordings=read.names, arm=arm, notes=read.notes, warnings=warnings)
+    result = _doubted(result, read.doubts)
     if folder is not None:
         _keep(folder, paths, config_path, config, read, found.predicted)
         urdf = Path(config.arm.urdf)
@@ -102,7 +106,7 @@ def _read(paths: Sequence[Path], columns: Columns) -> _Read:
         raise CsvError(f"{len(recordings)} recordings, more than {MOST_RECORDINGS}: give fewer files or episodes.")
     names = tuple(name for each in found for name in each.names)
     stepped = tuple(bool(all(flags)) for flags in zip(*(each.stepped for each in found), strict=True))
-    return _Read(_stepped_alike(recordings, found), names, stepped, found[0].columns, _notes(found))
+    return _Read(_stepped_alike(recordings, found), names, stepped, found[0].columns, _notes(found), _doubts(found))
 
 
 def _stepped_alike(recordings: tuple[Recording, ...], found: Sequence[Converted]) -> tuple[Recording, ...]:
@@ -115,6 +119,18 @@ def _stepped_alike(recordings: tuple[Recording, ...], found: Sequence[Converted]
 
 def _notes(found: Iterable[Converted]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(note for each in found for note in each.notes))
+
+
+def _doubts(found: Iterable[Converted]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(doubt for each in found for doubt in each.doubts))
+
+
+def _doubted(result: ShootingResult, doubts: Sequence[str]) -> ShootingResult:
+    """The result with these doubts in its verdict."""
+    if not doubts or result.verdict is None:
+        return result
+    trust = "with care" if result.verdict.trust == "yes" else result.verdict.trust
+    return replace(result, verdict=replace(result.verdict, trust=trust, sentences=(*result.verdict.sentences, *doubts)))
 
 
 def _zeroed(read: _Read, gravity: float) -> _Read:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.estimation.unsettled.causes import causes
+from hil.estimation.unsettled import causes as looked_for
+from hil.estimation.unsettled.causes import Fitted, causes
 from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.torque_faults import suspect_clipped
 from hil.estimator.data.recording import Recording
@@ -26,8 +27,16 @@ def healthy(limit: float = np.inf) -> Recording:
 
 
 def found(recording: Recording, predicted: np.ndarray, left: float = 20.0) -> tuple[str, ...]:
-    estimate: Any = SimpleNamespace(residual_over_noise=np.array([1.0, left]), segment_length=1.0)
-    return causes([recording], ("arm.csv",), [predicted], estimate)
+    estimate: Any = SimpleNamespace(
+        residual_over_noise=np.array([1.0, left]), segment_length=1.0, zeros=np.empty((0, 2))
+    )
+    return causes(Fitted([recording], ("arm.csv",), [predicted], estimate, estimate, 9.81))
+
+
+@pytest.fixture(autouse=True)
+def _without_defects_of_the_whole_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    """These need a fit: see test_defects."""
+    monkeypatch.setattr(looked_for, "likely_defect", lambda *_: None)
 
 
 def frozen(recording: Recording) -> Recording:
@@ -98,6 +107,13 @@ def test_clocks_that_drift_apart_are_named() -> None:
     (named,) = found(drifting(healthy()), healthy().position + 1e-4)
     drift = re.match(r"The delay of the torque drifts from .* \((-\d+) ppm\)", named)
     assert drift and float(drift[1]) == pytest.approx(-4000, rel=0.05) and "different clocks" in named
+
+
+def test_a_torque_of_one_joint_that_is_late_is_named() -> None:
+    recording = healthy()
+    torque = np.stack((recording.torque[0], np.interp(recording.time - 0.02, recording.time, recording.torque[1])))
+    (named,) = found(replace(recording, torque=torque), recording.position + 1e-4)
+    assert "The torque of joint 2 seems to be logged about 20 ms too late" in named
 
 
 def test_a_torque_that_the_drive_limits_is_named_with_the_limit() -> None:

@@ -25,7 +25,8 @@ JOINTS = ("joint 1", "joint 2", "joint 3")
     [
         (0.7, 2e-4, {}, True),
         (1.43, 2e-4, {}, True),
-        (1.25, 2e-4, {}, False),
+        (1.25, 2e-4, {}, True),
+        (1.12, 2e-4, {}, False),
         (1.25, 2e-4, {"torque_scale_2": 0.05}, True),
         (1.43, 2e-4, {"torque_scale_2": 0.3}, False),
         (1.43, 0.5, {}, False),

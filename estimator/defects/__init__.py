@@ -1,0 +1,1 @@
+"""Defects of recordings, told apart by what each would do to the residuals."""

@@ -1,0 +1,148 @@
+"""Sentences on defects of whole recordings: angles in a wrong scale, and what changed while the arm moved."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+from hil.estimator.data.recording import Recording
+from hil.estimator.defects.hypotheses import Course, Hypothesis
+from hil.estimator.defects.search import Defect, probable_defect
+from hil.estimator.fit.multiple_shooting import ShootingEstimate
+
+AS_WELL = 1.05  # largest mean square of the residual, relative to that of the chosen model
+WELL = 2.0  # mean square of the residual relative to the noise, up to which a defect is certain to be the cause
+MOSTLY = 0.8  # fraction of the residual that a defect must explain to be named at all
+
+
+def likely_defect(
+    recordings: Sequence[Recording], plain: ShootingEstimate, estimate: ShootingEstimate, gravity: bool
+) -> Defect | None:
+    """A defect that explains the recordings as well as the terms of `estimate` do; None if there is none.
+
+    plain: estimate of a model without terms that could imitate a defect.
+    """
+    found = probable_defect(recordings, plain, gravity)
+    if found is None or found.fit.left > AS_WELL * float((estimate.residual_over_noise**2).mean()):
+        return None
+    return found if found.explained > MOSTLY or found.fit.left < WELL else None
+
+
+def is_certain(defect: Defect) -> bool:
+    """Whether it leaves so little that no other cause need be sought."""
+    return defect.fit.left < WELL
+
+
+def is_other_arm(defect: Defect) -> bool:
+    """Whether one of several recordings seems to be of another arm, or of one with another load."""
+    return defect.hypothesis.course.kind == "recording" and defect.hypothesis.kind in {"arm", "load"}
+
+
+def defect_said(defect: Defect, names: Sequence[str]) -> str:
+    """A sentence on a defect, with the evidence and a remedy. names: of the recordings."""
+    hypothesis = defect.hypothesis
+    unknowns = defect.fit.unknowns[-hypothesis.unknowns :].tolist()
+    what, remedy = _WORDS[hypothesis.kind](hypothesis, unknowns, _when(hypothesis.course, names))
+    left, given = math.sqrt(defect.fit.left), math.sqrt(defect.given.left)
+    return f"{what}: with that, the residual is {left:.3g} times the noise instead of {given:.3g} times. {remedy}"
+
+
+def _when(course: Course, names: Sequence[str]) -> str:
+    which = f" of {names[course.recording]}" if len(names) > 1 and course.kind == "step" else ""
+    return {
+        "always": "",
+        "step": f"at about {course.time:.3g} s{which}",
+        "linear": "steadily in the course of the recording",
+        "decay": f"with a time constant of about {course.time:.2g} s",
+        "recording": f"in {names[course.recording]}" if course.recording < len(names) else "in one recording",
+    }[course.kind]
+
+
+def _joints(hypothesis: Hypothesis) -> str:
+    listed = " and ".join(map(str, hypothesis.joints))
+    return f"joint{'s' if len(hypothesis.joints) > 1 else ''} {listed}"
+
+
+def _scale(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
+    del when
+    factors = " and ".join(f"{1.0 + each:.4g}" for each in unknowns)
+    several = len(unknowns) > 1
+    given, true = ("angles", "ones") if several else ("angle", "one")
+    seem = "seem" if several else "seems"
+    return (
+        f"The {given} of {_joints(hypothesis)} {seem} to be {factors} times the true {true}",
+        "Check the unit, the ticks per turn and the belt or gear ratio between encoder and joint.",
+    )
+
+
+def _load(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
+    heavier = sum(unknowns) > 0.0
+    if hypothesis.course.kind == "recording":
+        change = f"The load seems to differ {when}"
+    else:
+        change = f"The load seems to have been {'picked up' if heavier else 'put down or lost'} {when}"
+    return change, "Use the part before or after it, or put each part in a file of its own."
+
+
+def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
+    each = unknowns if len(hypothesis.joints) > 1 else [sum(unknowns) / len(unknowns)]
+    whose = _joints(hypothesis)
+    percent = " and ".join(f"{100.0 * change:+.2g} %" for change in each)
+    match hypothesis.course.kind:
+        case "decay":
+            said = f"The friction of {whose} seems to be {percent} different at the beginning and to settle {when}"
+            return said, "Let the arm move for some minutes before you record, so that it is warm."
+        case "linear":
+            said = f"The friction of {whose} seems to change {when}, by {percent} of its value at the beginning"
+            return said, "Let the arm move for some minutes before you record, so that it is warm."
+        case "recording":
+            return f"The friction of {whose} seems to differ by {percent} {when}", "Estimate each recording separately."
+        case _:
+            said = f"The friction of {whose} seems to have changed by {percent} {when}"
+            return said, "Use the part before or after it, and look for what rubs."
+
+
+def _torque(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
+    # For the first joint, the unknown is the decrease of everything else.
+    factor = 1.0 / max(1.0 - unknowns[0], 0.1) if hypothesis.joints == (1,) else 1.0 + unknowns[0]
+    change, whose = 100.0 * (factor - 1.0), _joints(hypothesis)
+    match hypothesis.course.kind:
+        case "linear":
+            said = f"The motor torque of {whose}, relative to its column, seems to change {when}, by {change:+.2g} %"
+            return said, "A motor that heats up loses torque: record for a shorter time, or with less torque."
+        case "recording":
+            said = f"The motor torque of {whose} seems to be {factor:.4g} times that of its column {when}"
+            said += ", compared with the other recordings"
+            return said, "Check the unit, the gear ratio and the torque constant behind that column."
+        case _:
+            said = (
+                f"The motor torque of {whose}, relative to its column, seems to have changed by {change:+.2g} % {when}"
+            )
+            return said, "Check the supply voltage, the limits and the scale of that column."
+
+
+def _offset(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
+    del unknowns
+    verb = "differ" if hypothesis.course.kind == "recording" else "change"
+    return (
+        f"A constant torque on {_joints(hypothesis)} seems to {verb} {when}",
+        "A cable that pulls, a contact or a zero error of the current sensor has this effect.",
+    )
+
+
+def _arm(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
+    del unknowns
+    if hypothesis.course.kind == "recording":
+        return f"The arm {when} seems to be another one, or to carry another load", "Estimate each separately."
+    return (
+        f"The arm seems to be another one after a change {when}: load, mounting, servo or settings",
+        "Use the part before or after it, or put each part in a file of its own.",
+    )
+
+
+_WORDS: Mapping[str, Callable[[Hypothesis, Sequence[float], str], tuple[str, str]]] = {
+    "scale": _scale,
+    "load": _load,
+    "friction": _friction,
+    "torque": _torque,
+    "offset": _offset,
+    "arm": _arm,
+}

@@ -1,0 +1,127 @@
+"""Comparison of recorded velocities with the positions: a wrong time scale leaves no other trace.
+
+Parameters absorb a wrong time scale: an arm whose times are twice as long has four times the inertia. Only a second
+measurement that depends on time, such as a velocity column, shows it. Velocities are otherwise not used.
+"""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.recordings.table import Table
+from hil.recordings.units import split_head
+
+Values = NDArray[np.float64]
+
+WINDOW = 0.5  # s over which motion is averaged, so that noise and filters of the velocity hardly matter
+FEWEST_WINDOWS = 8
+LONGEST_LAG = 0.3  # s
+ALIKE = 0.99  # correlation of the two motions below which a column is not the velocity of that joint
+APART = 0.04  # relative difference that is worth a warning
+LATE = 0.02  # s likewise
+KNOWN_UNITS = (1.0, 180.0 / math.pi, 30.0 / math.pi, 30.0 / math.pi / 0.229)  # rad/s, deg/s, rpm, X-series ticks
+_VELOCITY = re.compile(r"(?<![a-z])(vel|velocity|speed|omega|dq|qd|qdot)(?![a-z])", re.I)
+_NOT_MEASURED = re.compile(
+    r"(?<![a-z])(des|desired|ref|reference|goal|target|sp|setpoint|cmd|commanded|err)(?![a-z])", re.I
+)
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A joint's velocity column: `factor` times the derivative of its position, `late` [s] behind it."""
+
+    column: str
+    factor: float
+    late: float
+
+
+def rates(table: Table, time: Values, position: Values) -> tuple[Rate, ...]:
+    """Compare the velocity columns with `position` (joints, rows) [rad] at `time` (rows,) [s].
+
+    () unless there is one column for each joint, and each follows that joint.
+    """
+    columns = _columns(table)
+    if len(columns) != len(position):
+        return ()
+    found = [_rate(name, time, row, table.columns[name]) for name, row in zip(columns, position, strict=True)]
+    known = tuple(each for each in found if each is not None)
+    return known if len(known) == len(position) else ()
+
+
+def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
+    """Sentences on velocities that contradict the positions."""
+    unit = min(KNOWN_UNITS, key=lambda each: max((abs(math.log(rate.factor / each)) for rate in found), default=0.0))
+    factors = [rate.factor / unit for rate in found]
+    wrong = [joint for joint, factor in enumerate(factors, 1) if abs(math.log(factor)) > APART]
+    if not wrong:
+        return ()
+    if len(found) > 1 and len(wrong) == len(found) and max(factors) < (1.0 + APART) * min(factors):
+        factor = float(np.mean(factors))
+        return (
+            f"The velocity columns are {factor:.3g} times the rates at which the positions change: the times, or "
+            f"both velocities, are in a wrong scale. If times are {factor:.3g} times too long, inertias are "
+            f"{factor**2:.3g} times too large: check the unit of time and the sample rate.",
+        )
+    return tuple(
+        f"Column {found[joint - 1].column!r} is {factors[joint - 1]:.3g} times the rate at which the position of joint "
+        f"{joint} changes: that velocity, the angle of joint {joint}{' or time' if len(found) == 1 else ''} is in a "
+        "wrong scale. Check units, gear ratio and sample rate."
+        for joint in wrong
+    )
+
+
+def notes(found: Sequence[Rate]) -> tuple[str, ...]:
+    """Sentences on velocities that are not simultaneous with the positions."""
+    return tuple(
+        f"Column {rate.column!r} is {1e3 * abs(rate.late):.2g} ms {'behind' if rate.late > 0.0 else 'ahead of'} the "
+        "position; velocities are not used."
+        for rate in found
+        if abs(rate.late) > LATE
+    )
+
+
+def _columns(table: Table) -> list[str]:
+    named = []
+    for name in table.columns:
+        words = re.sub(r"(?<=[a-z])(?=\d)|[_./\[\]\-]+", " ", split_head(name)[0])
+        if _VELOCITY.search(words) and not _NOT_MEASURED.search(words):
+            named.append(name)
+    return named
+
+
+def _rate(column: str, time: Values, position: Values, velocity: Values) -> Rate | None:
+    known = np.isfinite(time) & np.isfinite(position) & np.isfinite(velocity)
+    time, position, velocity = time[known], position[known], velocity[known]
+    if time.size < FEWEST_WINDOWS or np.any(np.diff(time) <= 0.0) or time[-1] - time[0] < FEWEST_WINDOWS * WINDOW:
+        return None
+    step = float(np.median(np.diff(time)))
+    travelled = np.concatenate(([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time))))
+    at = np.arange(time[0] + WINDOW + LONGEST_LAG, time[-1] - WINDOW - LONGEST_LAG, max(step, 0.02))
+    if at.size < FEWEST_WINDOWS:
+        return None
+    moved = _increase(at, time, position)
+    lags = np.arange(-LONGEST_LAG, LONGEST_LAG + 0.5 * step, min(step, 0.01))
+    each = [_increase(at + lag, time, travelled) for lag in lags]
+    if not moved.any() or not all(row.any() for row in each):
+        return None
+    alike = [float(np.corrcoef(moved, row)[0, 1]) for row in each]
+    best = int(np.argmax(np.abs(alike)))
+    if not abs(alike[best]) > ALIKE:
+        return None
+    # Noise on either side would bias a regression on it; the ratio of the sizes is in between.
+    factor = float(np.std(each[best]) / np.std(moved))
+    return Rate(column, factor, float(lags[best])) if alike[best] > 0.0 else None
+
+
+def _increase(at: Values, time: Values, values: Values) -> Values:
+    """Increase of `values` over a window around each time, averaged over as much."""
+    fine = np.linspace(-0.5 * WINDOW, 0.5 * WINDOW, 9)
+    mean = sum(
+        np.interp(at + shift + 0.5 * WINDOW, time, values) - np.interp(at + shift - 0.5 * WINDOW, time, values)
+        for shift in fine
+    )
+    return np.asarray(mean) / fine.size

@@ -1,0 +1,28 @@
+"""A length of link 1 that no arm has reveals a wrong unit of time."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.estimation.unsettled.plausibility import implausible
+
+
+@pytest.mark.parametrize(("time", "named"), [(1.0, False), (10.0, True), (0.1, True)])
+def test_a_length_that_no_arm_has_is_named(time: float, named: bool) -> None:
+    value = {"inertia_1": 0.02, "gravity_1": 1.5, "coupling": 0.008 * time**2, "gravity_2": 0.4}
+    values = np.array(list(value.values()))
+    estimate: Any = SimpleNamespace(parameters=value, names=tuple(value), value=values, std=0.01 * values)
+    found = implausible([SimpleNamespace(joints=0)], estimate, 9.81)  # type: ignore[list-item]
+    assert any("link 1 would be" in said for said in found) is named
+
+
+@pytest.mark.parametrize(("inertia", "named"), [(0.0142, False), (1.42e-4, True)])
+def test_a_pendulum_of_a_few_millimetres_is_named(inertia: float, named: bool) -> None:
+    """Times of 0.1 times the true ones make inertia a hundred times smaller."""
+    value = {"inertia_1": inertia, "gravity_1": 0.46}
+    values = np.array(list(value.values()))
+    estimate: Any = SimpleNamespace(parameters=value, names=tuple(value), value=values, std=0.01 * values)
+    found = implausible([SimpleNamespace(joints=0)], estimate, 9.81)  # type: ignore[list-item]
+    assert any("pendulum 0.003 m long" in said for said in found) is named
