@@ -34,11 +34,23 @@ class Bus:
         self.velocity = NOTHING
         self.wobble = 0.0
         """Difference of two successive positions [rad]."""
+        self.keeps_torque = True
+        self.error = (0,) * JOINTS
         self.slow: Slow | None = None
         self.status: Any = None
 
     def wait_longer(self, seconds: float) -> None:
         self.patience += seconds
+
+    def bear_others(self) -> None:
+        self.calls.append(("others",))
+
+    def accept_any_order(self) -> None:
+        self.calls.append(("any order",))
+
+    def has_torque(self) -> bool:
+        self.calls.append(("torque",))
+        return self.keeps_torque
 
     def exchange(self, goals: list[float], *, between: bool = False) -> State:
         now = self.clock.now()
@@ -46,7 +58,7 @@ class Bus:
         self.clock.wait_until(now + (self.takes.pop(0) if len(self.takes) > 1 else self.takes[0]))
         position, fine = (HELD + self.wobble * (len(self.calls) % 2),) * JOINTS, (False,) * JOINTS
         after, sent = self.clock.now(), tuple(goals)
-        return State(now, after, sent, sent, self.velocity, position, (0,) * JOINTS, fine, self.slow, self.status)
+        return State(now, after, sent, sent, self.velocity, position, self.error, fine, self.slow, self.status)
 
     def check_not_overruled(self, due: float) -> None:
         self.calls.append(("read back", round(due, 6)))

@@ -1,0 +1,49 @@
+"""How often a lowered arm is commanded, and how long its replies are awaited: as slowly as late replies require.
+
+Servos hold their latest goal, so an arm can be lowered with fewer exchanges than the experiment needs. If replies come
+too late for one exchange per sample, only every second or third sample is exchanged from then on, until the end.
+"""
+
+from math import ceil
+
+LONGER_S = 0.008
+"""How much longer than during the experiment replies are awaited [s]."""
+
+LONGEST_S = 0.022
+"""How long replies are awaited after some were missing [s]: longer than an adapter's latency timer of 16 ms."""
+
+LAST_S = 0.075
+"""Time after the latest reply at which waiting ends in any case [s]: torque must be off 25 ms later."""
+
+MARGIN_S = 0.002
+"""Time between the end of an exchange and the next goals [s]."""
+
+
+class Pace:
+    """interval: time between two samples [s]. patience: how long replies were awaited during the experiment [s].
+    is_blind: whether replies were missing in the latest exchange.
+    """
+
+    def __init__(self, interval: float, patience: float, *, is_blind: bool) -> None:
+        self._interval = interval
+        self._usual = patience + LONGER_S
+        self._is_blind = is_blind
+        self._was_late = False
+        self.every = 1
+        """Number of samples per exchange."""
+
+    def patience(self, unheard: float) -> float:
+        """How long the next exchange may wait for replies [s]. unheard: time since the latest reply of all servos."""
+        if not self._is_blind and not self._was_late:
+            return self._usual
+        return max(min(max(self._usual, LONGEST_S), LAST_S - unheard), self._usual - LONGER_S)
+
+    def took(self, seconds: float, *, missed: bool) -> None:
+        """Process an exchange that took `seconds` [s]. missed: whether replies were missing in the end."""
+        self._is_blind = missed
+        if missed or seconds <= self.every * self._interval:
+            return
+        # A single late reply may be due to a busy computer.
+        if self._was_late:
+            self.every = ceil((seconds + MARGIN_S) / self._interval)
+        self._was_late = True
