@@ -140,7 +140,7 @@ class Lowering:
         self._guard.holding(goal)
         self._obedience = Obedience(len(position))
         if watch is not None:
-            self._obedience.suspect(watch.residual(), velocity.tolist(), state.time_before_write)
+            self._obedience.suspect(watch.residual, velocity.tolist(), state.time_before_write)
         self._excess = deque[tuple[float, NDArray[np.float64]]]()
         self._against = np.zeros_like(position)
         return int(count)
@@ -175,7 +175,8 @@ class Lowering:
         velocity, now = np.array(self._recent.believed(state)), state.time_before_write
         turned = -1
         if self._watch is not None:
-            turned = self._obedience.look(self._watch.residual(state), velocity.tolist(), now)
+            self._watch.observe(state)
+            turned = self._obedience.look(self._watch.residual, velocity.tolist(), now)
         if turned >= 0:
             raise SafetyStop(
                 f"{self._config.joints[turned].joint.title} moves against its command: torque that its motion "

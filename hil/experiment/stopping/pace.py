@@ -10,7 +10,9 @@ LONGER_S = 0.008
 """How much longer than during the experiment replies are awaited [s]."""
 
 LONGEST_S = 0.022
-"""How long replies are awaited after some were missing [s]: longer than an adapter's latency timer of 16 ms."""
+"""How long replies are awaited once some have been late [s]: longer than an adapter's latency timer of 16 ms. Where
+replies are lost, asking again soon is better.
+"""
 
 LAST_S = 0.075
 """Time after the latest reply at which waiting ends in any case [s]: torque must be off 25 ms later."""
@@ -20,30 +22,29 @@ MARGIN_S = 0.002
 
 
 class Pace:
-    """interval: time between two samples [s]. patience: how long replies were awaited during the experiment [s].
-    is_blind: whether replies were missing in the latest exchange.
-    """
+    """interval: time between two samples [s]. patience: how long replies were awaited during the experiment [s]."""
 
-    def __init__(self, interval: float, patience: float, *, is_blind: bool) -> None:
+    def __init__(self, interval: float, patience: float) -> None:
         self._interval = interval
         self._usual = patience + LONGER_S
-        self._is_blind = is_blind
         self._was_late = False
         self.every = 1
         """Number of samples per exchange."""
 
-    def patience(self, unheard: float) -> float:
-        """How long the next exchange may wait for replies [s]. unheard: time since the latest reply of all servos."""
-        if not self._is_blind and not self._was_late:
+    def patience(self, unheard: float, *, are_late: bool) -> float:
+        """How long the next exchange may wait for replies [s].
+
+        unheard: time since the latest reply of all servos [s]. are_late: whether replies have just been too late.
+        """
+        if not are_late and not self._was_late:
             return self._usual
         return max(min(max(self._usual, LONGEST_S), LAST_S - unheard), self._usual - LONGER_S)
 
     def took(self, seconds: float, *, missed: bool) -> None:
         """Process an exchange that took `seconds` [s]. missed: whether replies were missing in the end."""
-        self._is_blind = missed
-        if missed or seconds <= self.every * self._interval:
+        if missed or seconds <= min(self.every * self._interval, self._usual):
             return
         # A single late reply may be due to a busy computer.
-        if self._was_late:
+        if self._was_late and seconds > self.every * self._interval:
             self.every = ceil((seconds + MARGIN_S) / self._interval)
         self._was_late = True

@@ -24,6 +24,9 @@ from hil.plan.plan import Plan
 from hil.plan.silence import BRIDGED_S
 from hil.runs.recording import Phase, Recorder, missed
 
+_RECENT_S = 0.1
+"""How long a late reply lets further ones be expected [s]."""
+
 
 class Stopped(NamedTuple):
     """Where a stream was stopped.
@@ -73,7 +76,7 @@ class WayDown:
         self._guard = guard
         self._watch = watch
         self._lowering = Lowering(config, plan, self._apart)
-        self._pace = Pace(self._interval, 0.0, is_blind=False)
+        self._pace = Pace(self._interval, 0.0)
         self._takes = 0.0
         self._alerts: list[bool] = []
         self._goal: list[float] = []
@@ -114,7 +117,7 @@ class WayDown:
         lowering, asked = self._lowering, max(1, self._stop.count)
         self._bus.bear_others()
         self._bus.prepared.accept_any_order()
-        self._pace = Pace(self._interval, self._bus.prepared.patience, is_blind=stopped.is_blind)
+        self._pace = Pace(self._interval, self._bus.prepared.patience)
         self._sent_at, self._heard_at, self._goal = self._clock.now(), state.time_before_write, stopped.goal
         # The path begins with the latest state that is known, which may be a few exchanges old.
         old = self._clock.now() - state.time_before_write if stopped.is_blind else 0.0
@@ -149,7 +152,9 @@ class WayDown:
     def _exchange(self, *, between: bool) -> State:
         """Exchange the present goals and adapt the pace to how long that takes."""
         pace, former = self._pace, self._pace.every
-        longer = pace.patience(self._clock.now() - self._heard_at) - self._bus.prepared.patience
+        now = self._clock.now()
+        are_late = now - self._bus.prepared.heard.late_at < _RECENT_S
+        longer = pace.patience(now - self._heard_at, are_late=are_late) - self._bus.prepared.patience
         if longer != 0.0:
             self._bus.prepared.wait_longer(longer)
         state = self._steps.corrected(self._bus.exchange(self._goal, between=between))

@@ -1,6 +1,7 @@
 """A scripted bus on a virtual clock, and checks that only note what they are given."""
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 from hil.config.schema import Config
@@ -35,6 +36,7 @@ class Bus:
         self.wobble = 0.0
         """Difference of two successive positions [rad]."""
         self.keeps_torque = True
+        self.heard = SimpleNamespace(late_at=-math.inf)
         self.error = (0,) * JOINTS
         self.slow: Slow | None = None
         self.status: Any = None
