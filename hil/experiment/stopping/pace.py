@@ -7,7 +7,9 @@ too late for one exchange per sample, only every second or third sample is excha
 from math import ceil
 
 LONGER_S = 0.008
-"""How much longer than during the experiment replies are awaited [s]."""
+"""How much longer replies are awaited than they took so far while the arm was lowered, or at first, than during the
+experiment [s].
+"""
 
 LONGEST_S = 0.022
 """How long replies are awaited once some have been late [s]: longer than an adapter's latency timer of 16 ms. Where
@@ -26,7 +28,9 @@ class Pace:
 
     def __init__(self, interval: float, patience: float) -> None:
         self._interval = interval
-        self._usual = patience + LONGER_S
+        self._least = patience
+        self._longest = 0.0
+        self._first = self._usual = max(patience, min(patience + LONGER_S, LONGEST_S))
         self._was_late = False
         self.every = 1
         """Number of samples per exchange."""
@@ -38,11 +42,15 @@ class Pace:
         """
         if not are_late and not self._was_late:
             return self._usual
-        return max(min(max(self._usual, LONGEST_S), LAST_S - unheard), self._usual - LONGER_S)
+        return max(min(max(self._least, LONGEST_S), LAST_S - unheard), LONGER_S)
 
     def took(self, seconds: float, *, missed: bool) -> None:
         """Process an exchange that took `seconds` [s]. missed: whether replies were missing in the end."""
-        if missed or seconds <= min(self.every * self._interval, self._usual):
+        if missed:
+            return
+        usual, self._longest = self._usual, max(self._longest, seconds)
+        self._usual = min(self._first, self._longest + LONGER_S)
+        if seconds <= min(self.every * self._interval, usual):
             return
         # A single late reply may be due to a busy computer.
         if self._was_late and seconds > self.every * self._interval:

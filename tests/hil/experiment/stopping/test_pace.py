@@ -22,6 +22,15 @@ def test_late_replies_are_awaited_longer_but_not_for_ever() -> None:
     assert pace.patience(0.02, are_late=False) == pytest.approx(0.005 + LONGER_S), "lost ones are asked for again soon"
     assert pace.patience(0.02, are_late=True) == LONGEST_S
     assert pace.patience(LAST_S - 0.015, are_late=True) == pytest.approx(0.015)
-    assert pace.patience(LAST_S, are_late=True) == pytest.approx(0.005)
-    pace.took(0.005, missed=False)
-    assert pace.patience(0.0, are_late=False) == pytest.approx(0.005 + LONGER_S) and pace.every == 1
+    assert pace.patience(LAST_S, are_late=True) == pytest.approx(LONGER_S)
+    pace.took(0.003, missed=False)
+    assert pace.patience(0.0, are_late=False) == pytest.approx(0.003 + LONGER_S) and pace.every == 1
+
+
+def test_what_an_unknown_adapter_might_take_is_not_awaited_once_it_is_known_to_be_fast() -> None:
+    pace = Pace(0.0167, 0.0177)
+    assert pace.patience(0.0, are_late=False) == LONGEST_S
+    for seconds in (0.0004, 0.001, 0.0004):
+        pace.took(seconds, missed=False)
+    assert pace.patience(0.0, are_late=False) == pytest.approx(0.001 + LONGER_S)
+    assert pace.patience(0.0, are_late=True) == LONGEST_S
