@@ -1,5 +1,6 @@
 """The servos of one arm on one port: preparation and the control cycle; torque is switched by `hil.drivers.torque`."""
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -14,9 +15,9 @@ from hil.drivers.preparation.cadence import CHECK_S, cadence
 from hil.drivers.preparation.prepare import (
     check_quiet,
     learn_latency,
+    overheard,
     overruled,
     prepare_servo,
-    shared,
 )
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
@@ -287,7 +288,7 @@ class ServoBus(TorqueSwitch):
         """Send goals, one per joint [A, or V in PWM mode], and return the arm's state.
 
         between: whether this exchange lies between two samples (`Exchange.cycle`).
-        A servo that does not reply is marked as missing. Raises PortLost; BusShared if instructions of another master
+        A servo that does not reply is marked as missing. Raises PortLost; BusOverheard if packets of another master
         are heard repeatedly; WrongReply if servos repeatedly answer with each other's ID; ValueError for a goal that is
         not a finite number.
         """
@@ -299,7 +300,7 @@ class ServoBus(TorqueSwitch):
         self._last_answers = reply.servos
         state = self._converter.state(ticks, reply)
         if (strangers := exchange.heard.strangers) > MOST_STRANGERS:
-            raise shared(f"has sent {strangers} packets, or requested them from servos,")
+            raise overheard(f"has sent {strangers} packets, or requested them from servos,")
         if exchange.heard.mixed_up > MOST_MIXED_UP:
             raise WrongReply(exchange.heard.mixed_up_advice(self.port.url))
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
@@ -346,6 +347,10 @@ class ServoBus(TorqueSwitch):
             f"Just before, {seen.register} of {self._drives[seen.place].title} was {seen.value} although "
             f"{seen.written} had been written{who}."
         )
+
+    def bear_others(self) -> None:
+        """From now on, do not raise BusOverheard for packets of another master; what it writes is still noticed."""
+        self.prepared.heard.strangers = -math.inf
 
     def read_status_next(self) -> None:
         """Read the servos' status in the next exchange, if they report one at all."""

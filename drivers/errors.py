@@ -10,6 +10,7 @@ DriverError
 ├── ServoRefused        a servo replied with an error code: access, range, limit
 ├── ServoFault          a servo reports a hardware error: overload, overheating, voltage
 ├── BusShared           another master is active on the same bus
+│   └── BusOverheard    its packets were heard; nothing shows that it has written anything
 ├── WrongModel          a different model, or one whose firmware is too old, replies at this ID
 ├── WrongSetting        a register holds a value that rules out an experiment
 │   └── TorqueHeld      torque is already on: another program holds or drives the arm
@@ -17,6 +18,7 @@ DriverError
 """
 
 __all__ = [
+    "BusOverheard",
     "BusShared",
     "DriverError",
     "NoReply",
@@ -78,6 +80,12 @@ class ServoFault(DriverError):
 class BusShared(DriverError):
     """Another master is sending instructions on this bus, or has written goals or modes. Example: a controller board
     wired next to the adapter.
+    """
+
+
+class BusOverheard(BusShared):
+    """Packets of another master have been heard, but nothing shows that it has written anything. Example: a program
+    that polls the servos' temperatures.
     """
 
 

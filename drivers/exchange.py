@@ -175,6 +175,14 @@ class Exchange:
         self._usual = self._plans[0]
         self._latest_plan = self._usual if is_usual else self._latest_plan
 
+    def accept_any_order(self) -> None:
+        """From now on, accept answers in any order. Use this only where the replies to one request have all arrived, or
+        count as lost, before the next request: nothing else shows to which of them an answer belongs.
+        """
+        for plan in self._plans:
+            if isinstance(plan.read, SyncRead):
+                plan.read.in_any_order = True
+
     def read_status_next(self) -> None:
         """Read the status in the next cycle instead of when it is due."""
         if self._status_every < _NEVER:

@@ -132,6 +132,8 @@ class SyncRead:
 
     def __init__(self, ids: Sequence[int], span: Span | Sequence[Span]) -> None:
         self._ids = tuple(ids)
+        self.in_any_order = False
+        """Whether answers are accepted in any order, as when some of them are late and others are not."""
         spans = one_each(span, len(self._ids))
         self._values = {servo_id: Struct(f"<B{own.format}") for servo_id, own in zip(ids, spans, strict=True)}
         span = spans[0]
@@ -169,6 +171,8 @@ class SyncRead:
         return answers
 
     def search(self, received: bytes) -> tuple[list[Answer], bool]:
+        if self.in_any_order:
+            return self._search_any_order(received)
         found: dict[int, Answer] = {}
         latest, is_repeated = -1, False
         for packet in Framer(longest=self._longest).feed(received):
@@ -185,6 +189,14 @@ class SyncRead:
         if is_repeated and len(found) < len(self._ids):
             found.clear()  # whose answers these are is unknown
         return [found.get(servo_id) for servo_id in self._ids], is_over
+
+    def _search_any_order(self, received: bytes) -> tuple[list[Answer], bool]:
+        found: dict[int, Answer] = {}
+        for packet in Framer(longest=self._longest).feed(received):
+            answer = self._answer(packet) if packet.is_status and packet.id in self._ids else None
+            if answer and found.setdefault(packet.id, answer) != answer:
+                return [None] * len(self._ids), False  # one of them belongs to another request or servo
+        return [found.get(servo_id) for servo_id in self._ids], len(found) == len(self._ids)
 
     def senders(self, received: bytes) -> list[int]:
         packets = Framer(longest=self._longest).feed(received)

@@ -83,10 +83,11 @@ class Cause(Enum):
         """Whether the servos still accept commands, so that an arm may be lowered under supervision.
 
         A servo that has lost its watchdog still obeys; if the watchdog had tripped, the loss of torque would be
-        detected during lowering. Missing replies may return: the arm continues without them for a moment.
+        detected during lowering. Missing replies may return: the arm continues without them for a moment. A servo that
+        has raised its alert may have kept its torque, which is read first.
         """
         others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
-        others.add(Cause.MISSING)
+        others |= {Cause.MISSING, Cause.ALERT}
         return self.allows_braking or self in others
 
 

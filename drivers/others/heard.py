@@ -43,7 +43,7 @@ class Heard:
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
         """Number of replies with one answer per servo but IDs that do not fit, since a reply was last late."""
-        self.strangers = 0
+        self.strangers: float = 0
         """Number of received packets that this program neither sent nor requested: another master is on the bus."""
 
     def expect(self, reads: Iterable[GroupRead]) -> None:

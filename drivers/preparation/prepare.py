@@ -2,7 +2,7 @@
 
 from contextlib import suppress
 
-from hil.drivers.errors import BusShared, NoReply, ServoFault, WrongReply, WrongSetting
+from hil.drivers.errors import BusOverheard, BusShared, NoReply, ServoFault, WrongReply, WrongSetting
 from hil.drivers.joint import Joint
 from hil.drivers.others.read_back import Overruled
 from hil.drivers.packet import Framer, HardwareError
@@ -73,12 +73,12 @@ def check_quiet(port: Port) -> None:
     heard = list(Framer().feed(port.read(_MOST_HEARD_BYTES, LISTEN_S)))
     targets = sorted({packet.id for packet in heard if not packet.is_status})
     if targets:
-        raise shared(f"is sending instructions to ID {', '.join(map(str, targets))}")
+        raise overheard(f"is sending instructions to ID {', '.join(map(str, targets))}")
 
 
-def shared(what: str) -> BusShared:
+def overheard(what: str) -> BusOverheard:
     """Return the error for a bus with another active master; `what` describes what that master does."""
-    return BusShared(
+    return BusOverheard(
         f"Another master {what} on this bus, or the adapter echoes what this program sends. Two masters corrupt each "
         "other's packets, and the other master's goals would move the arm too. Stop the other program or unplug the "
         "other controller; if there is none, switch off the adapter's echo."

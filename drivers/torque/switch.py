@@ -167,6 +167,10 @@ class TorqueSwitch:
         unconfirmed = set() if report is None else {joint for joint, _ in report.unconfirmed}
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
 
+    def has_torque(self) -> bool:
+        """Read whether every servo has its torque, outside the control cycle; False if one does not answer."""
+        return all(is_torque_on(servo) for servo in self._servos.values())
+
     def cut_foreign_torque(self, on: Collection[Joint]) -> None:
         """Cut torque that another program has switched on since `torque_off`; `torque_now` then shows the outcome."""
         interrupts: list[BaseException] = []

@@ -75,18 +75,17 @@ class ChainWatch:
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
-        joint = self._observe(state)
+        joint = self.observe(state)
         if joint >= 0:
             self._raise(joint, state)
 
-    def residual(self, state: State | None = None) -> Residual:
-        """What the model does not explain. A sample, if given, is processed first, without raising SafetyStop."""
-        if state is not None:
-            self._observe(state)
+    @property
+    def residual(self) -> Residual:
+        """What the model does not explain in the latest sample."""
         return Residual(self._observer.lacking, self._observer.torque, self._observer.is_beyond)
 
-    def _observe(self, state: State) -> int:
-        """Process a sample; return the joint whose motion is inconsistent, -1 if there is none."""
+    def observe(self, state: State) -> int:
+        """Process a sample without raising anything; return the joint whose motion is inconsistent, -1 if none is."""
         if any(state.missing):
             return -1
         goal, self._goal = self._goal, state.goal_current

@@ -68,7 +68,8 @@ class Guard:
     recent: the exchanges so far, if another guard has checked them.
 
     lowers_since: for an arm that is being lowered, the time of the last exchange that all servos answered [s]. Replies
-    may then be missing longer, and no advice about the experiment's torque is given.
+    may then be missing longer, temperatures, voltages and alerts are accepted as long as the servos have their torque,
+    and no advice about the experiment's torque is given.
     """
 
     def __init__(
@@ -117,7 +118,7 @@ class Guard:
         self._joints = _joint_records(config, planned, left_by_a_run)
         self._checks = JointChecks(self._joints, interval)
         self._apart = Apart()
-        self._status = StatusCheck(config)
+        self._status = StatusCheck(config, bears_errors=is_lowering)
         self._missing = self._silence.counts
         self._errors = [0] * len(config.joints)
         """Number of consecutive replies with values and an error, by joint."""
@@ -187,17 +188,17 @@ class Guard:
         """Check an exchange in which replies are missing or report an error, or that follows such an exchange."""
         now, missing, error = state.time_before_write, state.missing, state.error
         self._silence.ask(now)
-        # Lowering ends before an exchange that might last too long.
-        silent = 2.0 * state.time_after_read - now if self._is_lowering else now
+        # While the arm is lowered, an exchange may be awaited for a good part of the time that is allowed.
+        silent = state.time_after_read if self._is_lowering else now
         for index in range(len(missing)):
-            if error[index] & ALERT:
+            if error[index] & ALERT and not self._is_lowering:
                 self._stop(
                     index, Cause.ALERT, "raised its alert: read Hardware Error Status, find the cause, then reboot it."
                 )
             if missing[index]:
                 self._count_missing(index, error[index], silent, alone=not all(missing))
                 continue
-            self._count_errors(index, error[index])
+            self._count_errors(index, error[index] & ~ALERT)
             fault = self._checks.look_at(index, state, unsure, self._missing[index])
             if fault != joint_checks.FINE:
                 self._stop_for(fault, state)
@@ -455,6 +456,8 @@ class Guard:
 
     def _look_slow(self, slow: Slow) -> None:
         safety = self._safety
+        if self._is_lowering:
+            return  # the servos protect themselves, and holding on for seconds is better than dropping the arm
         for index, (celsius, volt) in enumerate(zip(slow.temperature, slow.voltage, strict=True)):
             if volt > 0.0 and not volt >= self._supply[index]:
                 self._supply[index] = volt

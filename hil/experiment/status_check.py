@@ -38,9 +38,13 @@ _HELD_BEFORE = 4
 
 
 class StatusCheck:
-    """Compares reported values with the commanded ones. `look` returns the fault, or None."""
+    """Compares reported values with the commanded ones. `look` returns the fault, or None.
 
-    def __init__(self, config: Config) -> None:
+    bears_errors: whether a hardware error that leaves the servo its torque is accepted.
+    """
+
+    def __init__(self, config: Config, *, bears_errors: bool = False) -> None:
+        self._bears_errors = bears_errors
         self._armed = round(config.safety.watchdog / WATCHDOG_UNIT)
         self._may_be_unwatched = config.safety.allow_no_watchdog
         self._half_tick = [0.5 * abs(joint.joint.drive_unit(12.0)) for joint in config.joints]
@@ -80,7 +84,7 @@ class StatusCheck:
 
         sent: the joint's goal in the same exchange [A or V]. now: time of the exchange [s].
         """
-        if status.hardware_error:
+        if status.hardware_error and not (self._bears_errors and status.torque):
             error = describe_error(HardwareError(status.hardware_error))
             return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then power-cycle it."
         if status.torque is False:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError
+from hil.drivers.errors import BusOverheard, DriverError
 from hil.drivers.rate import FixedRate
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
@@ -150,7 +150,7 @@ class Stream:
         """Play the whole plan. Raises ExperimentError, SafetyStop, StopRequested, PortLost."""
         try:
             self._play_all()
-        except ExperimentError as error:
+        except (ExperimentError, BusOverheard) as error:
             self.modes_seen_ago = self._bus.modes_seen_ago
             if isinstance(error, SafetyStop) and error.cause in _BY_OTHER_GOALS and self._bus.commanded_by_another:
                 error.add_note(self._bus.commanded_by_another)

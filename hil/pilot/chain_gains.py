@@ -14,20 +14,13 @@ from numpy.typing import NDArray
 from hil.config.schema import Config, StabiliserConfig
 from hil.drivers.servo_prior import servo_prior
 from hil.estimator.chain.simulation.rollout import ChainArms, inertias
+from hil.plan.gains import MOST_DAMPING, MOST_DRIVING, most_damping, most_stiffness
 from hil.plan.stabiliser import DELAY_SAMPLES
 
 Array = NDArray[np.float64]
 
 FREQUENCY, DAMPING_RATIO = 3.0, 0.7
 """Natural frequency [Hz] and damping ratio of each joint on the stabiliser's spring, unless the rate is too low."""
-
-MOST_DAMPING = 0.3
-"""Largest fraction of a joint's velocity that the damper may remove per sample, with the other joints free. At 1 or
-more, a single joint would oscillate.
-"""
-
-MOST_DRIVING = 0.3
-"""Largest fraction of a joint's damping that its spring's delay may undo."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +55,10 @@ class ChainGains:
 
     def stiffness_at(self, rate: float) -> Array:
         """Stiffness of each joint (joints,) at a rate [Hz], before rounding [N m/rad]."""
-        most: Array = MOST_DRIVING * rate / DELAY_SAMPLES * (self._damping_at(rate) + self.friction)
-        return np.minimum(self.stiffness, most)
+        return np.minimum(self.stiffness, most_stiffness(rate, self._damping_at(rate), self.friction))
 
     def _damping_at(self, rate: float) -> Array:
-        return np.minimum(self.damping, MOST_DAMPING * rate * self.lightest)
+        return np.minimum(self.damping, most_damping(rate, self.lightest))
 
     @property
     def sufficient_rate(self) -> float:

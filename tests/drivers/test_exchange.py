@@ -177,6 +177,18 @@ def test_the_usual_answer_is_unpacked_at_once_without_a_search(fast: bool, monke
     assert exchange(wire, fast=fast).cycle([0, 0]).servos == [(0, 3, 2, 1), (0x80, -1, 4, 5)]
 
 
+def test_answers_in_another_order_are_accepted_only_where_that_is_allowed() -> None:
+    first, second = answer(1, 3, 2, 1), answer(2, -1, 4, 5)
+    assert exchange(Wire([second + first])).cycle([0, 0]).servos == [None, None]
+    for received in (second + first, first + first + second):
+        any_order = exchange(Wire([received]))
+        any_order.accept_any_order()
+        assert any_order.cycle([0, 0]).servos == [(0, 3, 2, 1), (0, -1, 4, 5)]
+    mixed_up = exchange(Wire([first + answer(1, 7, 7, 7) + second]))
+    mixed_up.accept_any_order()
+    assert mixed_up.cycle([0, 0]).servos == [None, None], "two different answers with one ID"
+
+
 def test_a_fast_answer_from_other_servos_is_not_believed() -> None:
     wire = Wire([fast_answer((1, 0, state(3, 2, 1)), (3, 0, state(-1, 4, 5)))])
     assert exchange(wire, fast=True).cycle([0, 0]).servos == [(0, 3, 2, 1), None]

@@ -16,12 +16,16 @@ from numpy.typing import NDArray
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
+from hil.drivers.errors import BusOverheard
+from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import Cause, ExperimentError, SafetyStop
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
+from hil.experiment.stopping.pace import LONGEST_S
 from hil.plan.chain_model import torque_limits
 from hil.plan.chain_plan import SETTLE_IN, PathSegment
+from hil.plan.gains import most_damping, most_stiffness
 from hil.plan.obedience import Obedience
 from hil.plan.plan import Plan
 from hil.plan.recent_motion import RecentMotion
@@ -45,8 +49,10 @@ _FASTER = 1.3
 
 def may_lower(config: Config, error: BaseException) -> bool:
     """Whether this stop lowers the arm before torque is cut: configuration and cause must both allow it."""
-    if not config.is_chain or config.safety.stop == "cut" or not isinstance(error, ExperimentError):
+    if not config.is_chain or config.safety.stop == "cut":
         return False
+    if not isinstance(error, ExperimentError):
+        return isinstance(error, BusOverheard)
     return error.cause.allows_lowering if isinstance(error, SafetyStop) else True
 
 
@@ -67,13 +73,27 @@ class Lowering:
         self._planned = [float(peak) for peak in np.max([each.peak_goal for each in plan.segments], axis=0)]
         self._stiffness, self._damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
         self._constants = np.array([joint.torque_per_goal for joint in config.joints])
+        self._rate = plan.rate
+        self._gains = self._stiffness, self._damping
         self._growth = PULL_PER_S / plan.rate * self._stiffness
+        priors = [(len(joint.ids), servo_prior(joint.joint.servo)) for joint in config.joints]
+        self._lightest = np.array([servos * prior.armature.median for servos, prior in priors])
+        usual = np.array([servos * prior.viscous.median for servos, prior in priors])
+        self._friction = np.clip(self._thought.viscous, 0.0, usual)
         self._most_pull = PULL_SHARE * torque_limits(config)
         self._most_held = self._most_pull + np.array(self._planned) * self._constants
         self._fastest = RUNS_AWAY * np.array([joint.velocity_limit for joint in config.joints])
         self._fade = max(1, round(SETTLE_IN * plan.rate))
         self._rest = np.array(config.arm.rest_pose)
         self._thought.of(self._way.path(self._rest, np.zeros_like(self._rest)))  # compile in advance
+
+    def slow_down(self, every: int) -> None:
+        """From now on, goals are computed for every `every`-th sample only: spring and damper must be softer."""
+        rate = self._rate / every
+        stiffness, damping = self._gains
+        self._damping = np.minimum(damping, most_damping(rate, self._lightest))
+        self._stiffness = np.minimum(stiffness, most_stiffness(rate, self._damping, self._friction))
+        self._growth = PULL_PER_S / rate * self._stiffness
 
     def lies(self, state: State) -> bool:
         """Whether the arm is already at rest in its rest pose."""
@@ -108,18 +128,20 @@ class Lowering:
         self._share = np.clip((count - np.arange(count)) / self._fade, 0.0, 1.0)
         self._feed = (self._share * torque).T
         self._pull = np.zeros_like(position)
+        self.slow_down(1)
         self._position, self._velocity = self._path.position.T.copy(), self._path.velocity.T.copy()
         self._guard = Guard(
             _widened(self._config, self._path.position, velocity),
             self._planned,
             interval=self._interval,
+            patience=LONGEST_S,
             recent=recent,
             lowers_since=state.time_before_write,
         )
         self._guard.holding(goal)
         self._obedience = Obedience(len(position))
         if watch is not None:
-            self._obedience.suspect(watch.residual(), velocity.tolist(), state.time_before_write)
+            self._obedience.suspect(watch.residual, velocity.tolist(), state.time_before_write)
         self._excess = deque[tuple[float, NDArray[np.float64]]]()
         self._against = np.zeros_like(position)
         return int(count)
@@ -154,7 +176,8 @@ class Lowering:
         velocity, now = np.array(self._recent.believed(state)), state.time_before_write
         turned = -1
         if self._watch is not None:
-            turned = self._obedience.look(self._watch.residual(state), velocity.tolist(), now)
+            self._watch.observe(state)
+            turned = self._obedience.look(self._watch.residual, velocity.tolist(), now)
         if turned >= 0:
             raise SafetyStop(
                 f"{self._config.joints[turned].joint.title} is moving against its command: torque that the "

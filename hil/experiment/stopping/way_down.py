@@ -9,21 +9,23 @@ from typing import NamedTuple
 
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError
-from hil.drivers.rate import FixedRate
+from hil.drivers.errors import BusOverheard, DriverError
+from hil.drivers.packet import ALERT
 from hil.drivers.state import State
 from hil.drivers.torque.off import TRIP_S
-from hil.errors import ExperimentError, SafetyStop, StopRequested
+from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stopping.lowering import Lowering
+from hil.experiment.stopping.pace import Pace
+from hil.experiment.stopping.position_steps import PositionSteps
 from hil.plan.plan import Plan
 from hil.plan.silence import BRIDGED_S
 from hil.runs.recording import Phase, Recorder, missed
 
-LATE_REPLIES_S = 0.008
-"""How much longer replies are awaited while the arm is lowered [s]."""
+_RECENT_S = 0.1
+"""How long a late reply lets further ones be expected [s]."""
 
 
 class Stopped(NamedTuple):
@@ -65,7 +67,6 @@ class WayDown:
         self._bus = bus
         self._clock = bus.port.clock
         self._config = config
-        self._rate = plan.rate
         self._interval = 1 / plan.rate
         self._turns = bus.exchanges_per_sample
         self._apart = self._interval / self._turns
@@ -75,17 +76,25 @@ class WayDown:
         self._guard = guard
         self._watch = watch
         self._lowering = Lowering(config, plan, self._apart)
+        self._pace = Pace(self._interval, 0.0)
         self._takes = 0.0
+        self._alerts: list[bool] = []
         self._goal: list[float] = []
-        self._deadline = self._sent_at = 0.0
+        self._deadline = self._sent_at = self._heard_at = 0.0
 
-    def lower(self, error: ExperimentError, stopped: Stopped) -> None:
+    def lower(self, error: ExperimentError | BusOverheard, stopped: Stopped) -> None:
         """Brake and lower the arm until it is at rest, a check fails, or a second signal arrives. Never raises.
 
         error: the stop, which is told how this ended.
         """
         state = stopped.whole
-        if state is None or stopped.latest is None or any(stopped.latest.error) or self._lowering.lies(state):
+        if state is None or stopped.latest is None or self._lowering.lies(state):
+            return
+        self._alerts = [bool(each & ALERT) for each in stopped.latest.error]
+        if any(each & ~ALERT for each in stopped.latest.error):
+            return
+        is_alert = isinstance(error, SafetyStop) and error.cause is Cause.ALERT
+        if (is_alert or any(self._alerts)) and not self._bus.has_torque():
             return
         if stopped.is_blind and self._clock.now() - state.time_before_write > BRIDGED_S:
             return
@@ -107,32 +116,56 @@ class WayDown:
     def _follow(self, state: State, stopped: Stopped) -> State:
         """Follow the path home; return the last state. Raises SafetyStop, StopRequested, DriverError."""
         lowering, asked = self._lowering, max(1, self._stop.count)
-        # The deadlines missed so far are not those of the way down.
-        ticks = FixedRate(self._clock, self._rate)
-        self._sent_at, self._goal = self._clock.now(), stopped.goal
-        # Replies that are merely late are worth a missed deadline: without them, nothing corrects the way down.
-        self._bus.prepared.wait_longer(LATE_REPLIES_S)
+        self._bus.bear_others()
+        self._bus.prepared.accept_any_order()
+        self._pace = Pace(self._interval, self._bus.prepared.patience)
+        self._sent_at, self._heard_at, self._goal = self._clock.now(), state.time_before_write, stopped.goal
         # The path begins with the latest state that is known, which may be a few exchanges old.
         old = self._clock.now() - state.time_before_write if stopped.is_blind else 0.0
-        passed = round(old / self._interval)
-        for index in range(passed, lowering.begin(state, self._goal, self._guard.recent, self._watch)):
-            for checked in self._between_samples() if index > passed else ():
-                lowering.look(index - 1, checked, checked.time_before_write - state.time_before_write, between=True)
-                state = checked
-            if index > passed:
-                self._look_for_another_master(self._interval)
-            deadline, now, late = ticks.wait()
-            self._deadline = deadline
+        index = first = round(old / self._interval)
+        self._steps = PositionSteps(state)
+        count = lowering.begin(state, self._goal, self._guard.recent, self._watch)
+        # The first goals are sent at once: until then those that led to the stop drive the arm.
+        start = self._clock.now() - first * self._interval
+        while index < count:
+            self._deadline = start + index * self._interval
+            if index > first:
+                self._look_for_another_master(self._deadline)
+            self._clock.wait_until(self._deadline)
+            now = self._clock.now()
             self._stop.check_again(asked)
-            if late:
-                self._recorder.keep(deadline, Phase.LOWERING, stopped.segment, -1, missed(self._goal, now))
+            if index > first and now - self._deadline >= self._interval:
+                self._recorder.keep(self._deadline, Phase.LOWERING, stopped.segment, -1, missed(self._goal, now))
                 lowering.late(now - self._sent_at)
+                index += 1
                 continue
             self._goal = lowering.goals(index, state)
-            former, state = state.time_before_write, self._bus.exchange(self._goal)
-            self._sent_at = state.time_before_write
-            self._recorder.keep(deadline, Phase.LOWERING, stopped.segment, -1, state)
+            former, state = state.time_before_write, self._exchange(between=False)
+            self._recorder.keep(self._deadline, Phase.LOWERING, stopped.segment, -1, state)
+            self._look_at_alerts(state)
             lowering.look(index, state, state.time_before_write - former)
+            for checked in self._between_samples() if index + 1 < count else ():
+                lowering.look(index, checked, checked.time_before_write - state.time_before_write, between=True)
+                state = checked
+            index += self._pace.every
+        return state
+
+    def _exchange(self, *, between: bool) -> State:
+        """Exchange the present goals and adapt the pace to how long that takes."""
+        pace, former = self._pace, self._pace.every
+        now = self._clock.now()
+        are_late = now - self._bus.prepared.heard.late_at < _RECENT_S
+        longer = pace.patience(now - self._heard_at, are_late=are_late) - self._bus.prepared.patience
+        if longer != 0.0:
+            self._bus.prepared.wait_longer(longer)
+        state = self._steps.corrected(self._bus.exchange(self._goal, between=between))
+        self._sent_at = state.time_before_write
+        took, is_missed = state.time_after_read - state.time_before_write, any(state.missing)
+        self._takes = max(self._takes, took)
+        self._heard_at = self._heard_at if is_missed else state.time_before_write
+        pace.took(took, missed=is_missed)
+        if pace.every != former:
+            self._lowering.slow_down(pace.every)
         return state
 
     def _between_samples(self) -> Iterator[State]:
@@ -141,24 +174,31 @@ class WayDown:
         An exchange that might delay the next sample is left out.
         """
         following = self._deadline + self._interval
-        for turn in range(1, self._turns):
+        for turn in range(1, self._turns if self._pace.every == 1 else 1):
             due = self._deadline + turn * self._apart
-            self._look_for_another_master(turn * self._apart)
+            self._look_for_another_master(due)
             self._clock.wait_until(due)
             now = self._clock.now()
             if now - due < self._apart and now + self._takes < following:
-                state = self._bus.exchange(self._goal, between=True)
-                self._sent_at = state.time_before_write
-                self._takes = max(self._takes, state.time_after_read - state.time_before_write)
-                yield state
+                yield self._exchange(between=True)
 
-    def _look_for_another_master(self, later: float) -> None:
-        """If a read-back is due, do it just before the exchange that is due `later` [s] after the sample."""
-        if self._bus.prepared.read_back_at <= self._deadline + later:
-            self._bus.check_not_overruled(self._deadline + later)
+    def _look_at_alerts(self, state: State) -> None:
+        """Raise SafetyStop if a servo has raised its alert since the last exchange and some servo has no torque."""
+        alerts = [bool(error & ALERT) for error in state.error]
+        new = [joint for joint, now, before in zip(self._bus.joints, alerts, self._alerts, strict=True) if now > before]
+        if not new:
+            return
+        self._alerts = [now or before for now, before in zip(alerts, self._alerts, strict=True)]
+        if not self._bus.has_torque():
+            raise SafetyStop(f"{new[0].title} raised its alert, and a servo has lost its torque.", Cause.ALERT)
+
+    def _look_for_another_master(self, due: float) -> None:
+        """If a read-back is due, do it just before the exchange that is due at `due` [s]."""
+        if self._bus.prepared.read_back_at <= due:
+            self._bus.check_not_overruled(due)
             if (lost := self._bus.goals_lost) is not None:
                 self._guard.goals_are_lost(*lost)
 
-    def _told(self, error: ExperimentError, what: str) -> None:
+    def _told(self, error: ExperimentError | BusOverheard, what: str) -> None:
         error.add_note(what)
         self._note(what)

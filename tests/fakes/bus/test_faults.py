@@ -100,6 +100,15 @@ def test_late_reply_comes_after_the_next_ones(bench: Any) -> None:
     assert bench.bus.read(14, 0.1) == PONG
 
 
+def test_a_late_reply_holds_back_those_behind_it(bench: Any) -> None:
+    """They are in the same buffer of the adapter: bytes of one group read never overtake each other."""
+    late = Fault(kind="late_reply", servo=1, amount=0.005)
+    bench.bus.faults.add(late)
+    bench.bus.write(encode(BROADCAST_ID, Instruction.SYNC_READ, bytes((132, 0, 4, 0, 1, 2))))
+    assert bench.bus.read(30, 0.004) == b""
+    assert [packet.id for packet in Framer().feed(bench.bus.read(30, 0.005))] == [1, 2]
+
+
 def test_noise_comes_before_a_reply_that_is_still_found(bench: Any) -> None:
     bench.bus.faults.add(Fault(kind="noise", amount=5))
     (raw,) = raw_replies(bench)

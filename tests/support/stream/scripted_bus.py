@@ -1,6 +1,7 @@
 """A scripted bus on a virtual clock, and checks that only note what they are given."""
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 from hil.config.schema import Config
@@ -36,11 +37,24 @@ class Bus:
         """Number of exchanges of which the last one shows a velocity."""
         self.wobble = 0.0
         """Difference of two successive positions [rad]."""
+        self.keeps_torque = True
+        self.heard = SimpleNamespace(late_at=-math.inf)
+        self.error = (0,) * JOINTS
         self.slow: Slow | None = None
         self.status: Any = None
 
     def wait_longer(self, seconds: float) -> None:
         self.patience += seconds
+
+    def bear_others(self) -> None:
+        self.calls.append(("others",))
+
+    def accept_any_order(self) -> None:
+        self.calls.append(("any order",))
+
+    def has_torque(self) -> bool:
+        self.calls.append(("torque",))
+        return self.keeps_torque
 
     def exchange(self, goals: list[float], *, between: bool = False) -> State:
         now = self.clock.now()
@@ -49,7 +63,7 @@ class Bus:
         position, fine = (HELD + self.wobble * (len(self.calls) % 2),) * JOINTS, (False,) * JOINTS
         after, sent = self.clock.now(), tuple(goals)
         velocity = NOTHING if len(self.calls) % self.moves_every else self.velocity
-        return State(now, after, sent, sent, velocity, position, (0,) * JOINTS, fine, self.slow, self.status)
+        return State(now, after, sent, sent, velocity, position, self.error, fine, self.slow, self.status)
 
     def check_not_overruled(self, due: float) -> None:
         self.calls.append(("read back", round(due, 6)))

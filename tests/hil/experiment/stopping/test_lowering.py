@@ -301,3 +301,35 @@ def test_an_arm_that_cannot_be_heard_any_more_is_cut(ready: Any) -> None:
     text, _, last = driven(ready, faults=lost(5.0, 10.0))
     assert "missed 2 replies" in text
     assert 5.03 < last < 5.1
+
+
+def faults_of(kind: str, **options: Any) -> tuple[Any, ...]:
+    from hil.fakes.bus.faults import Fault
+
+    return (Fault(kind=kind, at=5.0, **options),)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("faults", "said"),
+    [
+        (faults_of("late_reply", amount=0.013), "too late"),
+        (faults_of("late_reply", amount=0.006, probability=0.4), ""),
+        (faults_of("low_voltage", servo=2), "oltage"),
+        (faults_of("status_error", amount=128), "alert"),
+        (faults_of("other_master", servo=3, amount=0.03), "Another master"),
+    ],
+)
+def test_an_arm_whose_servos_obey_is_lowered(ready: Any, faults: tuple[Any, ...], said: str) -> None:
+    text, record, _ = driven(ready, faults=faults)
+    assert said in text and ("lowered to its rest pose" in text or not said)
+    np.testing.assert_allclose(record["position"][-1], ready.config.arm.rest_pose, atol=0.1)
+
+
+def test_a_reading_that_steps_does_not_drop_the_arm(ready: Any) -> None:
+    from benchmarks.fault_campaign.attack import Attack, Kind
+    from hil.fakes.bus.faults import Fault, FaultKind
+
+    step = Fault(kind=FaultKind.ENCODER_JUMP, servo=2, at=5.5, duration=0.03, amount=300)
+    text, record, _ = driven(ready, (Attack(Kind.SIGINT, 5.0, 1e9),), (step,))
+    assert "lowered to its rest pose" in text
+    np.testing.assert_allclose(record["position"][-1], ready.config.arm.rest_pose, atol=0.1)

@@ -11,7 +11,7 @@ import pytest
 
 from hil.config.schema import load_config
 from hil.drivers.state import State
-from hil.errors import ExperimentError
+from hil.errors import Cause, ExperimentError, SafetyStop
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stopping import way_down as module
 from hil.experiment.stopping.way_down import Stopped, WayDown
@@ -26,12 +26,18 @@ class Lowers(Checks):
 
     elsewhere = ""
     lies_already = False
+    samples = 3
+
+    every = 1
+
+    def slow_down(self, every: int) -> None:
+        self.every = every
 
     def lies(self, _state: State) -> bool:
         return self.lies_already
 
     def begin(self, _state: State, _goal: list[float], _recent: object, _watch: object) -> int:
-        return 3
+        return self.samples
 
     def goals(self, index: int, _state: State) -> list[float]:
         return [0.5 + 0.1 * index] * JOINTS
@@ -92,14 +98,14 @@ def test_an_arm_is_lowered_at_the_usual_rate(make: Make, turns: int) -> None:
     bus, lowering = made.bus, made.lowering
     bus.read_back_at = -math.inf
     assert made.lower() == ["The arm was lowered to its rest pose."]
-    first = 0.05 + TAKES_S + 0.05  # the ticks begin with the way down
+    first = 0.05 + TAKES_S  # at once: until then the goals that led to the stop drive the arm
     at = [round(first + 0.05 * index, 6) for index in range(3)]
     assert bus.times("sample") == at
     assert bus.times("between") == ([] if turns == 1 else [round(each + 0.025, 6) for each in at[:2]])
     assert [call[2] for call in bus.calls if call[0] == "sample"] == pytest.approx([0.5, 0.6, 0.7])
     between = [(0, 0.025, True), (1, 0.025, True)] if turns == 2 else [None, None]
     apart = 0.05 / turns
-    wanted = [(0, 0.051, False), between[0], (1, apart, False), between[1], (2, apart, False)]
+    wanted = [(0, 0.001, False), between[0], (1, apart, False), between[1], (2, apart, False)]
     assert lowering.of("look") == [each for each in wanted if each is not None]
     assert bus.times("read back")[-1] == at[-1]
     samples = made.way._recorder.samples
@@ -112,7 +118,7 @@ def test_ticks_missed_while_it_is_lowered_are_told_and_recorded(make: Make) -> N
     made = make(takes=[0.13, TAKES_S])
     made.lower()
     assert made.lowering.of("late") == [(0.13,)]
-    assert made.bus.times("sample") == [0.101, 0.231]
+    assert made.bus.times("sample") == [0.051, 0.181]
     samples = made.way._recorder.samples
     assert samples["missing"][:, 0].tolist() == [0, 1, 0]
     assert set(samples["phase"]) == {Phase.LOWERING} and set(samples["period"]) == {-1}
@@ -130,7 +136,7 @@ def test_an_arm_whose_watchdogs_have_acted_cannot_be_lowered(
     made.bus.clock.wait_until(0.05 + since)
     (told,) = made.lower()
     assert ("was lowered" in told) is is_lowered and ("had already acted" in told) is not is_lowered
-    assert len(made.bus.calls) == (3 if is_lowered else 0)
+    assert len(made.bus.times("sample")) == (3 if is_lowered else 0)
 
 
 @pytest.mark.parametrize(("silent", "is_lowered"), [(0.05, True), (0.07, False)])
@@ -151,7 +157,7 @@ def test_an_arm_that_lies_or_was_not_seen_is_not_lowered(make: Make) -> None:
     assert made.lower() == []
     made.lowering.lies_already = False
     assert made.stopped.latest is not None
-    assert made.lower(latest=made.stopped.latest._replace(error=(128, 0))) == [] and not made.bus.calls
+    assert made.lower(latest=made.stopped.latest._replace(error=(4, 0))) == [] and not made.bus.calls
     assert made.lower(sent_at=None) == ["The arm was lowered to its rest pose."]
 
 
@@ -162,3 +168,35 @@ def test_the_signals_so_far_do_not_end_the_lowering(make: Make, count: int, aske
     made.way._stop = SimpleNamespace(count=count, check_again=told.append)  # type: ignore[assignment]
     made.lower()
     assert told == [asked] * 3
+
+
+def test_late_replies_slow_the_way_down(make: Make) -> None:
+    """From the second late exchange on, every second sample is exchanged: the servos hold their goals meanwhile."""
+    made = make(takes=[0.06])
+    made.lowering.samples = 12
+    assert made.lower() == ["The arm was lowered to its rest pose."]
+    assert made.bus.times("sample") == pytest.approx([0.051, 0.111, 0.201, 0.301, 0.401, 0.501, 0.601])
+    assert made.lowering.every == 2 and [each[0] for each in made.lowering.of("look")] == [0, 1, 3, 5, 7, 9, 11]
+    made = make(takes=[0.06, TAKES_S])
+    made.lower()
+    assert made.lowering.every == 1, "one late exchange may be due to a busy computer"
+
+
+@pytest.mark.parametrize("keeps_torque", [True, False])
+def test_an_alert_drops_the_arm_only_with_lost_torque(make: Make, keeps_torque: bool) -> None:
+    made = make()
+    made.bus.keeps_torque = keeps_torque
+    alert = SafetyStop("stopped", Cause.ALERT)
+    made.way.lower(alert, made.stopped)
+    assert len(made.bus.times("sample")) == (3 if keeps_torque else 0)
+    made = make()
+    made.bus.keeps_torque, made.bus.error = keeps_torque, (0, 128)
+    (told,) = made.lower()
+    assert ("was lowered" in told) is keeps_torque and ("lost its torque" in told) is not keeps_torque
+    assert len(made.bus.times("sample")) == (3 if keeps_torque else 1) and made.bus.calls.count(("torque",)) == 1
+
+
+def test_packets_of_another_master_do_not_end_the_lowering(make: Make) -> None:
+    made = make()
+    made.lower()
+    assert made.bus.calls[:2] == [("others",), ("any order",)]

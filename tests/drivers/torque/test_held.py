@@ -4,7 +4,7 @@ from typing import cast
 
 import pytest
 
-from hil.drivers.preparation.hold import is_held
+from hil.drivers.torque.held import is_held
 from hil.drivers.servo import Servo
 
 

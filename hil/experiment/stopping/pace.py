@@ -1,0 +1,58 @@
+"""How often a lowered arm is commanded, and how long its replies are awaited: as slowly as late replies require.
+
+Servos hold their latest goal, so an arm can be lowered with fewer exchanges than the experiment needs. If replies come
+too late for one exchange per sample, only every second or third sample is exchanged from then on, until the end.
+"""
+
+from math import ceil
+
+LONGER_S = 0.008
+"""How much longer replies are awaited than they took so far while the arm was lowered, or at first, than during the
+experiment [s].
+"""
+
+LONGEST_S = 0.022
+"""How long replies are awaited once some have been late [s]: longer than an adapter's latency timer of 16 ms. Where
+replies are lost, asking again soon is better.
+"""
+
+LAST_S = 0.075
+"""Time after the latest reply at which waiting ends in any case [s]: torque must be off 25 ms later."""
+
+MARGIN_S = 0.002
+"""Time between the end of an exchange and the next goals [s]."""
+
+
+class Pace:
+    """interval: time between two samples [s]. patience: how long replies were awaited during the experiment [s]."""
+
+    def __init__(self, interval: float, patience: float) -> None:
+        self._interval = interval
+        self._least = patience
+        self._longest = 0.0
+        self._first = self._usual = max(patience, min(patience + LONGER_S, LONGEST_S))
+        self._was_late = False
+        self.every = 1
+        """Number of samples per exchange."""
+
+    def patience(self, unheard: float, *, are_late: bool) -> float:
+        """How long the next exchange may wait for replies [s].
+
+        unheard: time since the latest reply of all servos [s]. are_late: whether replies have just been too late.
+        """
+        if not are_late and not self._was_late:
+            return self._usual
+        return max(min(max(self._least, LONGEST_S), LAST_S - unheard), LONGER_S)
+
+    def took(self, seconds: float, *, missed: bool) -> None:
+        """Process an exchange that took `seconds` [s]. missed: whether replies were missing in the end."""
+        if missed:
+            return
+        usual, self._longest = self._usual, max(self._longest, seconds)
+        self._usual = min(self._first, self._longest + LONGER_S)
+        if seconds <= min(self.every * self._interval, usual):
+            return
+        # A single late reply may be due to a busy computer.
+        if self._was_late and seconds > self.every * self._interval:
+            self.every = ceil((seconds + MARGIN_S) / self._interval)
+        self._was_late = True

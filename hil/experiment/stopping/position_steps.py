@@ -1,0 +1,65 @@
+"""Rides over steps of a position reading while an arm is lowered: a joint cannot jump, but its reading can.
+
+A position that is far from where the joint's former position and its velocities predict it is taken for a false
+reading: from then on the difference is subtracted. When a later reading steps back, the subtraction ends. A joint whose
+readings step again and again is not corrected any more.
+"""
+
+from typing import NamedTuple
+
+from hil.drivers.state import State
+
+__all__ = ["PositionSteps"]
+
+STEP_RAD = 0.04
+"""Smallest step [rad]; smaller ones are left to the feedback."""
+
+BENDS_RAD_S2 = 200.0
+"""Acceleration that no joint of a lowered arm exceeds [rad/s^2]; it makes predictions uncertain."""
+
+MOST_STEPS = 6
+"""Number of steps of one joint that are ridden over; a single false reading makes two."""
+
+
+class _Seen(NamedTuple):
+    """A joint's latest corrected position [rad], its velocity [rad/s], and their time [s]."""
+
+    position: float
+    velocity: float
+    time: float
+
+
+class PositionSteps:
+    """Corrects the positions of the exchanges after `state`, which all servos answered."""
+
+    def __init__(self, state: State) -> None:
+        at = state.time_before_write
+        self._seen = [_Seen(*each, at) for each in zip(state.position, state.velocity, strict=True)]
+        self._offset = [0.0] * len(self._seen)
+        self._steps = [0] * len(self._seen)
+
+    def corrected(self, state: State) -> State:
+        """Return an exchange whose positions continue the motion so far [rad]."""
+        position, at = list(state.position), state.time_before_write
+        for joint, is_missing in enumerate(state.missing):
+            if not is_missing:
+                position[joint] = self._continued(joint, _Seen(position[joint], state.velocity[joint], at))
+        return state._replace(position=tuple(position)) if any(self._offset) else state
+
+    def _continued(self, joint: int, now: _Seen) -> float:
+        """Return the corrected position of a joint [rad]."""
+        seen = self._seen[joint]
+        if self._steps[joint] < MOST_STEPS and _is_step(seen, now.position + self._offset[joint], now):
+            self._steps[joint] += 1
+            away = seen.position + 0.5 * (now.time - seen.time) * (seen.velocity + now.velocity) - now.position
+            self._offset[joint] = away if _is_step(seen, now.position, now) else 0.0
+        self._seen[joint] = now._replace(position=now.position + self._offset[joint])
+        return self._seen[joint].position
+
+
+def _is_step(seen: _Seen, position: float, now: _Seen) -> bool:
+    """Whether a position is out of reach, whether the joint has moved at its velocities or stood still."""
+    seconds = now.time - seen.time
+    way = 0.5 * seconds * (seen.velocity + now.velocity)
+    unsure = STEP_RAD + 0.5 * BENDS_RAD_S2 * seconds**2
+    return not min(0.0, way) - unsure <= position - seen.position <= max(0.0, way) + unsure

@@ -1,0 +1,28 @@
+"""How stiff and how damped a joint may be held at a sample rate, without oscillating."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.plan.stabiliser import DELAY_SAMPLES
+
+Array = NDArray[np.float64]
+
+MOST_DAMPING = 0.3
+"""Largest fraction of a joint's velocity that the damper may remove per sample, with the other joints free. At 1 or
+more, a single joint would oscillate.
+"""
+
+MOST_DRIVING = 0.3
+"""Largest fraction of a joint's damping that its spring's delay may undo."""
+
+
+def most_damping(rate: float, lightest: Array) -> Array:
+    """Largest damping of each joint [N m s/rad] at a rate [Hz]. lightest: smallest inertia (joints,) [kg m^2]."""
+    return MOST_DAMPING * rate * lightest
+
+
+def most_stiffness(rate: float, damping: Array, friction: Array) -> Array:
+    """Largest stiffness of each joint [N m/rad] at a rate [Hz]. damping, friction: of the damper, and of the joint
+    itself (joints,) [N m s/rad].
+    """
+    return MOST_DRIVING * rate / DELAY_SAMPLES * (damping + friction)

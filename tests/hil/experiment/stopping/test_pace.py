@@ -1,0 +1,36 @@
+"""How often a lowered arm is commanded when its replies are late, and how long they are awaited."""
+
+import pytest
+
+from hil.experiment.stopping.pace import LAST_S, LONGER_S, LONGEST_S, Pace
+
+
+@pytest.mark.parametrize("late", [0.001, 0.004, 0.009, 0.016])
+@pytest.mark.parametrize("rate", [50, 133, 400])
+def test_exchanges_are_as_far_apart_as_the_replies_are_late(late: float, rate: int) -> None:
+    pace, are_late = Pace(1 / rate, 0.003), False
+    for _ in range(4):
+        awaited = pace.patience(0.0, are_late=are_late)
+        are_late = late > awaited
+        pace.took(min(late, awaited), missed=are_late)
+    assert pace.patience(0.0, are_late=False) > late
+    assert late <= pace.every / rate < late + 0.002 + 1 / rate or pace.every == 1
+
+
+def test_late_replies_are_awaited_longer_but_not_for_ever() -> None:
+    pace = Pace(0.01, 0.005)
+    assert pace.patience(0.02, are_late=False) == pytest.approx(0.005 + LONGER_S), "lost ones are asked for again soon"
+    assert pace.patience(0.02, are_late=True) == LONGEST_S
+    assert pace.patience(LAST_S - 0.015, are_late=True) == pytest.approx(0.015)
+    assert pace.patience(LAST_S, are_late=True) == pytest.approx(LONGER_S)
+    pace.took(0.003, missed=False)
+    assert pace.patience(0.0, are_late=False) == pytest.approx(0.003 + LONGER_S) and pace.every == 1
+
+
+def test_what_an_unknown_adapter_might_take_is_not_awaited_once_it_is_known_to_be_fast() -> None:
+    pace = Pace(0.0167, 0.0177)
+    assert pace.patience(0.0, are_late=False) == LONGEST_S
+    for seconds in (0.0004, 0.001, 0.0004):
+        pace.took(seconds, missed=False)
+    assert pace.patience(0.0, are_late=False) == pytest.approx(0.001 + LONGER_S)
+    assert pace.patience(0.0, are_late=True) == LONGEST_S
