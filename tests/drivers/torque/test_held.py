@@ -4,8 +4,8 @@ from typing import cast
 
 import pytest
 
-from hil.drivers.torque.held import is_held
 from hil.drivers.servo import Servo
+from hil.drivers.torque.held import is_held
 
 
 class Replies:
