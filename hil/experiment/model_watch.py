@@ -68,6 +68,11 @@ JOLT_RAD_S, JOLT_TIMES = 1.2, 5.0
 ones.
 """
 
+PLAY_RAD, CURVED = 0.015, 0.2
+"""Displacement within a jolt that gear backlash may cause [rad], twice that of a servo in its data sheet, and allowance
+for the curvature of ordinary motion, as a fraction of the usual change of velocity times the duration.
+"""
+
 _USUAL_S = 1.0
 _GAP = 3.0
 """Gap between two samples, in sample intervals, beyond which changes of velocity are not judged."""
@@ -100,6 +105,7 @@ class Jolts:
 
     def __init__(self, count: int, interval: float) -> None:
         back = max(1, round(JOLT_S / interval))
+        self._interval = interval
         self._least = JOLT_RAD_S * max(1.0, interval / JOLT_S)
         self._joints = np.zeros(count, _JOLT)
         self._joints["begun"] = -np.inf
@@ -119,6 +125,14 @@ class Jolts:
         self._pack(self._bytes, 0, *velocity)
         joint = self._jolting(self._joints, self._former, self._velocity, seconds, now, self._least)
         return None if joint < 0 else (joint, float(self._joints["change"][joint]))
+
+    def began(self, joint: int) -> float:
+        """Return the time of the sample before which a joint's latest jolt began [s]."""
+        return float(self._joints["begun"][joint]) - len(self._former) * self._interval
+
+    def usual(self, joint: int) -> float:
+        """Return the RMS of a joint's ordinary changes of velocity [rad/s]."""
+        return math.sqrt(float(self._joints["square"][joint]))
 
     def forget(self) -> None:
         """Start over: nothing is known about the motion since the previous sample."""
@@ -212,7 +226,7 @@ class ModelWatch:
         if seconds > self._longest_gap:
             self._jolts.forget()
         if (found := self._jolts.look(velocity, seconds, now)) is not None:
-            self._jerked(*found)
+            self._check_displacement(*found, state)
         self._recent.append(state)
         joint = self._observer.observe(position, velocity, torque, seconds)
         if joint < 0:
@@ -225,7 +239,16 @@ class ModelWatch:
                 return
         self._raise(joint, state)
 
-    def _jerked(self, joint: int, change: float) -> NoReturn:
+    def _check_displacement(self, joint: int, change: float, state: State) -> None:
+        """Raise SafetyStop for a jolt that moved the joint farther than backlash, in which its teeth change sides."""
+        began = self._jolts.began(joint)
+        before = next((each for each in reversed(self._recent) if each.time_before_write < began + 1e-3), None)
+        if before is not None:
+            seconds = state.time_before_write - before.time_before_write
+            expected = 0.5 * seconds * (before.velocity[joint] + state.velocity[joint])
+            displaced = abs(state.position[joint] - before.position[joint] - expected)
+            if displaced <= PLAY_RAD + CURVED * seconds * self._jolts.usual(joint):
+                return
         raise SafetyStop(
             f"{self._names[joint]} jerked: its velocity changed by {change:+.1f} rad/s and back within "
             f"{1e3 * JOLT_BACK_S:.0f} ms, which the commanded torques cannot cause. Its horn slips on the shaft, "

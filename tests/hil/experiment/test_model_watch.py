@@ -237,3 +237,17 @@ def test_a_horn_that_slips_at_the_first_motion_of_an_arm_without_a_description_i
             now, nothing = 0.01 * index, (0.0, 0.0)
             watch.look(State(now, now + 1e-3, nothing, nothing, (0.0, speed), (-1.57, turned), (0, 0), (False, False)))
     assert stopped.value.cause is Cause.UNEXPECTED
+
+
+@pytest.mark.parametrize("interval", [0.005, 0.02])
+def test_teeth_that_change_sides_within_the_play_of_a_gear_are_no_horn_that_slips(
+    config: Config, interval: float
+) -> None:
+    """A light link falls through the play and bounces: its velocity jumps, but it moves by no more than the play."""
+    undescribed = config.model_copy(update={"arm": config.arm.model_copy(update={"link_lengths": None})})
+    watch = ModelWatch(undescribed, [0.3, 0.2], interval=interval)
+    for index in range(80):
+        speed = 4.0 if index % 40 == 20 else 0.0
+        turned = 0.009 * ((index + 20) // 40)
+        now, nothing = interval * index, (0.0, 0.0)
+        watch.look(State(now, now + 1e-3, nothing, nothing, (0.0, speed), (-1.57, turned), (0, 0), (False, False)))
