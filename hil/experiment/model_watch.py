@@ -251,8 +251,8 @@ class ModelWatch:
                 return
         raise SafetyStop(
             f"{self._names[joint]} jerked: its velocity changed by {change:+.1f} rad/s and back within "
-            f"{1e3 * JOLT_BACK_S:.0f} ms, which the commanded torques cannot cause. Its horn slips on the shaft, "
-            "something hit it, its encoder is wrong, or another program sent it a goal.",
+            f"{1e3 * JOLT_BACK_S:.0f} ms, which the commanded torques cannot cause. Its horn slips on the shaft, its "
+            "gear is worn, something hit it, its encoder is wrong, or another program sent it a goal.",
             Cause.UNEXPECTED,
         )
 
