@@ -1,6 +1,5 @@
 """Detection of values that are impossible for a servo arm, for imported recordings; the usual cause is a wrong unit."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -83,9 +82,19 @@ def _link(estimate: ShootingEstimate, gravity: float) -> list[str]:
     value, names = estimate.parameters, list(estimate.names)
     if gravity <= 0.0 or "coupling" not in value:
         return []
-    if any(abs(value[name]) < SURE * float(estimate.std[names.index(name)]) for name in ("coupling", "gravity_2")):
+    std = {name: float(estimate.std[names.index(name)]) for name in ("coupling", "gravity_2")}
+    if not value["coupling"] > SURE * std["coupling"]:
         return []
-    length = abs(value["coupling"] * gravity / value["gravity_2"]) if value["gravity_2"] else math.inf
+    if abs(value["gravity_2"]) < SURE * std["gravity_2"]:
+        least = value["coupling"] * gravity / LINK[1]
+        if least < abs(value["gravity_2"]) + SURE * std["gravity_2"]:
+            return []
+        return [
+            f"gravity_2 is {value['gravity_2']:.2g} +- {std['gravity_2']:.2g} N m, but by coupling, link 2 weighs at "
+            f"least {least:.2g} N m: the torque does not contain gravity. Does the drive compensate for gravity, so "
+            "that its torque must be added? If the arm moves in a horizontal plane, set arm.gravity = 0."
+        ]
+    length = abs(value["coupling"] * gravity / value["gravity_2"])
     if LINK[0] < length < LINK[1]:
         return []
     return [

@@ -26,3 +26,14 @@ def test_a_pendulum_of_a_few_millimetres_is_named(inertia: float, named: bool) -
     estimate: Any = SimpleNamespace(parameters=value, names=tuple(value), value=values, std=0.01 * values)
     found = implausible([SimpleNamespace(joints=0)], estimate, 9.81)  # type: ignore[list-item]
     assert any("pendulum 0.003 m long" in said for said in found) is named
+
+
+@pytest.mark.parametrize(("gravity_2", "named"), [((0.001, 0.002), True), ((0.05, 0.02), False), ((0.4, 0.004), False)])
+def test_a_torque_without_gravity_is_named(gravity_2: tuple[float, float], named: bool) -> None:
+    """As of a drive that compensates for gravity; a weight that is merely uncertain casts no doubt."""
+    value = {"inertia_1": 0.02, "gravity_1": 1.5, "coupling": 0.008, "gravity_2": gravity_2[0]}
+    values = np.array(list(value.values()))
+    std = np.array([2e-4, 0.015, 8e-5, gravity_2[1]])
+    estimate: Any = SimpleNamespace(parameters=value, names=tuple(value), value=values, std=std)
+    found = implausible([SimpleNamespace(joints=0)], estimate, 9.81)  # type: ignore[list-item]
+    assert any("torque does not contain gravity" in said for said in found) is named
