@@ -146,7 +146,9 @@ def _advance(x: Any, t1: float, t2: float, dt: float, substeps: int, p: Any, wid
 
 
 def _constants(x: Any, scale: Any, slots: Any, fixed: Any, joints: int, p: Any) -> None:
-    p[:] = fixed
+    # Here and below, element by element: assigning slices takes seconds to compile.
+    for i in range(fixed.size):
+        p[i] = fixed[i]
     for i in range(slots.size):
         p[slots[i]] = x[2 * joints + i] * scale[i]
 
@@ -202,10 +204,13 @@ def _ekf_loop(
             moved[i] += DIFFERENCE
             _constants(moved, scale, slots, fixed, joints, p)
             _advance(moved, torque[k, 0], torque[k, 1], intervals[k], substeps, p, width, joints)
-            F[: 2 * joints, i] = (moved[: 2 * joints] - ahead[: 2 * joints]) / DIFFERENCE
-        x[:] = ahead
-        P[:, :] = F @ P @ F.T
+            for j in range(2 * joints):
+                F[j, i] = (moved[j] - ahead[j]) / DIFFERENCE
+        spread = F @ P @ F.T
         for i in range(n):
+            x[i] = ahead[i]
+            for j in range(n):
+                P[i, j] = spread[i, j]
             P[i, i] += noise[i] * intervals[k]
 
 
@@ -222,16 +227,19 @@ def _ukf_loop(
         _correct(x, P, R, position[k])
         root = _root(P)
         for i in range(n):
-            points[i] = x + reach * root[:, i]
-            points[n + i] = x - reach * root[:, i]
+            for j in range(n):
+                points[i, j] = x[j] + reach * root[j, i]
+                points[n + i, j] = x[j] - reach * root[j, i]
         for i in range(2 * n):
             _constants(points[i], scale, slots, fixed, joints, p)
             _advance(points[i], torque[k, 0], torque[k, 1], intervals[k], substeps, p, width, joints)
         for a in range(n):
             x[a] = np.mean(points[:, a])
         away = points - x
-        P[:, :] = away.T @ away / (2.0 * n)
+        spread = away.T @ away
         for i in range(n):
+            for j in range(n):
+                P[i, j] = spread[i, j] / (2.0 * n)
             P[i, i] += noise[i] * intervals[k]
 
 

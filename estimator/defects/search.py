@@ -25,6 +25,7 @@ FEWEST_SEGMENTS = 6
 MOST_SEGMENTS = 400  # more would take too long
 EXPLAINED = 1.2  # mean square of the residual, relative to the noise
 FITTED = 3  # hypotheses, each of another kind or joint
+PROMISING = 0.45  # fraction of the residual beyond the noise: what explains less, in the score test or fitted, is left
 CERTAIN = 2.0  # decrease of the sum of squares relative to that expected by chance
 LEAST = {"scale": 0.01, "load": 0.02, "friction": 0.04, "torque": 0.01, "offset": 0.01, "arm": 0.03}
 """Smallest change that matters: relative, for an offset relative to the RMS torque."""
@@ -46,10 +47,13 @@ class Defect:
 
 @dataclass(frozen=True)
 class _Score:
-    """A hypothesis with the expected sum of squares per sample, and the evidence for it: above 1 it is significant."""
+    """A hypothesis with the expected sum of squares per sample, the fraction of the residual beyond the noise that it
+    explains, and the evidence for it: above 1 it is significant.
+    """
 
     hypothesis: Hypothesis
     left: float
+    explained: float
     evidence: float
 
 
@@ -70,12 +74,12 @@ def probable_defect(recordings: Sequence[Recording], estimate: ShootingEstimate,
 def _searched(altered: Altered, every: Sequence[Hypothesis]) -> Defect | None:
     linear = _Linear.of(altered)
     scores = sorted((linear.score(altered, each, len(every)) for each in every), key=lambda each: each.left)
-    likely = _different([each for each in scores if each.evidence > CERTAIN])
+    likely = _different([each for each in scores if each.evidence > CERTAIN and each.explained > PROMISING])
     if not likely:
         return None
     given = altered.fit(None)
     found = _best(altered, likely, given, linear.independent)
-    if found is None or found.hypothesis.course.kind != "step":
+    if found is None or found.hypothesis.course.kind != "step" or found.explained < PROMISING:
         return found
     if found.fit.left > EXPLAINED:
         near = [found.hypothesis, *_neighbours(found.hypothesis, every)]
@@ -178,7 +182,8 @@ class _Linear:
         samples = float(self.samples[hypothesis.used].sum())
         left = float(self.squares[hypothesis.used].sum()) - before
         chance = self.colour * (hypothesis.unknowns * np.log(samples) + 2.0 * np.log(tried)) * left / samples
-        return _Score(hypothesis, max(left - fall, 0.0) / samples, fall / max(float(chance), 1e-300))
+        explained = fall / max(left - samples, 1e-6 * samples)
+        return _Score(hypothesis, max(left - fall, 0.0) / samples, explained, fall / max(float(chance), 1e-300))
 
     def _fall(self, base: Array, added: Array | None, hypothesis: Hypothesis) -> float:
         """Return the decrease of the sum of squares if the unknowns `base`, and those `added`, are freed."""

@@ -20,7 +20,7 @@ def test_a_lowering_with_room_that_lays_the_arm_down_is_safe() -> None:
 def test_too_little_room_on_the_way_down_is_not() -> None:
     near = Nearest(-0.005, 0.01, ("hand", "floor"), 0)
     assert (
-        "hand and floor: -5 mm, at least 10 mm"
+        "hand and floor: -5 mm; at least 10 mm required"
         in ChainStops(FALL, LoweringForeseen(5.0, near, 1.0, "knee", 0.02, HELPS)).unsafe
     )
 

@@ -53,8 +53,13 @@ def named(recordings: Sequence[Recording], model: Model) -> str:
     [
         ("", 1.0, "", 0.0),
         ("load", 1.2, "The load seems to have been picked up at about ", MIDDLE),
-        ("friction", 1.3, "The friction of joint 1 seems to have changed by +", 30.0),
-        ("torque", 0.9, "The motor torque of joint 1, relative to its column, seems to change steadily", -10.0),
+        pytest.param(
+            *("friction", 1.3, "The friction of joint 1 seems to have changed by +", 30.0), marks=pytest.mark.slow
+        ),
+        pytest.param(
+            *("torque", 0.9, "The motor torque of joint 1, relative to its column, seems to change steadily", -10.0),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_change_in_the_course_of_a_recording_is_named(change: str, size: float, said: str, value: float) -> None:

@@ -12,7 +12,7 @@ from hil.estimation.settled_warnings import warnings_of
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.runs.recording import Phase, sample_type
 from hil.runs.run_folder import RunFacts
-from tests.support import late_loop
+from tests.support.stream import late_loop
 
 Arm = Callable[..., Config]
 
