@@ -9,7 +9,7 @@ import numpy as np
 from hil.config.schema import Config
 from hil.drivers.rate import FixedRate, Tick
 from hil.estimation.settled_estimate import estimate_run
-from hil.experiment import stream
+from hil.experiment import pace
 from hil.experiment.run import run_experiment
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
@@ -51,7 +51,7 @@ def figures(result: SettledResult) -> dict[str, float]:
 
 def measure(config: Config, rms: float) -> dict[str, dict[str, float]]:
     """Figures of the estimates from the real and from the nominal times, with a loop that is late by `rms` [s]."""
-    exact, stream.FixedRate = stream.FixedRate, late_rate(rms)  # type: ignore[misc]
+    exact, pace.FixedRate = pace.FixedRate, late_rate(rms)  # type: ignore[misc]
     try:
         with tempfile.TemporaryDirectory() as folder:
             run = RunFolder.create(Path(folder) / "run", config)
@@ -60,4 +60,4 @@ def measure(config: Config, rms: float) -> dict[str, dict[str, float]]:
             forget_real_times(run, len(config.joints))
             return {"real": real, "nominal": figures(estimate_run(run))}
     finally:
-        stream.FixedRate = exact  # type: ignore[misc]
+        pace.FixedRate = exact  # type: ignore[misc]
