@@ -6,13 +6,13 @@ import pytest
 
 from benchmarks.population import figures, run
 
-ALWAYS = {12: "XL430-W250", 15: "XL330-M288", 30: "XC330-T288"}
-"""Seeds and models of a hanging, a tilted and an upright arm, with one and two joints, with and without current
-sensors, encoder noise and ripple.
-"""
+ALWAYS = {12: "XL430-W250", 30: "XC330-T288"}
+"""Seeds and models of a hanging and an upright arm, with and without current sensors, encoder noise and ripple."""
 
-SLOW = {7: "XM430-W350", 34: "XM540-W270"}
-"""Seeds of the other two models, both on arms that move in a horizontal plane; one has a warming gear."""
+SLOW = {7: "XM430-W350", 15: "XL330-M288", 34: "XM540-W270"}
+"""Seeds of the other models, two on arms that move in a horizontal plane and one on a tilted arm; one has a warming
+gear.
+"""
 
 
 @pytest.mark.long
