@@ -12,6 +12,13 @@ _FORGETS = 0.98
 """Factor by which the remembered longest duration of an exchange decays from one exchange to the next."""
 
 
+def read_back(bus: ServoBus, guard: Guard, due: float) -> None:
+    """Look for another master just before the exchange that is due at `due` [s]; tell the guard about lost goals."""
+    bus.check_not_overruled(due)
+    if (lost := bus.goals_lost) is not None:
+        guard.goals_are_lost(*lost)
+
+
 class Pace:
     """Sends goals when they are due. Every method but `interval` may raise what `ServoBus.exchange` raises.
 
@@ -39,7 +46,7 @@ class Pace:
         """Wait until the next sample is due. If a read-back is due, it takes place just before."""
         former = self._deadline
         if former is not None and self._exchange.read_back_at <= former + self.interval:
-            self._read_back(former + self.interval)
+            read_back(self._bus, self._guard, former + self.interval)
         tick = self._ticks.wait()
         deadline, now, _ = tick
         awake_at = self._awake_at
@@ -64,7 +71,7 @@ class Pace:
         for turn in range(1, self.turns):
             due = self._deadline + turn * self._apart
             if self._exchange.read_back_at <= due:
-                self._read_back(due)
+                read_back(self._bus, self._guard, due)
             self._clock.wait_until(due)
             now = self._clock.now()
             if now - due < self._apart and now + self._takes < following:
@@ -72,9 +79,3 @@ class Pace:
                 self.sent_at, self._awake_at = state.time_before_write, state.time_after_read
                 self._takes = max(_FORGETS * self._takes, state.time_after_read - state.time_before_write)
                 yield state
-
-    def _read_back(self, due: float) -> None:
-        """Look for another master just before the exchange that is due at `due` [s]."""
-        self._bus.check_not_overruled(due)
-        if (lost := self._bus.goals_lost) is not None:
-            self._guard.goals_are_lost(*lost)

@@ -16,6 +16,7 @@ from hil.drivers.torque.off import TRIP_S
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
+from hil.experiment.pace import read_back
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stopping.lowering import Lowering
 from hil.experiment.stopping.pace import Pace
@@ -195,9 +196,7 @@ class WayDown:
     def _look_for_another_master(self, due: float) -> None:
         """If a read-back is due, do it just before the exchange that is due at `due` [s]."""
         if self._bus.prepared.read_back_at <= due:
-            self._bus.check_not_overruled(due)
-            if (lost := self._bus.goals_lost) is not None:
-                self._guard.goals_are_lost(*lost)
+            read_back(self._bus, self._guard, due)
 
     def _told(self, error: ExperimentError | BusOverheard, what: str) -> None:
         error.add_note(what)
