@@ -34,7 +34,8 @@ class Geometry:
 class ChainArmModel(ArmModel):
     """The dynamics of an identified spatial arm.
 
-    `values` holds its base parameters; `groups` gives the linear combination that each of them stands for.
+    `values` holds its base parameters; `groups` gives, for each of them, the linear combination of link parameters that
+    it represents.
     """
 
     geometry: Geometry

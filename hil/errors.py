@@ -12,7 +12,7 @@ HilError                    exit code
     ├── SafetyStop          1   the guard stopped the arm because a limit was exceeded
     ├── StopRequested     130   Ctrl-C (143: SIGTERM, 129: SIGHUP)
     ├── NotSettled          1   the motion never became periodic
-    ├── DidNotMove          1   a joint did not move: friction, or it is blocked
+    ├── DidNotMove          1   a joint did not move, because of friction or an obstacle
     ├── NoSafeTorque        1   a dry run found no torque that keeps the arm within its limits
     └── RecordingCutShort   1   the recording holds no settled period
 
@@ -83,8 +83,8 @@ class Cause(Enum):
         """Whether the servos still accept commands, so that an arm may be lowered under supervision.
 
         A servo that has lost its watchdog still obeys; if the watchdog had tripped, the loss of torque would be
-        detected during lowering. Missing replies may return: the arm continues without them for a moment. A servo that
-        has raised its alert may have kept its torque, which is read first.
+        detected during lowering. If replies are missing, lowering continues for a moment without them, because they may
+        come back. A servo that has set its alert bit may still have torque; this is read first.
         """
         others = {Cause.UNEXPECTED, Cause.UNLIKE_BEFORE, Cause.LATE, Cause.NOT_A_NUMBER, Cause.WATCHDOG}
         others |= {Cause.MISSING, Cause.ALERT}

@@ -93,7 +93,7 @@ def read_model(path: str | PathLike[str]) -> ArmModel:
 
 
 def read_usable_result(path: Path) -> Result:
-    """Read a result that holds enough about the arm for a model; raises ResultError for any other."""
+    """Read a result that contains all data that a model of the arm needs. Raises ResultError if it does not."""
     result = read_result(path)
     if result.arm is None:
         raise ResultError(

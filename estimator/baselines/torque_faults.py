@@ -1,5 +1,5 @@
 """Detection of motor torques that differ from the torque column: clipped by the drive, timestamped by a different
-clock, or of one joint late.
+clock, or late in one joint.
 
 As in the detection of reversed columns (`hil.estimator.baselines.signs`), the residual of inverse dynamics with the
 torque as given is compared with the residual with a modified torque.
@@ -93,8 +93,8 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
 
 
 def suspect_late(recordings: Sequence[Recording]) -> Late | None:
-    """Return the joint whose torque has another delay than that of the others, if that explains the motion much better
-    than any delay of all.
+    """Return the joint whose torque is not delayed like that of the others, if a delay of its own explains the motion
+    much better than a common delay.
     """
     joints = recordings[0].joints
     if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:

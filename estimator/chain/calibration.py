@@ -1,4 +1,4 @@
-"""Torque constants of a spatial arm from a known mass: one likelihood of two settled periods, without and with it.
+"""Torque constants of a spatial arm from a known mass: one fit to two settled periods, without and with the mass.
 
 A single recording only determines the ratios of the torque constants. A known mass on a link changes the base
 parameters by amounts known in kilograms and metres. In units of the first joint's assumed torque constant, this change
@@ -51,7 +51,7 @@ class MassOnLink:
 
 @dataclass(frozen=True)
 class ChainCalibration:
-    """Torque constants and the arm's parameters in true units."""
+    """Torque constants, and the arm's parameters scaled to them."""
 
     factor: Array
     """Ratio of true to assumed torque constant of each joint (joints,)."""
@@ -59,7 +59,9 @@ class ChainCalibration:
     estimate: ChainEstimate
     """The fit, in units of the first joint's assumed torque constant."""
     value: Array
-    """Parameters of the arm without the mass in true units, in the order of `ChainModel.linear_names` [SI]."""
+    """Parameters of the arm without the mass, scaled to the identified torque constants, in the order of
+    `ChainModel.linear_names` [SI].
+    """
     std: Array
     residual_steps: Array
     """RMS of the residual in encoder steps (runs, joints)."""

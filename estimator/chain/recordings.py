@@ -89,14 +89,14 @@ class RecordedChain:
     reached: bool = True
     """Whether the fit has reached its minimum; always so for a regression."""
     systematic: float = 1.0
-    """See `ChainEstimate.systematic`; 1 for a regression."""
+    """Median ratio of the base parameters' standard errors to those under white noise; 1 for a regression."""
     at_bound: tuple[str, ...] = ()
     conflicts: tuple[Conflict, ...] = ()
-    """See `ChainEstimate.conflicts`."""
+    """Values far from what was known beforehand, the largest contradiction first."""
 
     @property
     def std(self) -> Array:
-        """Standard errors."""
+        """Standard errors of `value`, in the order of `names` [SI]."""
         return np.sqrt(np.diag(self.covariance))
 
     @property

@@ -101,8 +101,8 @@ class DesignProblem:
         return deviations
 
     def scale(self) -> Array:
-        """Return what each standard error is relative to: the parameter or, for an offset, the joint's Coulomb
-        friction.
+        """Return the value by which each standard error is divided: the parameter or, for an offset, the joint's
+        Coulomb friction [SI].
         """
         known = dict(zip(CONSTANTS, self.physics.vector.tolist(), strict=True))
         against = [name.replace("offset", "coulomb") if name.startswith("offset") else name for name in self.names]

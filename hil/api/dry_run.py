@@ -1,4 +1,4 @@
-"""`hil.dry_run`: simulate the experiment on arms like the one on the bench. Nothing moves."""
+"""`hil.dry_run`: simulate the experiment on arms similar to the real one. Nothing moves."""
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -46,7 +46,9 @@ class Rehearsal:
 
     @property
     def largest_peak_torque(self) -> tuple[float, ...]:
-        """The largest safe peak torque of each joint [N m]; empty if only the pilot can find one."""
+        """The largest safe peak torque of each joint [N m]; empty if the dry run found none and leaves the search to
+        the pilot.
+        """
         if isinstance(self.found, ChainDryRun):
             return self.found.peak_torque
         largest = self.found.largest

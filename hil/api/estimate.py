@@ -43,8 +43,9 @@ def estimate(
         out: for recordings from other tools, the folder for the result, which must be new or empty; by default
             runs/TIME-NAME.
         all_samples: use every sample of a run, by multiple shooting; no settled period is needed.
-        executor: a concurrent.futures executor, or `hil.study.engine.executor`; with `friction = "auto"` it also starts
-            fits that may turn out not to be needed: less waiting, more work in total. It does not change the result.
+        executor: a concurrent.futures executor, or `hil.study.engine.executor`. With `friction = "auto"` it
+            also runs fits in advance that may turn out not to be needed, which shortens the wait but increases the
+            total work. It does not change the result.
         on_progress: called with a `Progress` when a new stage begins.
 
     Returns:

@@ -49,7 +49,8 @@ def identify(
         take_over: take over an arm that another program left with its torque on, and lower it slowly; support it by
             hand.
         start_from: run folder or result.json of an earlier identification of the same arm. It replaces the prior,
-            so that fewer runs are needed; only with experiment.pilot. If the arm moves differently, the prior is used.
+            so that fewer runs are needed; only with experiment.pilot. If the arm does not move as that result predicts,
+            the prior is used.
         on_progress: called with a `Progress` about 20 times a second while the arm moves; on a real bus, in a separate
             thread. It cannot disturb the experiment: reports that arrive too fast are dropped. If it raises, the
             exception is logged and it is not called again.

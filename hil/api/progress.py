@@ -41,7 +41,7 @@ OnProgress = Callable[[Progress], None]
 def forgiving(listener: OnProgress) -> OnProgress:
     """Wrap a callback so that its first exception is logged and it is not called again.
 
-    A stop request by signal during the callback does not count as a failure of the callback: it is passed on.
+    A StopRequested raised during the callback (Ctrl-C, for example) does not count as its failure and is passed on.
     """
     failed = False
 

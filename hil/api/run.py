@@ -117,7 +117,8 @@ class Run:
     config: the configuration, with the experiment that was actually run. record: the contents of run.json. samples:
     every sample taken (dtype: hil.runs.recording.sample_type). events: pairs (time on the port's clock [s], what
     happened).
-    periods: after an estimate, the settled periods by role, as measured and as predicted by the model. result: None
+    periods: after an estimate, the settled periods by the role of their segment (for example "identify"), as measured
+    and as predicted by the model. result: None
     before an estimate.
     """
 

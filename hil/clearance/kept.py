@@ -18,7 +18,7 @@ def keep_shapes(arm: ArmDescription, folder: Path) -> None:
 
 
 def known_shapes(arm: ArmDescription) -> Shapes:
-    """The stored capsules if they belong to these links, otherwise new ones. Raises ArmFileError."""
+    """The stored capsules if they were computed for these links, otherwise newly computed ones. Raises ArmFileError."""
     path = _path(arm.path)
     if not path.is_file():
         return shapes_of(arm)

@@ -2,8 +2,8 @@
 positions.
 
 A capsule is the set of points within its radius of a line segment. Spheres are represented exactly. A cylinder is
-enclosed by one capsule, a box by one or a row of them, and a mesh like its bounding box. A link whose geometry
-cannot be read gets a capsule from joint to joint with a guessed radius, and is listed in `Shapes.guessed`.
+enclosed by one capsule, a box by one capsule or a row of them. A mesh is replaced by its bounding box. A link whose
+geometry cannot be read gets a capsule from joint to joint with a guessed radius, and is listed in `Shapes.guessed`.
 """
 
 import xml.etree.ElementTree as ET

@@ -18,11 +18,13 @@ from hil.description.urdf import rotation_of
 Array = NDArray[np.float64]
 
 ALWAYS_SHARE = 0.9
-"""Two capsules that are closer than the margin in at least this fraction of poses are assumed to touch by design."""
+"""Two capsules that are closer than the margin in at least this fraction of random poses are assumed to touch by
+design.
+"""
 
 NEAR_SHARE, NEAR_SHARE_OF_OTHERS = 0.75, 0.98
-"""Two capsules that are closer than BUILT_NEAR in at least this fraction of poses are near each other by design: they
-must not touch, but need no margin. First value: if exactly one link lies between them; second: if more do.
+"""Two capsules that are closer than BUILT_NEAR in at least this fraction of random poses are near each other by design:
+they must not touch, but need no margin. First value: if exactly one link lies between them; second: if more do.
 """
 
 BUILT_NEAR = 0.02  # m beyond the margin
@@ -31,8 +33,8 @@ TOUCHED = 0.02
 
 RANDOM_POSES = 400
 AT_REST_SLACK = 0.008
-"""If a pair is closer than the margin in the rest pose, it may be closer still by this distance [m] on the way to or
-from that pose.
+"""If a pair is closer than the margin in the rest pose, it may come closer still, by up to this distance [m], on the
+way to or from that pose.
 """
 
 AT_REST_INSIDE = 0.02
@@ -105,7 +107,8 @@ class Space:
     def has_reserve(self, position: Array, reserve: float) -> bool:
         """Whether a motion (joints, samples) [rad] keeps `reserve` [m] more than the required distance.
 
-        For pairs that are near each other by design, half of their median distance is enough if that is less.
+        For pairs that are near each other by design, half of their median distance is enough if that is less than
+        `reserve`.
         """
         needed = self._needed(False)
         needed = np.minimum(needed + reserve, np.maximum(needed, 0.5 * self._built))

@@ -10,7 +10,7 @@ from hil.estimator.models.terms import OPTIONS, Drive, Friction
 from hil.unit_hints import in_other_units
 
 DRIFT = 5.0
-"""Ratio of the accepted slow drift between periods to experiment.settle_within."""
+"""Limit on slow drift between periods, as a multiple of experiment.settle_within."""
 
 
 class ExperimentConfig(Table):
@@ -23,7 +23,7 @@ class ExperimentConfig(Table):
     )
     lines: list[list[int]] | None = Field(None, description="excited harmonics of 1/period, one list per joint")
     detection: bool = Field(
-        False, description="excite only some of the odd lines: the others reveal nonlinear distortion"
+        False, description="excite only some of the odd harmonics: the others reveal nonlinear distortion"
     )
     peak_torque: list[PositiveFloat] | None = Field(
         None, description="N m per joint; with pilot = true, found by dry runs"
@@ -123,7 +123,7 @@ class ModelConfig(Table):
     cable: bool = Field(False, description=OPTIONS["cable"])
     encoder: bool = Field(False, description=OPTIONS["encoder"])
     lags: bool = Field(False, description=OPTIONS["lags"])
-    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, where gravity reveals it")
+    base_tilt: bool = Field(False, description="tilt of a spatial arm's base, as far as gravity reveals it")
 
     @property
     def fixed_friction(self) -> Friction:

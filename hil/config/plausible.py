@@ -19,8 +19,8 @@ _MOST_TURN_RAD = 4 * math.pi
 _LONGEST_M = 3.0
 _SHORTEST_M = 2e-3
 _LEAST_TIME_SQUARED = 0.1  # s^2/rad
-"""Largest plausible inertia per stall torque: such a joint accelerates at 10 rad/s^2 at most, a tenth of the usual
-value.
+"""Largest plausible ratio of inertia to stall torque [s^2/rad]: such a joint accelerates at 10 rad/s^2 at most, a tenth
+of the usual value.
 """
 
 _MOST_ROTOR = 1e-4  # kg m^2, on the motor's side of the gears

@@ -58,7 +58,7 @@ LYING_RAD = 0.25
 """Largest deviation of a spatial arm from its rest pose at the start, unless arm.rest_tolerance is given [rad]."""
 
 SLOW_INTERVAL_S = 0.25
-"""Interval between slow reads [s]: alternately of the servos' clocks and of their voltages and temperatures."""
+"""Interval between slow reads [s], which alternate between the servos' clocks and their voltages and temperatures."""
 
 
 class PortConfig(Table):
@@ -139,7 +139,7 @@ class SafetyConfig(Table):
     max_voltage: PositiveFloat = Field(30.0, le=60, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s, time for which a current may deviate from its goal")
     follow_share: PositiveFloat = Field(
-        0.3, le=1, description="deviation of a current allowed for longer, as a fraction of the planned peak"
+        0.3, le=1, description="deviation of a current allowed without time limit, as a fraction of the planned peak"
     )
     take_over: bool = Field(
         False, description="take over an arm whose torque is on, and lower it slowly; by default such an arm is refused"
@@ -150,7 +150,7 @@ class SafetyConfig(Table):
         0.6, le=5, description="rad/s, speed at which a stop lowers a spatial arm to its rest pose"
     )
     lower_time: PositiveFloat = Field(
-        10.0, le=60, description="s: longest duration of lowering; on longer paths the arm moves faster"
+        10.0, le=60, description="s, maximum duration of lowering; if the path is long, lower_speed is exceeded"
     )
     limit_chance: float = Field(
         0.002, gt=0, le=0.5, description="acceptable probability, in a dry run, of reaching a limit"

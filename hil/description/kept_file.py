@@ -9,7 +9,7 @@ from hil.description.files import is_mjcf
 
 
 def kept_bytes(path: Path) -> bytes:
-    """The bytes to keep of a URDF or MJCF file. Raises OSError, ArmFileError.
+    """Return the bytes to store as the copy of a URDF or MJCF file. Raises OSError, ArmFileError.
 
     A URDF is kept as it is: without its meshes it still has all inertias. MuJoCo, however, cannot read an MJCF whose
     meshes, textures or included files are missing. Such a file is kept with everything included, the inertias computed

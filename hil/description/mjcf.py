@@ -132,7 +132,9 @@ class _Tree:
         return None if (x, y, z) == USUAL_GRAVITY else (x, y, z)
 
     def not_modelled(self, names: list[str], bodies: list[int]) -> Iterator[str]:
-        """Yield one sentence per kind of force in the file that rigid links with friction do not include."""
+        """Yield one sentence per kind of force in the file that the model, rigid links with friction, does not
+        include.
+        """
         model = self.model
         sprung = [name for name in names if np.any(model.jnt_stiffness[model.joint(name).id])]
         if sprung:
@@ -230,7 +232,9 @@ class _Tree:
     def on_link(
         self, body: int, rotation: Array, translation: Array, number: dict[int, int]
     ) -> tuple[int, Array, Array]:
-        """The moving link to which a body is fixed, and a pose in the body expressed in that link's frame."""
+        """The number of the moving link to which a body is fixed, and a pose, given in the body's frame, in that link's
+        frame.
+        """
         while body != WORLD and body not in number:
             turn, place = self._placed(body)
             rotation, translation = turn @ rotation, turn @ translation + place
@@ -238,8 +242,8 @@ class _Tree:
         return number.get(body, 0), rotation, translation - self._pivot(body)
 
     def rigid(self, body: int, chosen: set[int]) -> tuple[Body, list[str], list[str]]:
-        """A body about its joint, merged with everything fixed to it; names of the merged bodies, and of joints
-        held.
+        """A body in the frame of its joint, merged with everything fixed to it; the names of the merged bodies; and the
+        names of the joints held.
         """
         merged, fixed, held = self._merged(body, chosen)
         return merged.moved(np.eye(3), -self._pivot(body)), fixed, held

@@ -1,4 +1,4 @@
-"""Whether the planar model covers a described arm, with the same angle convention."""
+"""Check that the planar model, with its angle convention, applies to an arm described in a file."""
 
 import numpy as np
 

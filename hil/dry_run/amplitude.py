@@ -24,7 +24,7 @@ class AmplitudeOptions:
     search_arms: int = 32
     """Number of arms simulated during the search; the result is checked on all arms."""
     prior_share: float = 0.9
-    """Fraction of the limits that may be used before any identification. A wide prior has longer tails than the
+    """Fraction of the limits that may be used before any identification: a wide prior has longer tails than the
     simulated arms show.
     """
     max_rounds: int = 12
@@ -32,7 +32,7 @@ class AmplitudeOptions:
     max_polishing_rounds: int = 4
     """Maximum number of final torque increases, one joint at a time."""
     close: float = 0.94
-    """The limits count as reached once this fraction of them is used at the required probability."""
+    """A joint counts as at its limit once it reaches this fraction of it with the allowed probability."""
     over: float = 0.97
     """Fraction of the limits that the next iteration aims for if the last torque exceeded them."""
     under: float = 0.99
@@ -40,7 +40,9 @@ class AmplitudeOptions:
     max_ratio: float = 2.0
     """Maximum ratio of the torques of two successive iterations."""
     damping: float = 0.85
-    """Factor by which the exponent of the corrections decreases from one iteration to the next."""
+    """The torque is corrected by a power of its estimated error; each iteration multiplies the exponent by this
+    factor.
+    """
     min_exponent: float = 0.4
     least_change: float = 0.005
     """The search stops if the torque would change by less than this fraction: another iteration is not worth its
@@ -49,7 +51,7 @@ class AmplitudeOptions:
     polishing_ratio: float = 1.06
     """Factor by which each of the final increases raises a joint's torque."""
     worst_arms: int = 4
-    """Number of the worst arms, beyond those that may exceed a limit, that are simulated first once a check has failed.
+    """After a failed check, the next one starts with the worst arms: as many as may exceed a limit, and this many more.
     """
     back_off: float = 0.93
     """Factor applied to the torque when the check on all arms has failed."""
@@ -92,7 +94,7 @@ def largest_amplitude(
         config: configuration of the arm.
         ensemble: arms to simulate.
         share: fraction of the limits that may be used.
-        plan: plan whose waves are scaled; by default low-crest multisines.
+        plan: plan whose waves are scaled; by default multisines with a low crest factor.
         pose: where the arm starts (joints,) [rad].
         cap: largest torque (joints,) [N m], in addition to the current limits.
         executor: a concurrent.futures executor for the simulations.

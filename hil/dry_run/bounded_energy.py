@@ -16,9 +16,9 @@ from hil.estimator.models.parameters import CONSTANTS, Physics
 Array = NDArray[np.float64]
 
 _POINTS = 181
-"""Number of poses of the other joint at which the potential energy on the boundary is evaluated."""
+"""Number of angles of the other joint at which the potential energy on the boundary is evaluated."""
 _MARGIN = 0.05
-"""Share of the largest potential energy that is kept as a margin, for the grid and the integration."""
+"""Margin for grid and integration errors, as a fraction of the largest potential energy."""
 
 
 @dataclass(frozen=True)

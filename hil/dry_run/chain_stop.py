@@ -31,11 +31,11 @@ LAID_DOWN = 0.95
 
 @dataclass(frozen=True)
 class Fall:
-    """The hardest fall.
+    """The hardest of the simulated falls.
 
-    moment: start, as a time in the path [s]. hits: names of what collides; None if nothing does within FALL_S. seconds:
-    duration [s]. height: largest descent [m]. speed: largest speed at its end [m/s]. beyond: largest overshoot of each
-    joint beyond its limits in any fall (joints,) [rad].
+    moment: time in the path at which it starts [s]. hits: names of what collides; None if nothing does within FALL_S.
+    seconds: duration [s]. height: largest descent [m]. speed: largest speed at its end [m/s]. beyond: largest overshoot
+    of each joint beyond its limits in any fall (joints,) [rad].
     """
 
     moment: float
@@ -48,7 +48,7 @@ class Fall:
 
 @dataclass(frozen=True)
 class LoweringForeseen:
-    """Predicted lowering.
+    """Prediction of how a stop lowers the arm.
 
     seconds: longest duration [s]. nearest: smallest clearance. lies: fraction of simulations that end in the rest pose.
     joint: name of the joint that ends farthest from its rest angle, by `away` [rad]. helps: what to do about that

@@ -1,4 +1,4 @@
-"""Arms that could be the one on the bench, drawn from a prior or from an earlier result with its covariance."""
+"""Parameter sets that the real arm may have, drawn from a prior or from an earlier result with its covariance."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,7 +128,7 @@ def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: i
 
 
 def nominal(result: Result) -> Physics:
-    """The arm described by a result."""
+    """Return the arm with the estimated parameters of a result."""
     return Physics.of(result.values)
 
 

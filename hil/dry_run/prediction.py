@@ -48,7 +48,7 @@ class Prediction:
     of periods until each arm settled (arms,), 0 if it took more than max_settling_periods. shown: positions over time
     of a few arms (arms, joints, samples) [rad], padded with NaN. rest: rest pose (joints,) [rad]. rate: samples per
     second [Hz]. centre: centre of a path (joints,) [rad]; distances to a position limit then start at
-    rest or centre, whichever is farther.
+    rest or centre, whichever is farther from that limit.
     """
 
     values: Array

@@ -47,7 +47,8 @@ class Quantity:
 
 
 def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
-    """Draw base parameters, friction terms, zeros and lag: `count` values (count,) [SI] by the estimator's names.
+    """Draw base parameters, friction terms, encoder zeros and lag: `count` values (count,) [SI] by the estimator's
+    names.
 
     Raises ConfigError if the link lengths are missing.
     """

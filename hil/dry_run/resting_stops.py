@@ -28,9 +28,9 @@ def resting_stops(config: Config, arms: ChainArms, passed: NDArray[np.bool_] | N
     """Side on which each joint lies on its stop (joints,): -1 at its smallest angle, 1 at its largest, 0 if on neither.
 
     A joint is assumed to lie on its stop if its rest pose is near the end of its range, nothing else touches the part
-    of the arm that it moves, and gravity does not pull it away from there. A support missing from the description looks
-    the same until the joint has moved beyond its rest pose. passed: on which sides each joint has been beyond it, as
-    `passed_rest` returns it (2, joints). Raises ArmFileError.
+    of the arm that it moves, and gravity does not pull it away from there. If the description lacks a support, the
+    joint is taken to lie on its stop until a recording shows it beyond its rest pose. passed: whether each joint has
+    been below and above its rest pose, as returned by `passed_rest` (2, joints). Raises ArmFileError.
     """
     rest = np.array(config.arm.rest_pose)
     low, high = _ends(config, rest)

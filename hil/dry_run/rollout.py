@@ -80,7 +80,9 @@ class _Arm:
         self.parts: list[Response] = []
 
     def play_segment(self, commands: Commands) -> int:
-        """Play ramps and periods. Returns the number of periods until the arm settled, 0 if it never did."""
+        """Simulate the ramps and periods of one segment. Returns the number of periods until the arm settled, 0 if it
+        never did.
+        """
         self._play(commands.ramp_in)
         settled_after = self._settle(commands.period)
         if settled_after:

@@ -47,7 +47,7 @@ _AHEAD_S = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.2)
 _EVENLY = 16
 _IMMOVABLE = 1e3  # kg m^2
 _JUDGED_AFTER_S = (0.05, 0.2, 0.5)
-"""Times after torque off at which the remaining swing is omitted if the arm's energy keeps it within its limits [s].
+"""Times after torque is cut at which a simulation ends if the arm has too little energy to leave its limits [s].
 
 The first is many time constants of the current's lag, so that the motor no longer adds energy.
 """
@@ -58,9 +58,9 @@ _REACTION = 2
 class Way(StrEnum):
     """How the arm is stopped.
 
-    CUT: torque off. BRAKED: braked, then torque off. REVERSED: the brake accelerates the joint (reversed sign), is
-    abandoned, and torque is cut. SILENT: some or all servos receive nothing until their watchdogs act. SILENT_BRAKE:
-    the same, starting as braking begins.
+    CUT: torque off. BRAKED: braked, then torque off. REVERSED: braking accelerates the joint because a sign is
+    reversed, so braking ends and torque is cut. SILENT: some or all servos receive nothing until their watchdogs act.
+    SILENT_BRAKE: the same, from the moment at which braking begins.
     """
 
     CUT = "cut"
@@ -106,7 +106,9 @@ def stopping_distance(config: Config, plan: Plan, ensemble: Ensemble, velocity: 
 
 
 def beyond_when_planned(config: Config, plan: Plan, ensemble: Ensemble) -> dict[Way, Array]:
-    """Overshoot when stopped at any moment of the planned motion."""
+    """Largest overshoot beyond the limits (joints,) [rad], by kind of stop, if the planned motion is stopped at any
+    moment.
+    """
     stops = _Stops(config)
     ways = {
         Way.CUT: stops.cut,
@@ -121,8 +123,8 @@ def beyond_when_planned(config: Config, plan: Plan, ensemble: Ensemble) -> dict[
 def beyond_when_passed(
     config: Config, plan: Plan, ensemble: Ensemble, velocity: Array, pose: Array | None = None
 ) -> dict[Way, Array]:
-    """Overshoot when stopped at a limit that was crossed at up to `velocity` (joints,) [rad/s], under the largest
-    torque.
+    """Largest overshoot beyond the limits (joints,) [rad], by kind of stop, if a stop begins as a joint crosses a limit
+    under the largest torque, at up to `velocity` (joints,) [rad/s].
 
     pose: pose at that moment (joints,) [rad]; by default, one joint is at a limit and the other anywhere in its range.
     """

@@ -1,4 +1,6 @@
-"""Choice of the waves for a full run: low-crest multisines that use the range well, or optimally designed ones."""
+"""Choice of the waves for a full run: multisines with a low crest factor that make good use of the position range, or
+optimally designed ones.
+"""
 
 from dataclasses import replace
 from itertools import product

@@ -186,7 +186,8 @@ def calibration_lines(result: CalibrationResult) -> list[str]:
     if not result.fit.reached:
         lines.append(
             "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
-            "the remaining distance to it. Record both runs again with faster motion before relying on these values."
+            "the remaining distance to the minimum. Record both runs again with faster motion before relying on these "
+            "values."
         )
     lines.append("The standard errors cover noise only: add the relative errors of the mass and of its distance.")
     lines.append("Set torque_constant (torque_per_volt in pwm mode) of each joint to these values and estimate again.")

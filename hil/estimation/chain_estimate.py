@@ -236,7 +236,7 @@ def _verdict(
         trust = lowered(trust, "with care")
         sentences.append(
             "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
-            "the remaining distance to it. Use faster motion ([joint_path]), so that fewer joints stick."
+            "the remaining distance to the minimum. Use faster motion ([joint_path]), so that fewer joints stick."
         )
     if estimate.at_bound:
         trust = lowered(trust, "with care")
@@ -295,7 +295,7 @@ def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_p
 
 
 def is_explained(estimate: ChainEstimate) -> bool:
-    """Whether the residual is noise, so that no effect is known to be missing from the model."""
+    """Whether the residual is only noise, so that nothing suggests an effect missing from the model."""
     return float(estimate.over_noise.max()) <= EXPLAINED and estimate.systematic <= SYSTEMATIC
 
 

@@ -1,4 +1,6 @@
-"""The limit that determined the torque of a pilot. In a pilot's run, advice to raise peak_torque would not help."""
+"""The limit that kept the pilot from raising the torque further. If a pilot chose the torque, the user cannot raise
+peak_torque, so messages name this limit instead.
+"""
 
 import numpy as np
 from numpy.typing import NDArray

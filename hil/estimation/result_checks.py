@@ -88,7 +88,7 @@ def describe_segment_choice(choice: unsettled.SegmentChoice) -> ModelChoice:
 
 
 def describe_chain_choice(choice: ChainChoice) -> ModelChoice:
-    """Convert the choice among models of a spatial arm, judged on the fitted motion, one step ahead."""
+    """Convert the choice among models of a spatial arm, judged by predicting the fitted motion one step ahead."""
     return ModelChoice(
         chosen=choice.estimate.model.description,
         error_divided_by=choice.gained,

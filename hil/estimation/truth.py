@@ -20,7 +20,7 @@ from hil.results.parts import Quantity
 from hil.results.result import Result
 
 _EQUAL = 1e-4
-"""Relative difference up to which two torque constants are equal."""
+"""Relative difference up to which two torque constants count as equal."""
 
 _DETERMINED = 0.02
 """Largest standard error, relative to the true value, of a well determined parameter."""
@@ -83,7 +83,7 @@ def truth_of(result: Result, config: Config) -> Truth:
 
 
 def scaled(truth: Mapping[str, float] | None, config: Config, extra: Mapping[str, Quantity]) -> dict[str, float] | None:
-    """The entry `truth_scaled` of a result: its `truth` scaled like its parameters; None if that is the same."""
+    """The entry `truth_scaled` of a result: its `truth` scaled like its parameters; None if scaling changes nothing."""
     found = in_file_unit(truth or {}, config, extra, len(config.joints))
     return found.values if found.note else None
 

@@ -1,7 +1,7 @@
 """URDF and MJCF of an identified spatial arm.
 
-The URDF is the one used for the identification: names, frames, limits and meshes stay; inertias, damping and friction
-of the arm's joints are replaced. The MJCF is written from its geometry.
+The URDF is the one used for the identification: names, frames, limits and meshes are kept; inertias, damping and
+friction of the arm's joints are replaced. The MJCF is written from its geometry.
 """
 
 from collections.abc import Sequence
@@ -165,7 +165,8 @@ def _describe(root: ET.Element, model: ChainArmModel, found: ChainLinks, left: l
     """Add comments at the top of the file: its origin, and what was identified or kept."""
     words = [
         f"Inertias, damping and friction identified by hil {__version__}; everything else is from {found.path.name}.",
-        "Link inertias: the dynamically equivalent set closest to that file. Only these combinations were identified:",
+        "Link inertias: of all dynamically equivalent ones, those closest to that file. Only the following "
+        "combinations were identified:",
         *(f"{model.groups[name]} = {model.values[name]!r} +- {model.stds[name]:.1e}" for name in model.groups),
         *(f"Not representable in this format: {sentence}" for sentence in left),
     ]

@@ -21,7 +21,7 @@ from hil.arm_model import ArmModel
 from hil.errors import ExportError
 
 ROD = 0.75
-"""Share of m c^2 in the second moment of a uniform rod about its end."""
+"""Ratio of m c^2 to the second moment of a uniform rod about its end."""
 
 _UNKNOWN_LENGTH = 0.1  # m, arbitrary length of a pendulum without gravity, whose mass cannot be identified
 

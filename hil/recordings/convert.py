@@ -114,7 +114,7 @@ def _torque(table: Table, columns: Columns, joint: int, notes: list[str]) -> Val
         assert columns.supply_voltage is not None
         if float(np.nanmax(np.abs(values), initial=0.0)) > 1.5:
             raise CsvError(
-                f"{table.source}: column {name!r} reaches {float(np.nanmax(np.abs(values))):.4g}; a share of the "
+                f"{table.source}: column {name!r} reaches {float(np.nanmax(np.abs(values))):.4g}; a fraction of the "
                 'supply voltage is at most 1: is it in percent (pwm_unit = "%")?'
             )
         values = values * columns.supply_voltage

@@ -11,7 +11,7 @@ MOST_SHARE = 0.7  # of the readings: with a larger share of distinct values, no 
 
 
 def encoder_step(position: Values) -> float | None:
-    """Largest step that divides all differences between readings (samples,); None if there is none."""
+    """Largest step that divides all differences between readings (samples,), in their unit; None if there is none."""
     finite = position[np.isfinite(position)]
     if finite.size < FEWEST_LEVELS:
         return None

@@ -11,7 +11,7 @@ from hil.recordings.table import Table
 TEXTS = (".csv", ".txt", ".tsv", ".dat")
 SUFFIXES = (*TEXTS, ".parquet", ".mcap")
 UNSUPPORTED = (".db3", ".bag", ".h5", ".hdf5", ".xlsx", ".mat", ".npz", ".npy", ".json", ".jsonl", ".gz", ".zip")
-"""Formats of recordings that must be converted first. They are recognised even if there is no such file."""
+"""Formats of recordings that must be converted first. They are recognised by name even if the file does not exist."""
 
 
 def is_recording(path: Path) -> bool:

@@ -22,7 +22,7 @@ TIMES_NO_LOAD = 5.0
 """Highest plausible speed, relative to the no-load speed of the fastest servo."""
 
 _ONE_WAY = 0.7
-"""Smallest share of a joint's path in one direction for which it counts as rotating continuously."""
+"""A joint counts as rotating continuously if at least this fraction of its path is in one direction."""
 
 _OVER_S, _USUAL = 0.02, 0.9
 """Time over which speeds are measured, so that noise hardly matters [s], and the quantile of them that is checked."""

@@ -70,7 +70,8 @@ def split_head(head: str) -> tuple[str, str | None]:
 def wrapped(values: NDArray[np.float64], sizes: Sequence[int]) -> int | None:
     """The size [bits] of the signed register that was read as an unsigned number; None if nothing indicates that.
 
-    Negative numbers then lie in the uppermost quarter of the range, and no value in the two middle quarters.
+    Numbers that were negative then lie in the uppermost quarter of the range, and no value lies in the two middle
+    quarters.
     """
     known = values[np.isfinite(values)]
     if not known.size or known.min() < 0.0 or (known != np.round(known)).any():

@@ -1,6 +1,7 @@
 """Comparison of recorded velocities with the positions: a wrong time scale leaves no other trace.
 
-Parameters absorb a wrong time scale: an arm whose times are twice as long has four times the inertia. Only a second
+Parameters absorb a wrong time scale: if the recorded times are twice the true ones, the estimated inertia is four
+times too large. Only a second
 measurement that depends on time, such as a velocity column, shows it. Velocities are otherwise not used.
 """
 
@@ -63,12 +64,12 @@ def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
         factor = float(np.mean(factors))
         return (
             f"The velocity columns are {factor:.3g} times the rates at which the positions change: the times, or "
-            f"both velocities, are in a wrong scale. If times are {factor:.3g} times too long, inertias are "
+            f"both velocities, have a wrong scale. If times are {factor:.3g} times too long, inertias are "
             f"{factor**2:.3g} times too large: check the unit of time and the sample rate.",
         )
     return tuple(
         f"Column {found[joint - 1].column!r} is {factors[joint - 1]:.3g} times the rate at which the position of joint "
-        f"{joint} changes: that velocity, the angle of joint {joint}{' or time' if len(found) == 1 else ''} is in a "
+        f"{joint} changes: that velocity, the angle of joint {joint}{' or time' if len(found) == 1 else ''} has a "
         "wrong scale. Check units, gear ratio and sample rate."
         for joint in wrong
     )

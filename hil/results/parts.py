@@ -276,7 +276,7 @@ class ChainFacts:
 
     urdf: file name, relative to the configuration. rotation, translation [m]: pose of each joint's frame in the
     previous link's frame. axis: joint axis in its own frame. gravity: gravity in the base frame [m/s^2]. groups: linear
-    combination that each base parameter stands for. from_prior: parameters that the recording hardly determines, taken
+    combination that each base parameter represents. from_prior: parameters that the recording hardly determines, taken
     from the URDF. held: joints of the URDF that are treated as fixed. doubts: warnings about implausible inertias.
     """
 
@@ -335,7 +335,7 @@ class StabiliserShare:
 
 @dataclass(frozen=True)
 class PlayedStep:
-    """One run between the pilot and full amplitude.
+    """One run with a pilot, on the way to full amplitude: its predicted and measured peaks.
 
     Rows are the quantities of hil.dry_run.prediction.QUANTITIES, columns the joints. peak_torque: peak torque per joint
     [N m]. ended: why the run ended early; None if it did not.

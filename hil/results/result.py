@@ -13,9 +13,9 @@ model_choice with friction = "auto": the models tried, the one chosen, its gain 
 timing       how well the stream kept its deadlines, and the duration of the estimation
 arm          facts needed to use the model: gravity, rest pose, and, for each joint, name, servo, mode, limits, torque
              per goal [N m/A, or N m/V in pwm mode]
-chain        only for a spatial arm: its geometry, and the combination that each base parameter stands for
-truth        only on a fake arm: the base parameters it was built with, in N m of its own motors
-truth_scaled the same in the unit of `parameters`, only if the file's torque constants are not those of the motors
+chain        only for a spatial arm: its geometry, and the combination that each base parameter represents
+truth        only on a fake arm: the base parameters it was built with, for the true torque of its motors
+truth_scaled `truth` scaled to the torque constants in the file, like `parameters`; only if those of the motors differ
 physical     masses, centres and inertias, if [known] gives any quantity
 stabiliser   its share of the torque, if there was one
 steps        with a pilot: predicted and measured peaks of each step
@@ -59,7 +59,7 @@ class Result:
 
     parameters, extra: quantities by name, in the order of `covariance.names`. truth: true values by name [SI].
 
-    truth_scaled: `truth` scaled to the file's torque constants; None if that is the same.
+    truth_scaled: `truth` scaled to the file's torque constants; None if scaling changes nothing.
     """
 
     schema: int = SCHEMA

@@ -48,10 +48,10 @@ class Phase(IntEnum):
 def sample_type(joints: int) -> np.dtype[np.void]:
     """The type of one row.
 
-    It contains times [s], the position in the plan, and, for each joint, goal and measured current [A], velocity
-    [rad/s], position [rad], the servo's error byte and whether its reply is missing (the measured values are then NaN).
-    A few times a second, it also contains either the servo's clock [s] or its supply voltage [V] and temperature
-    [degrees C], in turn; these are NaN in all other rows.
+    It contains times [s], phase, segment and period of the experiment, and, for each joint, goal and measured current
+    [A], velocity [rad/s], position [rad], the servo's error byte and whether its reply is missing (the measured values
+    are then NaN). A few times a second, it also contains either the servo's clock [s] or its supply voltage [V] and
+    temperature [degrees C], in turn; these are NaN in all other rows.
     """
     each = (joints,)
     return np.dtype(

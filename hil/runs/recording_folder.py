@@ -70,7 +70,7 @@ class Predicted:
 
 
 def describe(config: str, files: Sequence[Path], notes: Sequence[str]) -> RecordingRecord:
-    """The record of an estimate made now."""
+    """Return the contents of run.json for an estimate that is made now."""
     return RecordingRecord(
         config,
         datetime.now().astimezone().isoformat(timespec="seconds"),

@@ -23,7 +23,7 @@ __all__ = ["executor", "versions", "workers"]
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "HIL_THREADS"), "1"
 )
-"""Environment that limits each worker process to one thread in BLAS, numba and hil."""
+"""Environment variables that limit each worker process to one thread in BLAS, numba and hil."""
 
 _DASK: dict[str, Any] = {
     "distributed.worker.daemon": False,
@@ -40,7 +40,7 @@ _PACKAGES = ("numpy", "scipy", "numba", "distributed")
 _CONNECT_S = 10.0
 _MOST_DEATHS = 10
 """Number of worker losses during one run after which it counts as failed: a machine may reboot several times, but a run
-that needs too much memory never ends."""
+that needs too much memory kills every worker that tries it."""
 
 
 @contextmanager

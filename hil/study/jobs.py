@@ -20,11 +20,11 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _AHEAD = 8
-"""Jobs given to each worker beyond the one it works on: enough that none waits, few enough that memory stays flat."""
+"""Jobs given to each worker beyond the one it works on: enough that none waits, few enough to limit memory use."""
 
 
 _TASK_S, _MOST_IN_A_TASK = 0.1, 50
-"""Jobs shorter than this share a task: every task has an overhead of some milliseconds."""
+"""Jobs are combined into tasks of up to this duration [s] and number of jobs: each task has an overhead of a few ms."""
 
 
 _COUNTED_EVERY_S = 1.0
@@ -92,7 +92,8 @@ class _Flight(Generic[Item, Result]):
 
     @property
     def room(self) -> int:
-        """How many more tasks may be in flight. Workers may join at any time; they wait until they are counted."""
+        """How many more tasks may be in flight. Workers may join at any time; they get tasks once they have been
+        counted."""
         if time.monotonic() - self._counted > _COUNTED_EVERY_S:
             workers = self._client.scheduler_info(n_workers=-1)["workers"]
             self._window, self._counted = max(1, len(workers)) * (1 + _AHEAD), time.monotonic()

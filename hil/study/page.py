@@ -17,7 +17,7 @@ _BINS = 24
 _MOST_ARMS = 200
 """Largest number of arms listed in a fleet's table on the page; the dataset contains all of them."""
 _MANY = 100
-"""Smallest number of values for which a histogram leaves out the lowest and the highest percent."""
+"""Smallest number of values for which a histogram leaves out the lowest 1 % and the highest 1 % of them."""
 
 
 def write_page(table: pa.Table, title: str, path: Path) -> Figures:

@@ -38,7 +38,7 @@ class _Latest:
     x: Array | None = None
     objects: tuple[object, ...] = ()
     settings: tuple[float, ...] = ()
-    """What else the simulation depends on."""
+    """Other settings on which the simulation depends."""
     parts: dict[int, list[tuple[slice, Array, Array]]] = field(default_factory=dict)
     """Samples, angles and derivatives of each period that was simulated to its end."""
     size: int = 0

@@ -1,4 +1,4 @@
-"""Options of the likelihood of chains."""
+"""Options of stage 2 for chains, the maximum-likelihood fit."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from hil.estimator.options import CoordinateOptions
 
 @dataclass(frozen=True)
 class ChainOptions:
-    """Options of the likelihood of chains; names as in `hil.estimator.options`."""
+    """Options of stage 2 for chains; names as in `hil.estimator.options`."""
 
     softness: tuple[float, ...] = (3.0, 1.5, 1.0)
     """Natural frequencies of the observer, in order of use [Hz].
@@ -15,13 +15,13 @@ class ChainOptions:
     A softer observer extracts more information; one that is too soft no longer follows the motion.
     """
     lost: float = 1.5
-    """The previous observer is kept if the cost grows by more than this factor times the growth that the greater
-    softness explains.
+    """A softer observer is rejected if the cost grows by more than this factor times the growth that its softness
+    explains.
     """
     first_step: float = 5.2e-3
     """Integration step while the observer is stiff [s]; samples within such a step are skipped."""
     coarse_step: float = 2.6e-3
-    """Integration step of the iterations in between [s]."""
+    """Integration step after the observer has been softened and before the last iterations [s]."""
     fine_step: float = 1.3e-3
     """Integration step of the last iterations [s]."""
     finer: int = 16

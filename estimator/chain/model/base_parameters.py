@@ -86,7 +86,7 @@ class BaseParameters:
 
     @cached_property
     def groups(self) -> tuple[str, ...]:
-        """The combination that each base parameter stands for, such as `moment_x_3 + 0.124 mass_4`."""
+        """The combination that each base parameter represents, such as `moment_x_3 + 0.124 mass_4`."""
         every = parameter_names(self.chain.joints)
         return tuple(_sum(name, every, row) for name, row in zip(self.names, self.grouping, strict=True))
 

@@ -19,7 +19,9 @@ from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
 """Meanings of the kinds of parameters that only chains have."""
 PART = 0.1
-"""Smallest share of a joint in the motion that loses the most inertia for `limited` to name the joint's back-EMF."""
+"""`limited` names a joint's back-EMF only if the joint contributes more than this fraction to the motion that loses the
+most inertia.
+"""
 MOST_LOST = 0.5
 """Largest fraction of a joint's inertia that a lagging back-EMF may cancel."""
 _ARMATURE = 10  # of a link's parameters

@@ -24,7 +24,9 @@ class ChainRun:
     """Input of a simulation from a recording: consecutive samples, each with its integration steps."""
 
     torque: Array
-    """Mean motor torque over each step after each sample, unscaled (samples, steps, joints) [N m]."""
+    """Mean motor torque over each step after each sample, not yet multiplied by the torque scales (samples, steps,
+    joints) [N m].
+    """
     slopes: Array
     """Derivatives of `torque` with respect to delay and each joint's lag (samples, steps, 2, joints) [N m/s]."""
     measured: Array
@@ -107,7 +109,7 @@ class Simulation:
         """Simulate the next `piece` of the samples.
 
         Returns the angles (samples, joints) [rad], None if the motion diverges, and their derivatives with respect to
-        `names` and the initial state (samples, joints, causes).
+        `names` and the initial state (samples, joints, names and initial state).
         """
         torque, measured = run_.torque[piece], run_.measured[piece]
         position = np.empty(measured.shape)

@@ -24,7 +24,7 @@ from hil.results.parts import Covariance
 FALSE_ALARMS = 0.05
 LEAST_SHARE = 0.01
 _POWER_Z = 1.645
-"""Standard deviations by which a change must exceed the threshold to be found with a probability of 95 %."""
+"""Number of standard errors by which a change must exceed the threshold to be found with a probability of 95 %."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def diff_runs(
 def _other_joints(before: ArmModel, after: ArmModel) -> tuple[str, ...]:
     return tuple(
         f"Joint {number} was {old.name!r} with {with_article(old.servo)} and is {new.name!r} with "
-        f"{with_article(new.servo)}: if these are two arms, the changes are the difference between them."
+        f"{with_article(new.servo)}: if these are different arms, the changes are differences between the arms."
         for number, (old, new) in enumerate(zip(before.joints, after.joints, strict=True), 1)
         if (old.name, old.servo) != (new.name, new.servo)
     )

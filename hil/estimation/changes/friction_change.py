@@ -9,8 +9,8 @@ one term alone    Did only term i change? The most powerful test is z_i = (S^-1 
                   (S^-1 d)_i / (S^-1)_ii is the change that this implies (generalised least squares).
 several at once   Is d anything but noise? d' S^-1 d has a chi-square distribution.
 
-The covariances are marginal ones: changes of inertia, gravity or another joint do not count. Friction itself varies
-slightly from run to run, which the covariance of a single run does not contain: `repeatability` is added to S.
+The covariances are marginal ones: changes of inertia, gravity or another joint do not affect the tests. Friction itself
+varies slightly from run to run. The covariance of a single run does not include this, so `repeatability` is added to S.
 """
 
 import math

@@ -27,8 +27,8 @@ from hil.runs.run_folder import RunFolder
 
 CUTOFFS = (2.0, 4.0, 6.0, 10.0, 15.0, 25.0)  # Hz
 LARGE = 0.1
-"""Parameters below this fraction of the largest of their kind are not judged: near zero, a relative error is
-meaningless.
+"""Parameters below this fraction of the largest of their kind are left out of the comparison: near zero, a relative
+error is meaningless.
 """
 
 Array = NDArray[np.float64]

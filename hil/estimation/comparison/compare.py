@@ -26,7 +26,7 @@ from hil.runs.run_folder import RunFolder, write_json
 SCHEMA = 1
 OURS = "hil"
 OURS_PLAIN = "hil_coulomb"
-"""hil's own estimate with the friction model that mujoco.sysid also has, for a fair comparison of computing times."""
+"""Name of hil's estimate with the friction model of mujoco.sysid, for a fair comparison of computing times."""
 
 
 @dataclass(frozen=True)

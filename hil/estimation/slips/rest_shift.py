@@ -26,7 +26,7 @@ _STILL_RAD = 0.02
 def rest_shift_warnings(config: Config, samples: NDArray[np.void], result: SettledResult) -> list[str]:
     """One sentence per joint whose rest angle changed by more than friction usually explains.
 
-    Nothing is reported for a trusted model, for a horizontal arm, or for one held by a stabiliser.
+    Nothing is reported if the verdict trusts the model, if the arm is horizontal, or if a stabiliser holds it.
     """
     trusted = result.verdict is not None and result.verdict.trust == "yes"
     if trusted or config.arm.gravity == 0.0 or config.stabiliser is not None or config.is_chain:

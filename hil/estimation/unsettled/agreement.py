@@ -1,4 +1,6 @@
-"""Whether several recordings show the same arm: a change of load must not be mistaken for a missing term."""
+"""Whether several recordings show the same arm: a change of load must not be mistaken for a missing term of the
+model.
+"""
 
 from collections.abc import Sequence
 
@@ -23,7 +25,7 @@ def disagreement(
     segment: float,
     zeros: bool,
 ) -> tuple[str, ...]:
-    """A sentence if each recording by itself is explained much better than all together; () otherwise.
+    """A sentence if separate fits explain the recordings much better than a common fit does; () otherwise.
 
     The encoder zeros are treated as unknown if the common estimate includes them.
     """

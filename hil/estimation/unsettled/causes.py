@@ -1,4 +1,4 @@
-"""Why a fit leaves much of the motion unexplained, if the recording itself shows it."""
+"""Reasons why a fit leaves much of the motion unexplained, as far as the recording shows them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from hil.estimator.selection.verdict import MUCH_LEFT
 
 @dataclass(frozen=True)
 class Fitted:
-    """Fits of recordings. names: of the recordings. predicted: simulated positions of each (joints, samples) [rad].
-    plain: of a model without terms that could imitate a defect; estimate: of the chosen one. gravity: in the arm's
-    plane [m/s^2].
+    """Fits of recordings. names: names of the recordings. predicted: simulated positions of each (joints, samples)
+    [rad]. plain: estimate of a model without terms that could imitate a defect. estimate: estimate of the chosen model.
+    gravity: gravity in the arm's plane [m/s^2].
     """
 
     recordings: Sequence[Recording]
@@ -28,7 +28,7 @@ class Fitted:
 
 
 def causes(fitted: Fitted) -> tuple[str, ...]:
-    """Sentences on the cause: a defect of whole recordings, or several that disagree, a local defect, a clipped torque
+    """Sentences on the cause: a defect of whole recordings, recordings that disagree, a local defect, a clipped torque
     or a clock that drifts; otherwise, where the residual is large.
     """
     recordings, names, estimate = fitted.recordings, fitted.names, fitted.estimate
@@ -63,7 +63,7 @@ def _late(recordings: Sequence[Recording]) -> tuple[str, ...]:
     than = "late" if late.delay > 0.0 else "early"
     return (
         f"The torque of joint {late.joint} seems to be logged about {1e3 * abs(late.delay):.2g} ms too {than}, "
-        f"compared with the other joint: shifted by that, inverse dynamics leaves {100 * late.residual:.2g} % of the "
+        f"compared with the other joint: with this shift, inverse dynamics leaves {100 * late.residual:.2g} % of the "
         f"torque unexplained instead of {100 * late.residual_given:.2g} %. Shift its column, or log both together.",
     )
 

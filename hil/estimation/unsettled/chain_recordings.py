@@ -39,8 +39,8 @@ UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "ca
 
 @dataclass(frozen=True)
 class ChainEstimated:
-    """An estimate from recordings. result: complete except for what the caller adds. predicted: positions per recording
-    (joints, samples) [rad]; NaN if there is none.
+    """An estimate from recordings. result: complete except for the fields that the caller fills in. predicted:
+    positions per recording (joints, samples) [rad]; NaN if there is none.
     """
 
     result: ShootingResult
@@ -179,8 +179,9 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     else:
         trust = "with care"
         sentences.append(
-            "The torque was taken as measured, so the result is a regression, whose errors are partly systematic. "
-            'If the columns hold commands, set columns.between = "held": maximum likelihood is then far more accurate.'
+            "The torque was taken as measured, so the result comes from a regression; its errors are partly "
+            'systematic. If the columns hold commands, set columns.between = "held": maximum likelihood is then far '
+            "more accurate."
         )
     if foretold is None:
         trust = "with care"
@@ -218,7 +219,7 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         trust = lowered(trust, "with care")
         sentences.append(
             "The fit stopped short of its minimum because a joint sticks and breaks away; the standard errors include "
-            "the remaining distance to it. Record faster motion, so that fewer joints stick."
+            "the remaining distance to the minimum. Record faster motion, so that fewer joints stick."
         )
     return Verdict(trust, weakest, tuple(sentences))
 

@@ -1,4 +1,4 @@
-"""Sentences on defects of whole recordings: angles in a wrong scale, and what changed while the arm moved."""
+"""Sentences on defects of whole recordings: angles with a wrong scale, and changes while the arm moved."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +27,7 @@ def likely_defect(
 
 
 def is_certain(defect: Defect) -> bool:
-    """Whether it leaves so little that no other cause need be sought."""
+    """Whether it explains so much of the residual that no other cause needs to be looked for."""
     return defect.fit.left < WELL
 
 
@@ -37,12 +37,15 @@ def is_other_arm(defect: Defect) -> bool:
 
 
 def defect_said(defect: Defect, names: Sequence[str]) -> str:
-    """A sentence on a defect, with the evidence and a remedy. names: of the recordings."""
+    """A sentence on a defect, with the evidence and a remedy. names: names of the recordings."""
     hypothesis = defect.hypothesis
     unknowns = defect.fit.unknowns[-hypothesis.unknowns :].tolist()
     what, remedy = _WORDS[hypothesis.kind](hypothesis, unknowns, _when(hypothesis.course, names))
     left, given = math.sqrt(defect.fit.left), math.sqrt(defect.given.left)
-    return f"{what}: with that, the residual is {left:.3g} times the noise instead of {given:.3g} times. {remedy}"
+    return (
+        f"{what}: if the model allows for this, the residual is {left:.3g} times the noise instead of {given:.3g} "
+        f"times. {remedy}"
+    )
 
 
 def _when(course: Course, names: Sequence[str]) -> str:
@@ -79,7 +82,7 @@ def _load(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple
         change = f"The load seems to differ {when}"
     else:
         change = f"The load seems to have been {'picked up' if heavier else 'put down or lost'} {when}"
-    return change, "Use the part before or after it, or put each part in a file of its own."
+    return change, "Use only the part before or after the change, or put each part in a file of its own."
 
 
 def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
@@ -97,7 +100,7 @@ def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> t
             return f"The friction of {whose} seems to differ by {percent} {when}", "Estimate each recording separately."
         case _:
             said = f"The friction of {whose} seems to have changed by {percent} {when}"
-            return said, "Use the part before or after it, and look for what rubs."
+            return said, "Use only the part before or after the change, and look for what rubs."
 
 
 def _torque(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
@@ -134,7 +137,7 @@ def _arm(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[
         return f"The arm {when} seems to be another one, or to carry another load", "Estimate each separately."
     return (
         f"The arm seems to be another one after a change {when}: load, mounting, servo or settings",
-        "Use the part before or after it, or put each part in a file of its own.",
+        "Use only the part before or after the change, or put each part in a file of its own.",
     )
 
 

@@ -48,8 +48,8 @@ NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 
 @dataclass(frozen=True)
 class Estimated:
-    """An estimate from recordings. result: complete except for what the caller adds. predicted: positions per recording
-    (joints, samples) [rad]; NaN if there is none.
+    """An estimate from recordings. result: complete except for the fields that the caller fills in. predicted:
+    positions per recording (joints, samples) [rad]; NaN if there is none.
     """
 
     result: ShootingResult
@@ -61,10 +61,10 @@ class Estimated:
 class Given:
     """What is known about the drives and encoders beforehand.
 
-    torque_scale_std: see `hil.estimator.models.conflicts.conflicts`. zeros: whether a configuration defines the encoder
-    zeros. names: names of the recordings. jumps: a sentence for each joint of a recording whose position jumped.
-    torque_source: where the torques come from. origin: the angles [rad] at which the columns of positions are 0, by
-    default 0.
+    torque_scale_std: relative standard deviation of the ratio of the torque constants, by parameter. zeros: whether a
+    configuration defines the encoder zeros. names: names of the recordings. jumps: a sentence for each joint of a
+    recording whose position jumped. torque_source: where the torques come from. origin: the angles [rad] at which the
+    columns of positions are 0, by default 0.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
@@ -235,7 +235,7 @@ def _result(
     )
     return ShootingResult(
         method=f"multiple shooting: {estimate.segments} segments of {estimate.segment_length:g} s with unknown "
-        f"initial states; {estimate.model.description}; standard errors robust against model error",
+        f"initial states; {estimate.model.description}; standard errors robust to model error",
         config=shown_path,
         joints=estimate.model.joints,
         parameters=dict(entries[:base]),

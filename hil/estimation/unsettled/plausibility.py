@@ -90,16 +90,16 @@ def _link(estimate: ShootingEstimate, gravity: float) -> list[str]:
         if least < abs(value["gravity_2"]) + SURE * std["gravity_2"]:
             return []
         return [
-            f"gravity_2 is {value['gravity_2']:.2g} +- {std['gravity_2']:.2g} N m, but by coupling, link 2 weighs at "
-            f"least {least:.2g} N m: the torque does not contain gravity. Does the drive compensate for gravity, so "
-            "that its torque must be added? If the arm moves in a horizontal plane, set arm.gravity = 0."
+            f"gravity_2 is {value['gravity_2']:.2g} +- {std['gravity_2']:.2g} N m, but according to coupling, link 2 "
+            f"weighs at least {least:.2g} N m: the torque does not contain gravity. Does the drive compensate for "
+            "gravity, so that its torque must be added? If the arm moves in a horizontal plane, set arm.gravity = 0."
         ]
     length = abs(value["coupling"] * gravity / value["gravity_2"])
     if LINK[0] < length < LINK[1]:
         return []
     return [
-        f"By coupling and gravity_2, link 1 would be {length:.2g} m long: check the units of time and angle, and "
-        "arm.gravity."
+        f"According to coupling and gravity_2, link 1 would be {length:.2g} m long: check the units of time and angle, "
+        "and arm.gravity."
     ]
 
 

@@ -7,10 +7,10 @@ from hil.estimator.baselines.signs import suspect_absolute, suspect_order, suspe
 from hil.estimator.data.recording import Recording
 
 CLEAR = 0.25
-"""A mistake is clear only if its correction reduces the torque residual to less than this fraction."""
+"""A mistake is clear only if its correction reduces the torque residual to less than this fraction of its value."""
 
 WELL = 0.3
-"""A mistake is clear only if the torque residual after its correction is less than this fraction of the torque."""
+"""A mistake is clear only if the torque residual after its correction is less than this fraction of the RMS torque."""
 
 
 def refuse_slips(recordings: Sequence[Recording], source: str) -> None:

@@ -17,7 +17,7 @@ def steps(data: RunData) -> Section | None:
     said = (
         f"In {listed(outside)}, a peak exceeded the value that the dry run predicted for 99 % of the arms."
         if outside
-        else "No peak with a limit exceeded the value that the dry run predicted for 99 % of the arms."
+        else "No peak of a limited quantity exceeded the value that the dry run predicted for 99 % of the arms."
     )
     tables = tuple(_table(step, data.config) for step in played)
     return Section("steps", "Predicted and measured peaks", (said,), tables)
