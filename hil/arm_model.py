@@ -21,7 +21,7 @@ _CHUNK = 16384  # samples per block, chosen so that temporaries stay in the proc
 
 @dataclass(frozen=True)
 class JointFacts:
-    """What a model knows about a joint besides its dynamics.
+    """Properties of a joint that are not part of its dynamics.
 
     mode: "current" (goals in A) or "pwm" (goals in V). torque_per_goal: N m/A or N m/V at the output shaft. goal_limit:
     A or V. position_limit: rad. velocity_limit: rad/s. servos: number of servos that drive the joint together.

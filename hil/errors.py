@@ -45,7 +45,7 @@ __all__ = [
 
 
 class Cause(Enum):
-    """What the guard detected. If measurement and drive still work, the stop may brake first."""
+    """What the guard detected. If measurement and drive still work, the stop may begin with braking."""
 
     POSITION = "position limit"
     VELOCITY = "velocity limit"

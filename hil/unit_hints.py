@@ -1,6 +1,6 @@
 """Recognition of a number given in another unit: 10000 where seconds are expected may be 10 s in milliseconds.
 
-A key's unit is read from its description, as people read it: the first words ("N m/A at the output shaft"), in brackets
+A key's unit is taken from its description: the first words ("N m/A at the output shaft"), in brackets
 ("viscous friction [N m s/rad]"), or after a comma ("roll, pitch and yaw, rad").
 """
 

@@ -24,7 +24,7 @@ class CheckReport:
 
     @property
     def ready(self) -> bool:
-        """Whether nothing blocks an experiment."""
+        """Whether no finding blocks an experiment."""
         return not self.problems
 
     @property

@@ -185,7 +185,9 @@ def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None)
 
 
 def unused_path(path: Path) -> Path:
-    """`path`, with a number appended if it already exists: a program may start two runs within a second."""
+    """Return `path`, with a number appended if it already exists, since a program may start two runs within a
+    second.
+    """
     number = 2
     tried = path
     while tried.exists():

@@ -58,7 +58,7 @@ class Nearest:
 
     @property
     def room(self) -> float:
-        """Excess over the required distance [m]; negative if too close."""
+        """Distance minus required distance [m]; negative if too close."""
         return self.distance - self.needed
 
     def __str__(self) -> str:

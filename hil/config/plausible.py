@@ -25,13 +25,13 @@ of the usual value.
 
 _MOST_ROTOR = 1e-4  # kg m^2, on the motor's side of the gears
 _GEAR = 8.0
-"""Largest ratio of a torque constant to the published one: an external gear, or a very bad guess."""
+"""Largest plausible ratio of a torque constant to the published one, for an external gear or a very rough guess."""
 
 _SPEED = 4.0
-"""Largest ratio of the velocity limit to the no-load speed at the highest published supply voltage."""
+"""Largest plausible ratio of the velocity limit to the no-load speed at the highest published supply voltage."""
 
 _CURRENT = 2.0
-"""Largest ratio of the current limit to the model's stall current."""
+"""Largest plausible ratio of the current limit to the model's stall current."""
 
 _PERCENT = 100.0
 _LEVER_M = 0.05

@@ -33,8 +33,8 @@ RAN_AWAY = 1e3
 class ChainPrediction:
     """Prediction of a spatial arm's experiment.
 
-    peaks: predicted peaks and their limits. nearest: smallest clearance among all arms, `moment` [s] into the segment
-    `role`.
+    peaks: predicted peaks and their limits. nearest: smallest clearance among all arms, which occurs
+    `moment` [s] into the segment `role`.
     rooms: smallest clearance of each arm minus the required one (arms,) [m]. tracking: median of the arms' largest
     tracking errors (joints,) [rad]. ways: number of samples of the transition at either end of the first segment.
     """
@@ -67,8 +67,8 @@ def predict_chain(
 ) -> ChainPrediction:
     """Simulate `plan` on every arm. Raises ArmFileError, ConfigError.
 
-    tell: called with the number of simulations done and the total number. shown: number of motions to store. passed: as
-    in `resting_stops`.
+    tell: called with the number of simulations done and the total number. shown: number of motions to store. passed:
+    whether each joint has ever been below and above its rest pose (2, joints), as for `resting_stops`.
     """
     space = Space.of(config)
     limits, rest = limits_of(config), np.array(config.arm.rest_pose)
@@ -121,7 +121,9 @@ def simulated_seconds(plan: Plan) -> float:
 
 
 def loop_of(config: Config, segment: PathSegment, rate: float, stops: Array | None = None) -> Loop:
-    """Commands and feedback of the control loop during a segment. stops: as in `Loop`."""
+    """Commands and feedback of the control loop during a segment. stops: side on which each joint lies on its own
+    stop, as in `Loop`.
+    """
     assert config.stabiliser is not None  # checked with the configuration
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     goals = np.concatenate((segment.ramp_in, *[segment.period_current] * PERIODS, segment.ramp_out))

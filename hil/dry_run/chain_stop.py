@@ -98,7 +98,8 @@ def foreseen_stops(
 ) -> ChainStops:
     """Simulate stops at times spread over the first path. Raises ConfigError, ArmFileError.
 
-    tell: called with the number of simulations done and the total number. passed: as in `resting_stops`.
+    tell: called with the number of simulations done and the total number. passed: whether each joint has
+    ever been below and above its rest pose (2, joints), as for `resting_stops`.
     """
     segment = plan.segments[0]
     assert isinstance(segment, PathSegment)

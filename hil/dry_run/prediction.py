@@ -1,7 +1,7 @@
 """The experiment simulated on an ensemble of arms: predicted peaks compared with each limit.
 
 Every arm of the ensemble receives exactly the goal currents of the plan, ramps included, for as many periods as
-settling takes. They are rounded to the servos' ticks and subject to lag and stabiliser. Peaks are expressed as
+settling takes. The goals are rounded to the servos' ticks; lag and stabiliser are simulated. Peaks are expressed as
 fractions of the distance from rest to the limit; if any fraction of an arm reaches 1, the guard would have stopped that
 arm.
 """

@@ -12,7 +12,7 @@ from hil.runs.run_folder import RunFolder
 
 
 def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
-    """Sentences about what is kept; the last one gives the next command.
+    """Sentences about what is kept of a stopped run; the last one gives the next command.
 
     command: the subcommand that was stopped. shown: the configuration's path as the user wrote it.
     """

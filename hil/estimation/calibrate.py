@@ -68,7 +68,7 @@ class CalibrationResult:
 
 @dataclass(frozen=True)
 class AddedMass:
-    """The mass as the user gives it: `distance` and `length` for a planar arm, `at` and `joint` for a spatial one.
+    """The mass as specified by the user: `distance` and `length` for a planar arm, `at` and `joint` for a spatial one.
 
     mass [kg], inertia about its own centre [kg m^2]. distance: distance from the last joint [m]; length: length of link
     1 [m]. at: position in the frame of the link that `joint` moves, by default the last joint [m].

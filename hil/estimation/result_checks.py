@@ -64,7 +64,7 @@ def _group(group: distortion.LineGroup | None) -> LineGroup | None:
 
 
 def describe_verdict(judged: verdict.Verdict) -> Verdict:
-    """Convert the estimator's verdict."""
+    """Convert the estimator's verdict to the form stored in a result."""
     return Verdict(judged.trust, judged.weakest, tuple(judged.sentences))
 
 

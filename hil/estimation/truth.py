@@ -57,7 +57,8 @@ def back_emf(config: Config, fake: FakeArm, drives: Sequence[Drive]) -> dict[str
 
 @dataclass(frozen=True)
 class Truth:
-    """True values, scaled to the file's torque constants. note: how they differ from the arm's own; "" if they do not.
+    """True values, scaled to the file's torque constants. note: a sentence on how they differ from the arm's own
+    values; "" if they do not.
 
     A value that depends on the torques of several joints is left out if the constants of these joints are wrong by
     different factors: no single factor converts it.
@@ -89,7 +90,7 @@ def scaled(truth: Mapping[str, float] | None, config: Config, extra: Mapping[str
 
 
 def in_file_unit(truth: Mapping[str, float], config: Config, names: Iterable[str], joints: int) -> Truth:
-    """True values, scaled like a result with parameters of these names."""
+    """True values scaled to the file's torque constants, as in a result with parameters of these names."""
     ratios, has_ratios = _torque_ratios(config), any(kind_of(each) == RATIO for each in names)
     if not truth or all(abs(ratio - 1.0) <= _EQUAL for ratio in ratios):
         return Truth(dict(truth), "")

@@ -1,5 +1,5 @@
-"""The links of an identified spatial arm: of all physical ones with the identified dynamics, those closest to the
-URDF.
+"""Links for the export of an identified spatial arm: of all physically possible links with the identified dynamics,
+those closest to the URDF.
 """
 
 from collections.abc import Mapping

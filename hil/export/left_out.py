@@ -1,4 +1,4 @@
-"""What a robot description cannot represent: reported in the terminal and in the file, never dropped silently."""
+"""Model terms that a robot description cannot represent; they are reported in the terminal and in the file."""
 
 from hil.arm_model import ArmModel
 from hil.chain_model import ChainArmModel

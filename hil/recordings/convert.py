@@ -29,8 +29,9 @@ SMALLEST_STEP = 1e-9  # rad, where readings show no steps: their noise is measur
 class Converted:
     """Recordings in SI units.
 
-    names: one per recording. stepped: whether each joint's encoder resolution is known. columns: their description,
-    including guesses. notes: one sentence per guess or correction. doubts: one per contradiction among the columns.
+    names: one per recording. stepped: whether each joint's encoder resolution is known. columns: description of the
+    columns, including guesses. notes: one sentence per guess or correction. doubts: one per contradiction among the
+    columns.
     """
 
     recordings: tuple[Recording, ...]

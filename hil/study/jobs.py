@@ -1,4 +1,6 @@
-"""Independent jobs on the workers: few in flight at a time, results as they finish, even if workers die."""
+"""Run independent jobs on the workers. Only a few jobs are submitted at a time, results are returned as they finish,
+and the jobs of workers that die are repeated.
+"""
 
 import math
 import time

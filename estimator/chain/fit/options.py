@@ -21,7 +21,7 @@ class ChainOptions:
     first_step: float = 5.2e-3
     """Integration step while the observer is stiff [s]; samples within such a step are skipped."""
     coarse_step: float = 2.6e-3
-    """Integration step after the observer has been softened and before the last iterations [s]."""
+    """Integration step of the iterations before the last ones, where first_step does not apply [s]."""
     fine_step: float = 1.3e-3
     """Integration step of the last iterations [s]."""
     finer: int = 16

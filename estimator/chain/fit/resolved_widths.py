@@ -23,7 +23,7 @@ def resolved_widths(problem: ChainProblem, x: Array, shortest_step: float, width
         problem: the recordings.
         x: coordinates at which the arm can be simulated.
         shortest_step: shortest integration step, near standstill [s].
-        widths_per_substep: number of widths through which a reversal of friction may take a joint in `shortest_step`;
+        widths_per_substep: number of widths that a joint may traverse in `shortest_step` when its friction reverses;
             see `hil.estimator.options.CoordinateOptions`.
     """
     model = problem.model

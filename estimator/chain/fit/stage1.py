@@ -39,7 +39,7 @@ class ChainLinear:
 def fit_lines(
     periods: Sequence[SettledPeriod], model: ChainModel, prior: Prior, added: Sequence[Array | None] = ()
 ) -> ChainLinear:
-    """Estimate the parameters in which the torque is linear from settled periods.
+    """From settled periods, estimate the parameters in which the torque is linear.
 
     added: known base parameters of the mass added to the arm in each period (base parameters,) [SI]; None if none was
     added.

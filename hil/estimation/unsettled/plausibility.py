@@ -31,7 +31,9 @@ def implausible(recordings: Sequence[Recording], estimate: ShootingEstimate, gra
 
 
 def undetermined(estimate: ShootingEstimate) -> list[str]:
-    """One sentence naming the terms that are undetermined, because their standard error is as large as their value."""
+    """One sentence naming the terms that are undetermined, because their standard errors are as large as their
+    values.
+    """
     found = [
         f"{name} ({value:.3g} +- {std:.2g})"
         for name, value, std in zip(estimate.names, estimate.value, estimate.std, strict=True)
