@@ -47,7 +47,7 @@ def natural_width(console: Console, table: Table) -> int:
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Print a table without truncating values: if the terminal is too narrow, it wraps the lines itself."""
+    """Print a table without truncating values: a terminal that is too narrow wraps its lines."""
     width = max(console.width, natural_width(console, table))
     ResultConsole(file=console.file, highlight=False, width=width).print(table)
 

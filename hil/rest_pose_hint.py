@@ -21,7 +21,7 @@ def within_limits(position: float, limits: Sequence[float]) -> float:
 
 
 def rest_pose_hint(position: float, rest: float, tolerance: float, zero_ticks: int) -> str:
-    """Return sentences that say what may be wrong.
+    """Return sentences that say why a joint may be away from its rest pose, and what to do.
 
     Args:
         position: measured angle [rad].

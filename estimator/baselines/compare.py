@@ -52,7 +52,7 @@ class Peer:
 
 
 def joined(period: SettledPeriod, periods: int) -> Recording:
-    """Return the settled period, `periods` times in a row, as a recording whose commands are held."""
+    """Return the settled period, repeated `periods` times, as a recording with commands held between samples."""
     count = period.samples * periods
     return Recording(
         np.arange(count) / period.rate,

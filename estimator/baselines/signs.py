@@ -25,7 +25,8 @@ LESS_RESIDUAL = 0.6
 """A combination is credible if its residual is below this fraction of the residual with the signs as given."""
 
 SAME_RESIDUAL = 1.05
-"""A combination that also makes a negative inertia or friction positive is credible up to this ratio of the residuals.
+"""A combination that also makes a negative inertia or friction positive is credible if its residual is up to this
+multiple of the residual with the signs as given.
 """
 
 _POSITIVE = ("inertia", "viscous", "coulomb")

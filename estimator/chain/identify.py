@@ -68,7 +68,7 @@ class ChainEstimate(FittedParameters):
     softness: float
     """Natural frequency of the observer that couples the simulation to the measurements [Hz]."""
     reached: bool
-    """Whether the fit has reached its minimum. The standard errors include the distance that remains."""
+    """Whether the fit has reached its minimum; if not, the standard errors include the remaining distance."""
     from_prior: tuple[str, ...]
     """Base parameters that the data hardly determine, whose values therefore come from the prior."""
     unseen: tuple[str, ...]
@@ -107,7 +107,7 @@ def identify_chain(
 ) -> ChainEstimate:
     """Estimate the parameters of `model` from settled periods: regression on their lines, then maximum likelihood.
 
-    `prior` determines what the data do not, as listed in `ChainEstimate.from_prior`. `added`: see `fit_lines`; for a
+    `prior` supplies what the data hardly determine (`ChainEstimate.from_prior`). `added`: see `fit_lines`; for a
     model with `added_mass`. test_zeros: whether to test the encoder zeros that `model` holds fixed
     (`ChainEstimate.doubtful_zeros`), which takes a tenth longer. Raises ModelError if `model` and a period differ in
     their number of joints, ConvergenceError if no minimum is found.

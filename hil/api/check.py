@@ -1,4 +1,4 @@
-"""`hil.check`: find everything that would stop an experiment before starting one."""
+"""`hil.check`: find everything that would prevent an experiment, before it starts."""
 
 from dataclasses import dataclass
 from pathlib import Path

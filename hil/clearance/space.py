@@ -98,7 +98,7 @@ class Space:
         return _space(_Key(config, arm))
 
     def room(self, position: Array, on_the_way: bool = False) -> Array:
-        """Smallest excess over the required distance (samples,) [m] along a motion (joints, samples) [rad].
+        """Smallest distance minus required distance in each sample (samples,) [m] of a motion (joints, samples) [rad].
 
         on_the_way: whether the motion leads from or to the rest pose; distances may then be less than the margin.
         """

@@ -100,7 +100,7 @@ class Columns(_Table):
 
     @property
     def drive(self) -> Literal["torque", "current", "voltage", "pwm"] | None:
-        """The quantity by which the columns describe how the joints were driven; None if they do not."""
+        """Kind of the columns that describe how the joints were driven; None if there are no such columns."""
         kinds: tuple[Literal["torque", "current", "voltage", "pwm"], ...] = ("torque", "current", "voltage", "pwm")
         return next((kind for kind in kinds if getattr(self, kind) is not None), None)
 

@@ -232,8 +232,8 @@ class _Tree:
     def on_link(
         self, body: int, rotation: Array, translation: Array, number: dict[int, int]
     ) -> tuple[int, Array, Array]:
-        """The number of the moving link to which a body is fixed, and a pose, given in the body's frame, in that link's
-        frame.
+        """The number of the moving link to which a body is fixed, and a pose converted from the body's frame to that
+        link's.
         """
         while body != WORLD and body not in number:
             turn, place = self._placed(body)

@@ -32,7 +32,9 @@ class AmplitudeOptions:
     max_polishing_rounds: int = 4
     """Maximum number of final torque increases, one joint at a time."""
     close: float = 0.94
-    """A joint counts as at its limit once it reaches this fraction of it with the allowed probability."""
+    """The search ends when every joint uses at least this fraction of its allowed range, or its largest allowed
+    torque.
+    """
     over: float = 0.97
     """Fraction of the limits that the next iteration aims for if the last torque exceeded them."""
     under: float = 0.99
@@ -40,8 +42,8 @@ class AmplitudeOptions:
     max_ratio: float = 2.0
     """Maximum ratio of the torques of two successive iterations."""
     damping: float = 0.85
-    """The torque is corrected by a power of its estimated error; each iteration multiplies the exponent by this
-    factor.
+    """Each iteration multiplies the torque by a power of the ratio of wanted to reached peaks; this factor then reduces
+    the exponent.
     """
     min_exponent: float = 0.4
     least_change: float = 0.005

@@ -255,7 +255,7 @@ def _verdict(
 
 
 def contradicting_torques(config: Config, estimate: ChainEstimate) -> tuple[str, ...]:
-    """One sentence for each joint whose torque constant contradicts the first joint's."""
+    """One sentence for each joint whose torque constant is inconsistent with that of the first joint."""
     std = torque_constant_stds(config)
     spreads = {f"{RATIO}_{joint}": float(np.hypot(std[0], std[joint - 1])) for joint in range(2, std.size + 1)}
     ratios = ratios_of(estimate.names, estimate.value, estimate.std)

@@ -27,7 +27,7 @@ from hil.export.source import Recorded
 __all__ = ["export_mcap"]
 
 _SHOWN_HZ = 50.0
-"""Rate of the frames [Hz]: smooth enough for a screen."""
+"""Rate at which frames are written [Hz], high enough for smooth motion on a screen."""
 _WHOLE = ("phase", "segment", "period", "error", "missing")
 _TIMES = ("deadline", "time_before_write", "time_after_read")
 _SHARED = (*_TIMES, "phase", "segment", "period")

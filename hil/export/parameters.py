@@ -23,13 +23,13 @@ _KEPT = (
 
 
 def export_json(source: Source, path: Path) -> list[str]:
-    """Write `path`; nothing is left out."""
+    """Write `path`; return an empty list, since nothing is left out."""
     write_text(path, strict_json.dumps(_kept(source), indent=2) + "\n")
     return []
 
 
 def export_toml(source: Source, path: Path) -> list[str]:
-    """Write `path`; nothing is left out."""
+    """Write `path`; return an empty list, since nothing is left out."""
     lines = ["# Base parameters of an identified arm [SI]; equations in docs/model.md. Read it with hil.load_model."]
     _write_table(lines, (), _kept(source))
     write_text(path, "\n".join(lines) + "\n")

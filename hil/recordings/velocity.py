@@ -1,8 +1,8 @@
 """Comparison of recorded velocities with the positions: a wrong time scale leaves no other trace.
 
 Parameters absorb a wrong time scale: if the recorded times are twice the true ones, the estimated inertia is four
-times too large. Only a second
-measurement that depends on time, such as a velocity column, shows it. Velocities are otherwise not used.
+times too large. Only a second measurement that depends on time, such as a velocity column, shows it. Velocities are
+otherwise not used.
 """
 
 import math
@@ -33,7 +33,7 @@ _NOT_MEASURED = re.compile(
 
 @dataclass(frozen=True)
 class Rate:
-    """A joint's velocity column: `factor` times the derivative of its position, `late` [s] behind it."""
+    """A joint's velocity column, which is `factor` times the derivative of its position and `late` [s] behind it."""
 
     column: str
     factor: float

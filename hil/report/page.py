@@ -33,8 +33,8 @@ from hil.report.svg import NARROW, WIDE, draw_svg
 
 FILE_NAME = "report.html"
 MOST_POINTS = 70_000
-"""Largest total number of points of all curves on a page, in the wide drawings: twice as many as a planar arm's page
-has."""
+"""Largest total number of points of all curves on a page, in the wide versions of the figures: twice as many as a
+planar arm's page has."""
 FEWEST_POINTS = 600
 _CODE = re.compile("`([^`]+)`")
 SCRIPTS = ("page.js", "spatial.js")

@@ -21,7 +21,9 @@ MOST_COMPRESSED = 200.0
 
 
 def check_archive(path: Path) -> None:
-    """Raise RunFolderError if an .npz would expand beyond any real recording. Also raises OSError, BadZipFile."""
+    """Raise RunFolderError if an .npz would expand to more than any real recording needs. Also raises OSError,
+    BadZipFile.
+    """
     with ZipFile(path) as archive:
         entries = archive.infolist()
     claimed, packed = sum(each.file_size for each in entries), sum(each.compress_size for each in entries)

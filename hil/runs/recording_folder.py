@@ -98,7 +98,7 @@ def create(path: Path) -> None:
 
 
 def save(path: Path, record: RecordingRecord, config: str, recordings: Sequence[Predicted]) -> None:
-    """Write all but the result and the report; raises RunFolderError."""
+    """Write all files except the result and the report; raises RunFolderError."""
     arrays = {
         f"{number}_{name}": getattr(each, name)
         for number, each in enumerate(recordings)

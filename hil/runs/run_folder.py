@@ -224,7 +224,7 @@ class RunFolder:
         return config.model_copy(update=played)
 
     def below(self, name: str, played: Config) -> "RunFolder":
-        """Create a separate run in a subfolder. Raises RunFolderError."""
+        """Create a separate run with the configuration `played` in the subfolder `name`. Raises RunFolderError."""
         folder = RunFolder.create(self.path / name, played)
         folder.write_played(played)
         return folder

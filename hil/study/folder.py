@@ -25,7 +25,7 @@ from hil.study.schema import Study
 
 @contextmanager
 def opened(study: Study, out: Path, runs: int, *, resume: bool) -> Iterator[Dataset]:
-    """The dataset in `out`, new or of the same study, locked for this process.
+    """Open the dataset in `out`, which is new or belongs to the same study, and lock it for this process.
 
     Raises RunFolderError if it cannot be used, ConfigError if it holds another study, or this study with other inputs
     or versions.

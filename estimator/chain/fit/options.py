@@ -36,7 +36,7 @@ class ChainOptions:
     other_initial_widths: tuple[float, ...] = (0.005, 0.001)
     """Initial widths of further fits, tried as long as no fit explains the motion [rad/s]."""
     poor: float = 1.2
-    """RMS weighted residual above which a second start is made; 1 for noise alone."""
+    """RMS weighted residual above which a second initial guess is tried; 1 for noise alone."""
     test_zeros: bool = False
     """Whether to test the encoder zeros that the model holds fixed; takes one more simulation with sensitivities."""
     min_initial_lag: float = 5e-4

@@ -1,6 +1,6 @@
 """Inertias of a chain's joints in a recording, and the narrowest smoothed Coulomb steps that a simulation resolves.
 
-See `hil.estimator.fit.resolved_widths`.
+The method is that of `hil.estimator.fit.resolved_widths`.
 """
 
 from collections.abc import Mapping

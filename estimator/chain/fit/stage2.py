@@ -64,7 +64,7 @@ class ChainFit:
     outliers: int
     """Number of samples that were downweighted."""
     correlation_time: float
-    """Number of samples over which the residual is correlated; 1 is white."""
+    """Number of samples over which the residual is correlated; 1 for white noise."""
     iterations: int
     """Number of simulations with derivatives."""
     softness: float
@@ -82,7 +82,7 @@ class ChainFit:
 
     @property
     def total_covariance(self) -> Array:
-        """Covariance of `value` about the truth: the covariance at the minimum, widened by the distance to the minimum
+        """Covariance of the errors of `value`: the covariance at the minimum, widened by the distance to the minimum
         and by the effects that the model is known to neglect.
         """
         return np.asarray(self.covariance + np.outer(self.missing, self.missing) + self.neglected)

@@ -6,7 +6,7 @@ the fit improves.
 If joints often stick, stage 1's estimate of friction can be far off. So can the link parameters and torque scales,
 which are correlated with friction. Softening the observer while the shape of friction is fixed then leads the fit
 towards another minimum, in a curved valley, where it stops short. So if the soft observer does not explain the motion,
-a second start is made from the prior's links, with the shape of friction free as soon as the stiffest observer follows
+a second fit starts from the prior's links, with the shape of friction free as soon as the stiffest observer follows
 the motion. The better of the two fits is continued.
 """
 

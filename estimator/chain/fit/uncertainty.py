@@ -45,7 +45,7 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
 
 
 def neglected_covariance(problem: ChainProblem, x: Array) -> Array:
-    """Return the covariance (parameters, parameters) [SI] due to the effects that the description of late back-EMF
+    """Return the covariance (parameters, parameters) [SI] due to the effects that the model of a lagging back-EMF
     neglects.
 
     The effect of friction on the motor's current is delayed by the difference between the fitted lag and the winding's.

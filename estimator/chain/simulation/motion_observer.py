@@ -131,7 +131,7 @@ class ChainObserver:
 
     @property
     def torque(self) -> list[float]:
-        """Commanded torque of each joint, filtered as `lacking` is (joints,) [N m]."""
+        """Commanded torque of each joint, filtered in the same way as `lacking` (joints,) [N m]."""
         return [float(value) for value in self._memory[TORQUE, : self._joints]]
 
     @property

@@ -1,5 +1,4 @@
-"""Closed-loop simulation of chains under goal torques: how arms that may be the real one would move in an
-experiment.
+"""Closed-loop simulation of chains under goal torques: how the arms of an ensemble would move in an experiment.
 
 At each sample, a goal torque is added to the torque of a software spring and damper, which is computed from angles and
 velocities of the previous sample as in the real loop. In between, the motion is integrated by the linearly implicit
@@ -75,7 +74,7 @@ class Loop:
     rate: samples per second.
     goal: torques (samples, joints) [N m].
     stiffness, damping: gains of the spring [N m/rad] and damper [N m s/rad] towards `pose` (joints,).
-    pose: rest pose (joints,) [rad], on a surface that keeps gravity from moving joints further down.
+    pose: rest pose (joints,) [rad], in which a surface keeps gravity from moving joints further down.
     limit: largest commanded torque (joints,) [N m].
     stops: side on which a joint lies on its own stop in the rest pose (joints,), -1, 1, or 0 if it does not; None if
     none does. A stop supports its joint instead of the surface, whatever the angles of the other joints. Nothing

@@ -51,7 +51,7 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The contents of compare.json: every method on one settled period; truth on a fake arm only."""
+    """The contents of compare.json: every method on one settled period; the true parameters on a fake arm only."""
 
     schema: int
     config: str

@@ -109,7 +109,7 @@ def estimate_any(
     given: Given = Given(),
 ) -> Estimated:
     """The estimate, its checks and its verdict. stepped: whether each joint's encoder step is known; by default it is.
-    given: prior knowledge, which the estimate must not contradict.
+    given: prior knowledge, with which the estimate is compared.
 
     Raises ConfigError, EstimationError.
     """

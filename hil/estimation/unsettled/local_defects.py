@@ -44,7 +44,7 @@ class _Joint:
     step: float
 
     def is_unexplained(self, part: slice) -> bool:
-        """Whether the residual in `part` is far above the usual one."""
+        """Whether the residual in `part` is far above its usual level."""
         inside = self.residual[part]
         known = np.isfinite(inside)
         if not known.any():

@@ -1,4 +1,4 @@
-"""Refusal of recordings with a clear mistake in their columns: an estimate would take a minute and be useless."""
+"""Rejection of recordings with a clear mistake in their columns: an estimate would take a minute and be useless."""
 
 from collections.abc import Sequence
 

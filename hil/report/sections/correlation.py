@@ -16,7 +16,7 @@ def correlation(data: RunData) -> Section | None:
 
 
 def correlation_of(result: Result) -> Section | None:
-    """The section for any kind of result."""
+    """Return the section on correlations for any kind of result; None if it has no parameters."""
     names = result.covariance.names
     if not names:
         return None

@@ -24,7 +24,9 @@ def parameters(data: RunData) -> Section:
 
 
 def parameters_of(result: Result, truth: Mapping[str, float] | None = None, note: str = "") -> Section:
-    """The section for any kind of result. truth: true values in the result's units; note: a sentence about them."""
+    """Return the section on parameters for any kind of result. truth: true values in the result's units; note: a
+    sentence about them.
+    """
     groups = {} if result.chain is None else result.chain.groups
     tables = [_table(result.parameters, truth or {}, groups, "Base parameters")]
     if result.extra:
