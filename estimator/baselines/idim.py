@@ -44,7 +44,7 @@ class InverseDynamics:
     value: Array
     """Values (parameters,) [SI]."""
     std: Array
-    """Standard errors assuming a white residual (parameters,)."""
+    """Standard errors assuming a white residual (parameters,) [SI]."""
     relative_residual: Array
     """RMS of the torque residual relative to that of the torque (joints,)."""
 

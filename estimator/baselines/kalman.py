@@ -43,7 +43,7 @@ class Filtered:
     value: Array
     """Base parameters (parameters,) [SI]."""
     std: Array
-    """Standard errors from the filter's own covariance (parameters,)."""
+    """Standard errors from the filter's own covariance (parameters,) [SI]."""
 
 
 def fit_by_kalman(

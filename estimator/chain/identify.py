@@ -52,7 +52,7 @@ class ChainEstimate(FittedParameters):
     linear_value: Array
     """Result of stage 1, in the order of `ChainModel.linear_names`."""
     start: Array
-    """Angles and velocities at the first sample (2, joints)."""
+    """Angles and velocities at the first sample (2, joints) [rad, rad/s]."""
     position: Array
     """One-step-ahead prediction of the first period (joints, samples) [rad]."""
     positions: tuple[Array, ...]

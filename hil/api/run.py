@@ -118,8 +118,7 @@ class Run:
     every sample taken (dtype: hil.runs.recording.sample_type). events: pairs (time on the port's clock [s], what
     happened).
     periods: after an estimate, the settled periods by the role of their segment (for example "identify"), as measured
-    and as predicted by the model. result: None
-    before an estimate.
+    and as predicted by the model. result: None before an estimate.
     """
 
     path: Path

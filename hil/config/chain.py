@@ -202,7 +202,7 @@ def _path_slips(config: "Config") -> Iterator[str]:
     if config.experiment.period * high < _HARMONICS - 1e-9:
         yield (
             f"experiment.period = {config.experiment.period:g} s: a path needs at least {_HARMONICS} harmonics below "
-            f"the upper end of its band, {high:g} Hz: set period to at least {_HARMONICS / high:.3g} s; 8 to 10 s is "
+            f"the upper end of its band, {high:g} Hz. Set period to at least {_HARMONICS / high:.3g} s; 8 to 10 s is "
             "usual"
         )
     if config.joint_path is None:

@@ -59,8 +59,8 @@ class ExperimentConfig(Table):
             raise ValueError("give either band or lines")
         if self.detection and self.band is None:
             raise ValueError(
-                "detection chooses lines from experiment.band; with experiment.lines, omit some odd harmonics from the "
-                "lists yourself"
+                "detection = true chooses harmonics from experiment.band; with experiment.lines, omit some odd "
+                "harmonics from the lists yourself"
             )
         if self.band is not None:
             low, high = self.band

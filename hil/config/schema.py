@@ -120,7 +120,7 @@ class SafetyConfig(Table):
         0.08, ge=0.02, le=2.54, description="s, time without packets after which a servo stops by itself"
     )
     allow_no_watchdog: bool = Field(
-        False, description="accept firmware without a Bus Watchdog: if packets cease, nothing then stops the servo"
+        False, description="accept firmware without a Bus Watchdog; nothing stops the servo if packets cease"
     )
     write_current_limit: bool = Field(True, description="lower each servo's Current Limit for the run, then restore it")
     missing_time: PositiveFloat = Field(0.015, le=2, description="s, time for which a servo may fail to reply")

@@ -2,7 +2,7 @@
 which.
 
 In the rest pose an arm lies without torque. It is supported by a surface (floor, cradle, another link) or by the
-joints' own stops. Moving the arm can lift it off a surface; a stop holds its joint wherever the others are.
+joints' own stops. Moving the arm can lift it off a surface; a stop holds its joint whatever the angles of the others.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""The work of `hil dry-run`: simulate the experiment on an ensemble and find the largest safe torque."""
+"""Implementation of `hil dry-run`: simulate the experiment on an ensemble and find the largest safe torque."""
 
 from concurrent.futures import Executor
 from dataclasses import replace

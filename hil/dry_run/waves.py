@@ -25,7 +25,7 @@ def roomy_plan(config: Config, physics: Physics) -> Plan:
     physics: parameters of the arm.
 
     The phases determine how evenly an arm swings to both sides. Reversing the sign or time of a wave gives another wave
-    with the same lines and peaks at no design cost.
+    with the same lines and peaks, without a new design.
     """
     return roomy_plans(config, physics, 1)[0]
 

@@ -24,7 +24,7 @@ def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], peri
         steps = swing / facts.position_step[index]
         if steps < LEAST_SWING:
             found.append(
-                f"{joint.name} moved by only {steps:.0f} encoder steps: rounding dominates its parameters; "
+                f"{joint.name} moved by only {steps:.0f} encoder steps: rounding errors dominate its parameters; "
                 f"raise {torque_limit(config, samples, index) or 'its peak_torque'}."
             )
         lost = 1.0 - float(np.mean(period.valid[index]))

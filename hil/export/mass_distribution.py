@@ -83,7 +83,7 @@ def _share_of_rod(p: Mapping[str, float]) -> float:
         raise ExportError(
             f"inertia_1 * inertia_2 = {p['inertia_1'] * p['inertia_2']:.4g} must be greater than coupling^2 = "
             f"{p['coupling'] ** 2:.4g} kg^2 m^4: no links of positive mass have such inertias. Check the residual in "
-            "the report; excite the arm more, or choose a richer [model] friction."
+            "the report; use more excitation, or choose a [model] friction with more terms."
         )
     return max(ROD, 0.5 * (1 + needed))
 

@@ -1,6 +1,6 @@
 """An arm as frames and shapes: where each link is at each sample, and what to draw there.
 
-Used by the MCAP export; Foxglove's 3D panel shows its messages `FrameTransforms` and `SceneUpdate`.
+Used by the MCAP export; Foxglove's 3D panel shows the exported messages `FrameTransforms` and `SceneUpdate`.
 """
 
 from dataclasses import dataclass

@@ -301,7 +301,7 @@ class PhysicalQuantity(Quantity):
 @dataclass(frozen=True)
 class Physical:
     """Masses, centres of mass and inertias, using [known]. not_told_apart: groups of quantities that cannot be
-    separated unless another one is known.
+    separated unless another quantity is known.
     """
 
     quantities: Mapping[str, PhysicalQuantity]
@@ -337,7 +337,8 @@ class StabiliserShare:
 class PlayedStep:
     """One run with a pilot, on the way to full amplitude: its predicted and measured peaks.
 
-    Rows are the quantities of hil.dry_run.prediction.QUANTITIES, columns the joints. peak_torque: peak torque per joint
+    The rows of predicted and measured peaks are the quantities of hil.dry_run.prediction.QUANTITIES, the columns are
+    the joints. peak_torque: peak torque per joint
     [N m]. ended: why the run ended early; None if it did not.
     """
 

@@ -14,7 +14,7 @@ timing       how well the stream kept its deadlines, and the duration of the est
 arm          facts needed to use the model: gravity, rest pose, and, for each joint, name, servo, mode, limits, torque
              per goal [N m/A, or N m/V in pwm mode]
 chain        only for a spatial arm: its geometry, and the combination that each base parameter represents
-truth        only on a fake arm: the base parameters it was built with, for the true torque of its motors
+truth        only on a fake arm: the base parameters it was built with, for the true torque constants of its motors
 truth_scaled `truth` scaled to the torque constants in the file, like `parameters`; only if those of the motors differ
 physical     masses, centres and inertias, if [known] gives any quantity
 stabiliser   its share of the torque, if there was one

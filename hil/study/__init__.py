@@ -1,1 +1,3 @@
-"""Many independent runs on a distributed engine: populations, Monte Carlo, fault campaigns, fleets of recordings."""
+"""Many independent runs on a distributed engine: populations of arms, Monte Carlo, fault campaigns, fleets of
+recordings.
+"""

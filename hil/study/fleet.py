@@ -61,7 +61,7 @@ class Fleet:
 
 
 def fleets(table: pa.Table) -> list[Fleet]:
-    """Compare the rows of a study with task = "estimate": arms of the same type, i.e. with the same servos.
+    """Compare the arms of the same type, i.e. with the same servos, in the rows of a study with task = "estimate".
 
     Arms that could not be estimated are ignored. The largest fleet comes first.
     """

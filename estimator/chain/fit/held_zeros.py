@@ -26,7 +26,7 @@ class HeldZeros:
 
 
 def held_zeros(problem: ChainProblem, x: Array, unfinished: float) -> HeldZeros:
-    """Estimate the zeros that `problem` holds at 0, from its minimum `x`.
+    """Estimate the encoder zeros that `problem` holds at 0, evaluated at its minimum `x`.
 
     unfinished: decrease of the sum of squares that one more step without fitting the zeros is expected to bring.
     """

@@ -27,7 +27,7 @@ class ChainLinear:
     value: Array
     """Values in the order of `ChainModel.linear_names` [SI]."""
     std: Array
-    """Standard errors assuming a white residual."""
+    """Standard errors assuming a white residual, in the same order [SI]."""
     delay: float
     """Delay of the motors' torque [s]."""
     motions: tuple[PeriodicMotion, ...]

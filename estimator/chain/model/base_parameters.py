@@ -5,7 +5,7 @@ the order first moments, inertias, rotor, mass. A column that depends linearly o
 its parameter is lumped into theirs (Gautier, Journal of Robotic Systems 8 (1991) 485). In this order the sums stay
 short, such as `moment_x_3 + 0.124 mass_4`, since a link's mass acts like a moment of the previous link.
 
-Columns that are nearly dependent wait until all others are kept, and then the least dependent comes first. With an axis
+Columns that are nearly dependent are considered after all others, the least dependent first. With an axis
 that is a degree off its link's y axis, the moment along y would otherwise be kept, and the sums would have large terms
 that nearly cancel.
 """

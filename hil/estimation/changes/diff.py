@@ -3,8 +3,8 @@
 Every common parameter is tested on its own: z = difference / sqrt(std_a^2 + std_b^2). The friction of each joint is
 also tested as a whole (hil.estimation.changes.friction_change). Holm's step-down correction keeps the probability of
 any false alarm in the whole table at `false_alarms` (S. Holm, Scandinavian Journal of Statistics 6 (1979) 65). A change
-must also be larger than `least_share` of the parameter's scale: standard errors cover noise only, and two runs of an
-arm with some unmodelled friction differ by a little more.
+must also be larger than the fraction `least_share` of the parameter's magnitude: standard errors cover noise only, and
+two runs of an arm with some unmodelled friction differ by a little more.
 """
 
 import math
@@ -32,7 +32,7 @@ class Change:
     """The change of one parameter: values, standard errors, difference in units of the combined standard error, and
     p-value.
 
-    changed: whether it is significant after Holm's correction and larger than the minimum share of its scale.
+    changed: whether it is significant after Holm's correction and larger than a minimum fraction of its magnitude.
     """
 
     name: str

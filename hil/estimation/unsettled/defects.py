@@ -27,7 +27,7 @@ def likely_defect(
 
 
 def is_certain(defect: Defect) -> bool:
-    """Whether it explains so much of the residual that no other cause needs to be looked for."""
+    """Whether the defect explains so much of the residual that no other cause needs to be looked for."""
     return defect.fit.left < WELL
 
 

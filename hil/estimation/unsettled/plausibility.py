@@ -93,8 +93,9 @@ def _link(estimate: ShootingEstimate, gravity: float) -> list[str]:
             return []
         return [
             f"gravity_2 is {value['gravity_2']:.2g} +- {std['gravity_2']:.2g} N m, but according to coupling, link 2 "
-            f"weighs at least {least:.2g} N m: the torque does not contain gravity. Does the drive compensate for "
-            "gravity, so that its torque must be added? If the arm moves in a horizontal plane, set arm.gravity = 0."
+            f"weighs at least {least:.2g} N m: the torque does not contain gravity. Does the drive itself compensate "
+            "for gravity? Then add that torque to the column. If the arm moves in a horizontal plane, set "
+            "arm.gravity = 0."
         ]
     length = abs(value["coupling"] * gravity / value["gravity_2"])
     if LINK[0] < length < LINK[1]:

@@ -72,7 +72,7 @@ def _motion(recordings: Sequence[Recording], joint: int, name: str) -> list[str]
     steps = swing / max(float(each.position_step[joint]) for each in recordings)
     if steps < LEAST_SWING:
         found.append(
-            f"{name} moved by only {steps:.0f} encoder steps: rounding dominates its parameters; drive it harder."
+            f"{name} moved by only {steps:.0f} encoder steps: rounding errors dominate its parameters; use more torque."
         )
     lost = 1.0 - float(np.mean(np.concatenate([np.isfinite(each.position[joint]) for each in recordings])))
     if lost > LOST:

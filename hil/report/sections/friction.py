@@ -68,7 +68,10 @@ def friction_curve(model: ArmModel, speed: Array) -> Array:
 
 
 def friction_interval(model: ArmModel, kept: Covariance, speed: Array, joint: int) -> tuple[Array, Array]:
-    """The curve's 2.5th and 97.5th percentiles under the parameters' covariance."""
+    """Return the 2.5th and 97.5th percentiles of a joint's friction torque [N m] at `speed` [rad/s] (samples,).
+
+    They follow from the parameters' covariance. joint: index from 0.
+    """
     names = [name for name in kept.names if name.endswith(f"_{joint + 1}")]
     index = [kept.names.index(name) for name in names]
     covariance = kept.array()[np.ix_(index, index)]

@@ -34,7 +34,8 @@ def parameters_of(result: Result, truth: Mapping[str, float] | None = None, note
     left_out = ", and small effects that the model leaves out and the motion cannot rule out"
     words = (
         f"The interval covers the noise of this recording{left_out if result.chain is None else ''}. It includes "
-        "neither the error of the torque constants, with which all values of a joint scale, nor other model errors.",
+        "neither the error of a torque constant, to which all values of a joint are proportional, nor other model "
+        "errors.",
         *([note] if note else []),
     )
     return Section("parameters", "Parameters", words, tuple(tables))

@@ -28,7 +28,7 @@ def spectra(data: RunData) -> Section | None:
     words = (
         "Each joint has its own lines, so that the coupling between the joints can be separated. The response between "
         "and above the excited lines comes from the arm's nonlinearity, mainly friction: the model must explain it "
-        "too, and it carries information. This response should be well above the noise.",
+        "too, and it contains information about the parameters. This response should be well above the noise.",
     )
     pictures = [_excitation(data, data.fitted, excited)]
     pictures += [_response(data.fitted, joint, name, excited) for joint, name in enumerate(data.names)]
