@@ -141,5 +141,6 @@ def _said(scale: _Scale, found: ShootingEstimate, estimate: ShootingEstimate) ->
     return (
         f"The angle of joint 1 seems to be {scale.factor:.4g} times the true one: with the angle divided by this "
         f"factor, the motion is explained equally well without {instead}, and gravity_1 is {other:.4g} instead of "
-        f"{given:.4g} N m. Check the unit, the ticks per turn and the belt or gear ratio between encoder and joint 1.{cause}"
+        f"{given:.4g} N m. Check the unit, the ticks per turn and the belt or gear ratio between encoder and joint "
+        f"1.{cause}"
     )

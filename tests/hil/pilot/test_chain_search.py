@@ -281,7 +281,7 @@ def test_a_pilot_starts_where_the_arm_lies(tmp_path: Path, monkeypatch: pytest.M
 
 def test_a_period_too_short_for_a_path_is_a_mistake_in_the_file() -> None:
     text = LEG.read_text(encoding="utf-8").replace("period = 10.0", "period = 1.0")
-    with pytest.raises(ConfigError, match=r"experiment\.period = 1 s: .* set period to at least"):
+    with pytest.raises(ConfigError, match=r"experiment\.period = 1 s: .* Set period to at least"):
         parse_config(text, LEG)
 
 
