@@ -19,7 +19,7 @@ class ResultConsole(Console):
 
 
 def result_console() -> Console:
-    """A console for results."""
+    """Return a console that prints results on standard output."""
     return ResultConsole(highlight=False)
 
 

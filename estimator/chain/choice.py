@@ -19,7 +19,7 @@ from hil.estimator.errors import ConvergenceError
 
 @dataclass(frozen=True)
 class ChoiceOptions:
-    """Options of the choice."""
+    """Options of the choice among models."""
 
     significance: float = 1e-3
     """Significance level at which a term is kept (likelihood ratio, corrected for the residual's correlation)."""

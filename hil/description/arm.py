@@ -110,7 +110,7 @@ class ArmDescription:
 
     @property
     def parameters(self) -> Array:
-        """`Body.parameters` of each link (joints, 10)."""
+        """Inertial parameters of each link, as in `Body.parameters` (joints, 10)."""
         return np.stack([joint.body.parameters for joint in self.joints])
 
     @property

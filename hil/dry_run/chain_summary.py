@@ -43,7 +43,7 @@ class ChainDryRun:
 
     @property
     def prediction(self) -> Prediction:
-        """Predicted peaks."""
+        """Predicted peaks of the planned motion and their limits."""
         return self.foreseen.peaks
 
     @property

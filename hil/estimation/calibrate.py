@@ -83,7 +83,9 @@ class AddedMass:
 
 
 def calibrate_runs(without: RunFolder, with_mass: RunFolder, added: AddedMass) -> CalibrationResult:
-    """Estimate the torque constants; see `hil.estimator.calibration`. Raises HilError, EstimationError."""
+    """Estimate the torque constants from runs without and with the added mass; see `hil.estimator.calibration`. Raises
+    HilError, EstimationError.
+    """
     config, other = without.load_config(), with_mass.load_config()
     _same_arm(config, other)
     if config.is_chain:

@@ -118,7 +118,9 @@ class Recorder:
         return self._samples[: self.count]
 
     def keep(self, deadline: float, phase: Phase, segment: int, period: int, state: State) -> None:
-        """Record one sample."""
+        """Record one sample: its deadline [s], its phase, segment and period in the experiment, and the measured
+        state.
+        """
         count = self.count
         if count == self._next_chunk:
             self._next_chunk += self._rows_a_chunk

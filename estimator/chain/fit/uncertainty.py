@@ -74,7 +74,7 @@ class _Spectrum:
     power: Array
     """Power of the residual (lines,); 1 for white noise with the variance that the weights assume."""
     share: Array
-    """Leverage (lines,)."""
+    """Leverage: fraction of the noise on each line that the fit absorbs (lines,)."""
     stands_for: float
     """Ratio of the period's number of samples to the number of those from which the Jacobian was computed."""
 

@@ -29,9 +29,9 @@ class Chain:
     """
 
     rotation: Array
-    """Orientations (joints, 3, 3)."""
+    """Orientation of each link's frame in that of the previous link, at angle zero (joints, 3, 3)."""
     translation: Array
-    """Origins (joints, 3) [m]."""
+    """Origin of each link's frame in that of the previous link (joints, 3) [m]."""
     axis: Array
     """Unit vector along the axis of each joint, in its own frame (joints, 3)."""
     gravity: Array

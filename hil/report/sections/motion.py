@@ -41,7 +41,7 @@ def motion(data: RunData) -> Section | None:
 
 
 def next_commands(data: RunData) -> Section:
-    """The section with commands to copy, always present."""
+    """Return the section with commands to copy."""
     run, length = data.run.path, ""
     if not data.config.is_chain and not data.config.arm.gravity and len(data.config.joints) > 1:
         # If gravity does not act on the arm, the motion reveals nothing about the length of link 1.

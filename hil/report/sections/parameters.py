@@ -18,7 +18,7 @@ _MOST_DECIMALS = 9
 
 
 def parameters(data: RunData) -> Section:
-    """Return the section, which every report has."""
+    """Return this section of the report."""
     truth = truth_of(data.result, data.config)
     return parameters_of(data.result, truth.values, truth.note)
 

@@ -6,7 +6,7 @@ from hil.runs.run_folder import Excitation
 
 
 def provenance(data: RunData) -> Section:
-    """Return the section, which every report has."""
+    """Return this section of the report."""
     record, config = data.record, data.config
     servos = "; ".join(f"{joint.name}: {joint.model}, ID {joint.id}" for joint in config.joints)
     rows = [

@@ -13,7 +13,7 @@ _BINS = 60
 
 
 def timing(data: RunData) -> Section:
-    """Return the section, which every report has."""
+    """Return this section of the report."""
     samples = data.samples
     sent = samples[samples["time_after_read"] > samples["time_before_write"]]
     lateness = 1e6 * (sent["time_before_write"] - sent["deadline"])

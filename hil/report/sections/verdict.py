@@ -14,7 +14,7 @@ TITLES = {
 
 
 def verdict(data: RunData) -> Section:
-    """Return the section, which every report has."""
+    """Return this section of the report."""
     judged = data.result.verdict
     tone, title = TITLES[judged.trust]
     warnings = [f"Warning: {warning}" for warning in data.result.warnings]
