@@ -60,7 +60,8 @@ class ClockDrift:
 class Late:
     """A joint whose torque column seems to be `delay` [s] later than those of the others; negative if earlier.
 
-    residual, residual_given: relative RMS of the worst joint's torque residual, with and without that correction.
+    residual, residual_given: relative RMS of the worst joint's torque residual, with the column shifted by `delay` and
+    as given.
     """
 
     joint: int

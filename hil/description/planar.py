@@ -1,4 +1,4 @@
-"""Check that the planar model, with its angle convention, applies to an arm described in a file."""
+"""Check whether the planar model, with its angle convention, applies to an arm described in a file."""
 
 import numpy as np
 

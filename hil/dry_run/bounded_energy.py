@@ -25,8 +25,8 @@ _MARGIN = 0.05
 class Boundary:
     """The position limits of an arm and the lowest potential energy at them.
 
-    low, high: limits (joints,) [rad]. least: that lowest energy [J]; -inf if the arm's energy is not bounded by this
-    model.
+    low, high: limits (joints,) [rad]. least: lowest potential energy at the limits [J]; -inf if this model does not
+    bound the arm's energy.
     """
 
     physics: Physics

@@ -220,7 +220,7 @@ def _verdict(
     if still:
         trust = "no"
         sentences.append(
-            f"{', '.join(still)} hardly moved, so the recording says little about inertia and friction there: increase "
+            f"{', '.join(still)} hardly moved, so the recording says little about their inertia and friction: increase "
             "joint_path.swing and speed, and check that nothing blocks the motion."
         )
     if estimate.from_prior:
@@ -248,8 +248,8 @@ def _verdict(
     sentences += conflict_sentences(estimate.conflicts, explained)
     if estimate.unseen:
         sentences.append(
-            f"Not identifiable from gravity in this motion: {', '.join(estimate.unseen)} (taken as zero, to within "
-            "their standard errors)."
+            f"Not identifiable from gravity in this motion: {', '.join(estimate.unseen)} (assumed to be zero, with "
+            "the standard errors given)."
         )
     return Verdict(trust, weakest, tuple(sentences))
 

@@ -23,7 +23,7 @@ _EQUAL = 1e-4
 """Relative difference up to which two torque constants count as equal."""
 
 _DETERMINED = 0.02
-"""Largest standard error, relative to the true value, of a well determined parameter."""
+"""Largest standard error, relative to the true value, of a well-determined parameter."""
 
 
 def true_parameters(config: Config, time: float = math.inf) -> dict[str, float] | None:

@@ -1,4 +1,6 @@
-"""Charts as SVG, in two widths: for large screens and paper, and for phones. `data-` attributes describe the axes."""
+"""Charts as SVG, in two widths: one for large screens and paper, and one for phones. `data-` attributes describe the
+axes.
+"""
 
 from dataclasses import dataclass
 from html import escape

@@ -30,7 +30,7 @@ _PACKAGES = ("numpy", "scipy", "numba")
 
 @dataclass(frozen=True)
 class RecordingFile:
-    """A file that was read. sha256: of its contents; empty for a folder."""
+    """A file that was read. sha256: SHA-256 of its contents; empty for a folder."""
 
     path: str
     sha256: str

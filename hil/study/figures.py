@@ -28,7 +28,9 @@ class Rate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Confidence interval by E. B. Wilson, Journal of the American Statistical Association 22 (1927) 209."""
+        """95 % confidence interval of the fraction, after E. B. Wilson, Journal of the American Statistical Association
+        22 (1927) 209.
+        """
         if not self.of:
             return 0.0, 1.0
         z2, n, p = _NORMAL_95**2, self.of, self.share

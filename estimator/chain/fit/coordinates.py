@@ -33,7 +33,7 @@ SMALL = {
     "base_tilt_x": 0.02,
     "base_tilt_y": 0.02,
 }
-"""Scales of the other parameters that are not base parameters [their unit]."""
+"""Scales of the parameters that are neither positive nor base parameters [unit of each]."""
 SHAPES = {
     "coulomb_width": (0.01, 2.5),
     "stribeck_rise": (0.3, 1.0),
@@ -81,8 +81,8 @@ class ChainCoordinates:
 
         If a recording hardly determines the torque of some joints relative to that of the first, their torque scales
         and all parameters of their links can change by a common factor. The scales are exponentials of their
-        coordinates. Unless the parameters change exponentially with them, straight steps leave this curved valley, and
-        only tiny ones succeed.
+        coordinates. Unless the parameters change exponentially with them, a step does not follow this common change,
+        and only tiny steps reduce the sum of squares.
         """
         y = x + step
         if self.torque_scales.size:

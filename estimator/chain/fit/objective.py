@@ -276,7 +276,7 @@ class ChainProblem:
     def weighted(self, x: Array, index: int, most: int) -> Iterator[tuple[Array, Array]]:
         """Yield each joint's weighted residual (samples,) in a period and its Jacobian (samples, coordinates).
 
-        Only the first `most` samples are used, rounded up to whole pieces.
+        Only the first `most` samples are used, rounded up to whole pieces of the simulation.
         """
         period, weight = self.periods[index], self.weights[index]
         where, slopes = self._where(x, index)

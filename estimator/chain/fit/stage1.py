@@ -27,7 +27,7 @@ class ChainLinear:
     value: Array
     """Values in the order of `ChainModel.linear_names` [SI]."""
     std: Array
-    """Standard errors assuming a white residual, in the same order [SI]."""
+    """Standard errors assuming a white residual, in the order of `value` [SI]."""
     delay: float
     """Delay of the motors' torque [s]."""
     motions: tuple[PeriodicMotion, ...]

@@ -62,7 +62,8 @@ def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -
     """Return the names of the lagging back-EMFs that would cancel more inertia than the simulation allows.
 
     The loss that is simulated is then smaller than the parameters imply, which biases the estimated inertias. A
-    back-EMF is only named if its loss exceeds a standard error in `std` (base parameters or more,).
+    back-EMF is only named if its loss exceeds the standard error of a base parameter. std: standard errors of the base
+    parameters; those of other parameters may follow.
     """
     generating = _generating(base.chain.joints, parameters)
     most, parts = _most_lost(base, parameters, generating)

@@ -29,7 +29,10 @@ class Prior:
     None if nothing is known about them."""
 
     def surpassing(self, names: tuple[str, ...], std: Array) -> tuple[str, ...]:
-        """Return the base parameters whose standard errors (base parameters or more,) exceed the prior's."""
+        """Return the base parameters whose standard errors exceed the prior's.
+
+        std: standard errors of the base parameters; those of other parameters may follow.
+        """
         return tuple(
             name for name, each, own in zip(names, std[: self.std.size], self.std, strict=True) if not each <= own
         )

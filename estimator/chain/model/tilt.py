@@ -10,7 +10,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 
 TILT = ("base_tilt_x", "base_tilt_y")
-"""Names of the two angles [rad]."""
+"""Names of the two tilt angles [rad]."""
 
 MEANINGS = {name: f"tilt of the base: rotation about its {name[-1]} axis" for name in TILT}
 

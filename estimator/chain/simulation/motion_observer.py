@@ -31,7 +31,7 @@ FILTER_S = 0.02
 HOLD_S = 0.02
 TIMES = 4.0
 FLOOR_SHARE = 0.25
-"""Fraction of the largest planned torque; a smaller residual never raises an alarm."""
+"""A residual below this fraction of the largest planned torque never raises an alarm."""
 
 FIRST_NOISE_SHARE = 0.1
 STANDING = 0.05  # rad/s: below this, dry friction may hold a joint

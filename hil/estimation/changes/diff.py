@@ -32,7 +32,8 @@ class Change:
     """The change of one parameter: values, standard errors, difference in units of the combined standard error, and
     p-value.
 
-    changed: whether it is significant after Holm's correction and larger than a minimum fraction of its magnitude.
+    changed: whether it is significant after Holm's correction and larger than a minimum fraction of the parameter's
+    magnitude.
     """
 
     name: str

@@ -96,8 +96,8 @@ def _other(name: str, goal: Array, measured: Array) -> str:
     )
     if beyond > _BEYOND_OFTEN:
         return (
-            f"{name} carried a current opposite to the commanded one, or larger, in {100 * beyond:.0f} % of the "
-            f"samples: {why}"
+            f"{name} carried a current opposite to the commanded one, or larger than it, in {100 * beyond:.0f} % "
+            f"of the samples: {why}"
         )
     part = _short_part(goal, measured)
     if part > OFTEN and _follows_small_goals(goal, measured) < SHORT:

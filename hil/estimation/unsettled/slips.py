@@ -14,7 +14,9 @@ WELL = 0.3
 
 
 def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
-    """Raise CsvError if a sign is reversed, joints or torques are swapped, or an angle has another origin."""
+    """Raise CsvError if a sign is reversed, joints or torques are swapped, or an angle is measured from a fixed
+    direction instead of from the previous link.
+    """
     absolute = suspect_absolute(recordings)
     if absolute is not None and _is_clear(*absolute):
         raise CsvError(

@@ -43,7 +43,7 @@ def _truth(data: RunData) -> str:
     known = {name: truth.values[name] for name, entry in found.items() if truth.is_determined(name, entry)}
     if shares := {name: abs(found[name].value / value - 1) for name, value in known.items()}:
         worst = max(shares, key=lambda name: shares[name])
-        told.append(f"{percent(shares[worst])} among the well determined values ({worst})")
+        told.append(f"{percent(shares[worst])} among the well-determined values ({worst})")
     if not told:
         return ""
     said = f"This is a fake arm with known true parameters: the largest error is {', and '.join(told)}."

@@ -100,4 +100,4 @@ def test_a_value_near_zero_does_not_head_the_relative_errors(identified_once: Pa
     truth = {**(data.result.truth or {}), "offset_1": 1e-5}
     changed = dataclasses.replace(data, result=dataclasses.replace(data.result, parameters=found, truth=truth))
     (said,) = [each for each in verdict(changed).bullets if "known true parameters" in each]
-    assert said.endswith("5.0 standard errors (gravity_1), and 0.5 % among the well determined values (gravity_1).")
+    assert said.endswith("5.0 standard errors (gravity_1), and 0.5 % among the well-determined values (gravity_1).")
