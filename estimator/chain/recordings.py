@@ -73,7 +73,7 @@ class RecordedChain:
     value: Array
     covariance: Array
     simulated: bool
-    """Whether the likelihood was used; False: regression, because the torque was measured."""
+    """Whether stage 2 was used; False if only the regression was, because the torque was measured."""
     residual_over_noise: Array
     """RMS of the one-step-ahead residual relative to the noise of the angles (joints,); NaN for a regression."""
     residual: Array

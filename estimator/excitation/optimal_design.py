@@ -54,7 +54,7 @@ class Design:
 
 def smoothed(physics: Physics) -> Physics:
     """Return the same arm with friction steps at least LEAST_WIDTH wide, which can be simulated faster and has nearly
-    the same optimum.
+    the same optimal excitation.
     """
     vector = physics.vector.copy()
     for joint in (1, 2):

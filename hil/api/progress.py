@@ -1,4 +1,4 @@
-"""Progress reports of long calls."""
+"""Progress reports of long-running functions."""
 
 import logging
 from collections.abc import Callable

@@ -206,12 +206,14 @@ def with_run(result: Result, run: Path) -> Identification | Estimation:
 
 
 def identification(result: SettledResult, run: Path) -> Identification:
-    """Link a result from settled periods to its run."""
+    """Return a result from settled periods together with its run folder."""
     return Identification(**_fields(result), run=run)
 
 
 def estimation(result: ShootingResult, run: Path | None) -> Estimation:
-    """Link a result of multiple shooting to its run, which is None for recordings made elsewhere."""
+    """Return a result of multiple shooting together with its run folder, which is None for recordings made
+    elsewhere.
+    """
     return Estimation(**_fields(result), run=run)
 
 

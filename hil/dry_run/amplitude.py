@@ -89,8 +89,8 @@ def largest_amplitude(
     executor: Executor | None = None,
     options: AmplitudeOptions = DEFAULTS,
 ) -> Amplitude:
-    """Find the largest torque that keeps the arms within `share` of their limits, up to probability
-    safety.limit_chance.
+    """Find the largest torque at which the arms exceed the fraction `share` of their limits with a probability of at
+    most safety.limit_chance.
 
     Args:
         config: configuration of the arm.

@@ -143,7 +143,7 @@ def _physical(drawn: dict[str, float], known: dict[str, float]) -> dict[str, flo
 
 
 def within_range(parameters: dict[str, float]) -> dict[str, float]:
-    """Limit the coupling so that the mass matrix stays positive definite."""
+    """Return the parameters with the coupling limited so that the mass matrix is positive definite."""
     if "coupling" not in parameters:
         return parameters
     most = _MOST_COUPLING * float(np.sqrt(parameters["inertia_1"] * parameters["inertia_2"]))

@@ -16,7 +16,7 @@ QUANTISATION_FLOOR_TICKS = 1 / math.sqrt(12)
 
 @dataclass(frozen=True)
 class Checks:
-    """Findings about an estimate, apart from its parameters."""
+    """What the checks of an estimate found."""
 
     validation: Validation
     verdict: Verdict

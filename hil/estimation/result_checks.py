@@ -69,7 +69,7 @@ def describe_verdict(judged: verdict.Verdict) -> Verdict:
 
 
 def describe_choice(choice: trial.Choice) -> ModelChoice:
-    """Convert the choice among friction models, with its gain and cost."""
+    """Convert the choice among friction models, with its gain and cost, to the form stored in a result."""
     return ModelChoice(
         chosen=choice.chosen.model.description,
         error_divided_by=choice.gained,
@@ -79,7 +79,9 @@ def describe_choice(choice: trial.Choice) -> ModelChoice:
 
 
 def describe_segment_choice(choice: unsettled.SegmentChoice) -> ModelChoice:
-    """Convert the choice among models for unsettled data, judged on held-out segments."""
+    """Convert the choice among models for unsettled data, judged on held-out segments, to the form stored in a
+    result.
+    """
     return ModelChoice(
         chosen=choice.chosen.model.description,
         error_divided_by=choice.gained,

@@ -6,7 +6,7 @@ is chosen among all dynamically equivalent ones (m mass, c centre, J inertia abo
     l1      = coupling g / gravity_2, as can be checked with a ruler; for a horizontal arm, the user must give it
     link 2  first moment m2 c2 = gravity_2 / g = coupling / l1, second moment m2 c2^2 + J2 = inertia_2
     link 1  with the elbow's servo: first moment gravity_1 / g - m2 l1, second moment inertia_1 - m2 l1^2, which
-            includes joint 1's rotor, because a fixed base cannot tell the two apart
+            includes joint 1's rotor, because with a fixed base the two have the same effect
 
 As in a uniform rod held at its end, m c^2 is 3/4 of each second moment, or more if a rod would be too heavy for
 inertia_1. The centre of link 1 is kept within its length, and the rest of its second moment is J1. This is possible if

@@ -16,7 +16,9 @@ _CARRIED = ("armature", "offset", "lag", "lag_difference", "cable_stiffness")
 
 
 def export_mjcf(source: Source, path: Path) -> list[str]:
-    """Write `path`; return what MJCF cannot represent. Raises ExportError if no physical masses exist."""
+    """Write `path`; return what MJCF cannot represent. Raises ExportError if no physically possible
+    masses have the identified parameters.
+    """
     model = source.model
     if isinstance(model, ChainArmModel):
         return export_chain_mjcf(source, model, path)

@@ -28,7 +28,7 @@ FORMATS = {"mjcf": (export_mjcf, "xml"), "urdf": (export_urdf, "urdf")}
 TABLE = "arms.parquet"
 MOST_SAMPLES = 100_000
 _TRIES = 20
-"""Rounds in which draws without physical masses are replaced."""
+"""Maximum number of rounds in which draws without physically possible masses are replaced."""
 
 _FRICTION = ("viscous", "coulomb")
 _LEAST_WIDTH = 1e-4
@@ -45,7 +45,7 @@ class Drawn:
     """Arms drawn from one result.
 
     values: parameters (samples, names) [SI]. torque_factor: common torque factor (samples,), with a mean of 1. redrawn:
-    number of draws without physical masses, which were replaced.
+    number of draws without physically possible masses, which were replaced.
     """
 
     models: tuple[ArmModel, ...]

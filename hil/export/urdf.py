@@ -15,7 +15,9 @@ STANDARD_GRAVITY = 9.81
 
 
 def export_urdf(source: Source, path: Path) -> list[str]:
-    """Write `path`; return what URDF cannot represent. Raises ExportError if no physical masses exist."""
+    """Write `path`; return what URDF cannot represent. Raises ExportError if no physically possible
+    masses have the identified parameters.
+    """
     model = source.model
     if isinstance(model, ChainArmModel):
         return export_chain_urdf(source, model, path)

@@ -14,7 +14,7 @@ def as_text(title: str, quantities: Mapping[str, Quantity], sentences: Sequence[
 def as_html(
     title: str, quantities: Mapping[str, Quantity], truth: Mapping[str, float], sentences: Sequence[str]
 ) -> str:
-    """Format the same content as HTML, with a column of true values if there are any."""
+    """Format a title, quantities and sentences as HTML, with a column of true values if there are any."""
     head = ("parameter", "value", "standard error", "unit", *(("truth",) if truth else ()))
     rows = [
         (

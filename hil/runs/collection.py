@@ -34,7 +34,7 @@ class RunSummary:
 
     started: None if run.json does not contain it. verdict: "yes", "with care", "no", or what is missing. residual:
     residual of the worst joint in encoder steps; None without a result. steps: number of pilot and intermediate runs in
-    it.
+    the run folder.
     """
 
     path: Path

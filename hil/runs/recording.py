@@ -46,7 +46,7 @@ class Phase(IntEnum):
 
 
 def sample_type(joints: int) -> np.dtype[np.void]:
-    """The type of one row.
+    """NumPy type of one row of a recording.
 
     It contains times [s], phase, segment and period of the experiment, and, for each joint, goal and measured current
     [A], velocity [rad/s], position [rad], the servo's error byte and whether its reply is missing (the measured values

@@ -132,7 +132,7 @@ def executor(scheduler: str | None = None, count: int | None = None) -> Iterator
 
 
 def versions() -> dict[str, str]:
-    """Versions of everything that affects the numbers, in this process, or in a worker if Dask runs this function
+    """Versions of everything that affects numerical results, in this process, or in a worker if Dask runs this function
     there.
     """
     return {"hil": __version__, **_package_versions()}

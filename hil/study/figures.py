@@ -17,7 +17,7 @@ QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 
 @dataclass(frozen=True)
 class Rate:
-    """A count out of a total, with the 95 % confidence interval of the fraction (Wilson's)."""
+    """A count out of a total, with the 95 % confidence interval of the fraction (Wilson's method)."""
 
     count: int
     of: int

@@ -27,8 +27,8 @@ from hil.study.schema import Study
 def opened(study: Study, out: Path, runs: int, *, resume: bool) -> Iterator[Dataset]:
     """Open the dataset in `out`, which is new or belongs to the same study, and lock it for this process.
 
-    Raises RunFolderError if it cannot be used, ConfigError if it holds another study, or this study with other inputs
-    or versions.
+    Raises RunFolderError if the folder cannot be used, ConfigError if it holds another study, or this study with other
+    inputs or versions.
     """
     copy, about = out / "study.toml", out / "about.json"
     text, now = study.path.read_bytes(), _about(study, runs)

@@ -147,7 +147,10 @@ class PathDesigner:
         return Path(centre + share * (path.position - centre), share * path.velocity, share * path.acceleration)
 
     def worth(self, path: Path) -> tuple[float, float]:
-        """Return the worst and the median relative standard error of the base parameters that a path leaves."""
+        """Return the largest and the median standard error of the base parameters after a path.
+
+        Each is relative to the prior's standard deviation.
+        """
         errors = self._errors(path, max(1, path.position.shape[1] // LOOKED_AT))
         return float(errors.max()), float(np.median(errors))
 

@@ -7,7 +7,7 @@ from hil.estimator.options import CoordinateOptions
 
 @dataclass(frozen=True)
 class ChainOptions:
-    """Options of stage 2 for chains; names as in `hil.estimator.options`."""
+    """Options of stage 2 for chains; those that `hil.estimator.options` also has are named as there."""
 
     softness: tuple[float, ...] = (3.0, 1.5, 1.0)
     """Natural frequencies of the observer, in order of use [Hz].
