@@ -72,7 +72,7 @@ class ChainEstimate(FittedParameters):
     from_prior: tuple[str, ...]
     """Base parameters that the data hardly determine, whose values therefore come from the prior."""
     unseen: tuple[str, ...]
-    """Zero errors and tilts that the data hardly determine, which are therefore taken as zero."""
+    """Encoder zero errors and base tilts that the data hardly determine, which are therefore taken as zero."""
     doubtful_zeros: tuple[tuple[int, float], ...]
     """Joints, from 1, whose encoder zeros the model holds fixed although the recording contradicts them, and their
     errors (true minus measured angle) [rad]. Empty if they were not tested.

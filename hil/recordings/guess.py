@@ -41,7 +41,7 @@ _SUPPLY = re.compile(r"(?<![a-z])(supply|battery|bus|input)(?![a-z])", re.I)
 
 
 def guessed(table: Table, columns: Columns) -> Columns:
-    """Complete `columns` from the table's column names. Raises CsvError if these are not clear."""
+    """Complete `columns` from the table's column names. Raises CsvError if the names are ambiguous."""
     found: dict[str, object] = {}
     if columns.time is None and columns.rate is None:
         found["time"] = _time(table)

@@ -8,7 +8,7 @@ Values = NDArray[np.float64]
 CODES = tuple(
     sign * code for code in (99.0, 999.0, 9999.0, 99999.0, 999999.0, 32767.0, 65535.0) for sign in (-1.0, 1.0)
 )
-"""Usual codes; 32767 and 65535 are the largest signed and unsigned 16-bit values."""
+"""Usual codes for missing values; 32767 and 65535 are the largest signed and unsigned 16-bit values."""
 
 FEWEST = 2
 APART = 2.0

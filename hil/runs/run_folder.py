@@ -261,7 +261,7 @@ class RunFolder:
             write_json(self.rest_pose_path, {"rest_pose": list(played.arm.rest_pose)})
 
     def set_aside(self, name: str, played: Config) -> None:
-        """Move the recording of a run to a subfolder, so that another run can use this folder. played: its
+        """Move the recording of a run to the subfolder `name`, so that another run can use this folder. played: its
         configuration.
         """
         folder = self.below(name, played)

@@ -30,7 +30,7 @@ _RECENT = 4
 
 _BEYOND, _BEYOND_OFTEN = 0.25, 0.02
 """A current was not the commanded one if it deviates this much from all recent goals and from 0, relative to the
-largest goal. It is reported if the fraction of such samples exceeds the second value.
+largest goal. A warning is given if the fraction of such samples exceeds the second value.
 """
 
 _SMALL, _LEAST = 0.5, 0.1
