@@ -135,7 +135,9 @@ class SafetyConfig(Table):
     rest_velocity: PositiveFloat = Field(0.1, le=2, description="rad/s, speed below which a joint counts as at rest")
     slew: PositiveFloat = Field(100.0, le=1e4, description="A/s (V/s in PWM mode): maximum rate of change of goals")
     max_temperature: PositiveFloat = Field(70.0, le=100, description="degrees C, highest allowed inside a servo")
-    min_voltage: float = Field(0.0, ge=0, le=60, description="V; default: the models' factory shutdown thresholds")
+    min_voltage: float = Field(
+        0.0, ge=0, le=60, description="V, lowest allowed; default: the models' factory shutdown thresholds"
+    )
     max_voltage: PositiveFloat = Field(30.0, le=60, description="V")
     follow_time: PositiveFloat = Field(0.05, le=5, description="s, time for which a current may deviate from its goal")
     follow_share: PositiveFloat = Field(

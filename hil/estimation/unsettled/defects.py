@@ -53,7 +53,7 @@ def _when(course: Course, names: Sequence[str]) -> str:
     return {
         "always": "",
         "step": f"at about {course.time:.3g} s{which}",
-        "linear": "steadily in the course of the recording",
+        "linear": "steadily during the recording",
         "decay": f"with a time constant of about {course.time:.2g} s",
         "recording": f"in {names[course.recording]}" if course.recording < len(names) else "in one recording",
     }[course.kind]
@@ -134,9 +134,9 @@ def _offset(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tup
 def _arm(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
     del unknowns
     if hypothesis.course.kind == "recording":
-        return f"The arm {when} seems to be another one, or to carry another load", "Estimate each separately."
+        return f"The arm {when} seems to be a different one, or to carry a different load", "Estimate each separately."
     return (
-        f"The arm seems to be another one after a change {when}: load, mounting, servo or settings",
+        f"The arm seems to be a different one after a change {when}: load, mounting, servo or settings",
         "Use only the part before or after the change, or put each part in a file of its own.",
     )
 
