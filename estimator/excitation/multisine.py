@@ -13,7 +13,6 @@ from functools import lru_cache, partial
 
 import numpy as np
 import numpy.typing as npt
-from scipy.fft import next_fast_len
 
 from hil.estimator.arrays import Array
 from hil.estimator.errors import ExcitationError
@@ -195,6 +194,8 @@ def _low_crest_phases(harmonics: tuple[int, ...], seed: int, joint: int) -> Arra
     # Plain Schroeder phases would give every seed the same wave, so they are shifted in time and perturbed.
     starts = [schroeder + order * random.uniform(0.0, 2.0 * np.pi) + random.uniform(-1.0, 1.0, count)]
     starts += [random.uniform(0.0, 2.0 * np.pi, count) for _ in range(STARTS)]
+    from scipy.fft import next_fast_len  # slow to import, and few commands need it
+
     coarse = next_fast_len(OVERSAMPLING * int(order.max()), real=True)
     fine = next_fast_len(FINAL_OVERSAMPLING * int(order.max()), real=True)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hil.api.experiment import ConfigLike, loaded
+from hil.api.configuration import ConfigLike, loaded
 from hil.api.progress import OnProgress, Progress, ignore
 from hil.results.display import html_table
 from hil.setup.preflight import Finding, Level, check_arm

@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from hil.api.experiment import ConfigLike, loaded
+from hil.api.configuration import ConfigLike, loaded
 from hil.api.progress import OnProgress, Progress, ignore
 from hil.config.schema import Config
 from hil.dry_run.chain_summary import ChainDryRun, chain_dry_run_json

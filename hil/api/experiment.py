@@ -7,10 +7,11 @@ from datetime import datetime
 from os import PathLike
 from pathlib import Path
 
+from hil.api.configuration import ConfigLike, loaded
 from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Identification, Run, identification, load_run
 from hil.clearance.doubts import doubts
-from hil.config.schema import Config, load_config
+from hil.config.schema import Config
 from hil.drivers.errors import DriverError
 from hil.dry_run.ensemble import earlier_result
 from hil.errors import ConfigError, ExperimentError, StopRequested
@@ -26,9 +27,6 @@ from hil.runs.run_folder import RunFolder
 __all__ = ["identify", "record"]
 
 log = logging.getLogger(__name__)
-
-ConfigLike = str | PathLike[str] | Config
-"""A TOML file, the name of a bundled configuration, or a loaded configuration."""
 
 
 def identify(
@@ -159,18 +157,6 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
                 for line in _how_to_go_on(stopped, run, command, shown):
                     stopped.add_note(line)
         raise
-
-
-def loaded(config: ConfigLike) -> tuple[Config, Path]:
-    """Load and check the configuration; also return its path as the caller wrote it. Raises ConfigError, TypeError."""
-    if isinstance(config, Config):
-        return config, config.path
-    if not isinstance(config, str | PathLike):
-        raise TypeError(
-            "config must be a TOML file, the name of a bundled configuration or the result of hil.load_config, not "
-            f"{config!r}."
-        )
-    return load_config(Path(config)), Path(config)
 
 
 def _taking_over(config: Config) -> Config:

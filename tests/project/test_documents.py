@@ -3,6 +3,7 @@
 import ast
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -61,7 +62,9 @@ def place(identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     (here / "configs" / "new.toml").write_text(new, encoding="utf-8")
     for urdf in (ROOT / "configs").glob("*.urdf"):
         (here / "configs" / urdf.name).symlink_to(urdf)
-    (here / "examples").symlink_to(ROOT / "examples")
+    shutil.copytree(ROOT / "examples", here / "examples")
+    study = here / "examples" / "studies" / "friction.toml"
+    study.write_text(study.read_text(encoding="utf-8").replace("runs = 6", "runs = 2"), encoding="utf-8")
     (here / "runs").mkdir()
     identified.rename(here / "runs" / "finished")
     monkeypatch.chdir(here)

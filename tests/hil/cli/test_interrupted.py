@@ -10,7 +10,7 @@ import pytest
 from tests.support.interrupted import STAGES, interrupt
 from tests.support.paths import CONFIGS
 
-OFTEN = {"opening the port": signal.SIGINT, "held-out part": signal.SIGINT, "report": signal.SIGTERM}
+OFTEN = {"held-out part": signal.SIGINT, "report": signal.SIGTERM}
 """Stages tried in every run of the tests, and with which signal; each takes two processes."""
 WORDS = {
     "identify": ["identify", "arm.toml", "--out", "run"],

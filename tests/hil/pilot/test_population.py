@@ -6,10 +6,10 @@ import pytest
 
 from benchmarks.population import figures, run
 
-ALWAYS = {12: "XL430-W250", 30: "XC330-T288"}
-"""Seeds and models of a hanging and an upright arm, with and without current sensors, encoder noise and ripple."""
+ALWAYS = {12: "XL430-W250"}
+"""Seed and model of a hanging arm without current sensors, with encoder noise and ripple."""
 
-SLOW = {7: "XM430-W350", 15: "XL330-M288", 34: "XM540-W270"}
+SLOW = {30: "XC330-T288", 7: "XM430-W350", 15: "XL330-M288", 34: "XM540-W270"}
 """Seeds of the other models, two on arms that move in a horizontal plane and one on a tilted arm; one has a warming
 gear.
 """
