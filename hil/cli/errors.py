@@ -18,9 +18,10 @@ def exit_code(error: Exception) -> int | None:
 
 
 def message(error: Exception) -> str:
-    """Return the error's message, that of an expected error that was being handled when it occurred, and its notes.
+    """Return the text to print for an error: its message and its notes.
 
-    The notes end with the next command, if they name one.
+    If the error occurred while another expected error was being handled, the message of that error is included. If the
+    notes name a command to type next, they end with it.
     """
     lines = [f"hil: {error}"]
     cause = None if error.__suppress_context__ else error.__context__

@@ -1,7 +1,7 @@
-"""The pose read from the bus, compared with the arm's description: each joint in turn is moved by hand, torque off.
+"""Compare the arm with its description: each joint in turn is moved by hand, with torque off, and its angle is read.
 
-An identification cannot detect wrong IDs, directions, zeros or axes: they only make the parameters of a spatial arm
-wrong. A person who moves the joints notices such errors at once.
+An identification cannot detect wrong IDs, directions, zeros or axes: it merely finds wrong parameters for a spatial
+arm. A person who moves the joints notices such errors at once.
 """
 
 from collections.abc import Callable, Iterator
@@ -50,7 +50,7 @@ class Moved:
     """Angles by which all joints moved [rad]."""
     well: bool
     found: str
-    """Finding in words, including what to change if it differs from the description."""
+    """Finding in words; if the motion differs from the description, it also says what to change."""
 
 
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:

@@ -14,7 +14,9 @@ _FASTEST = 10.0  # rad/s, initial limit of servos that could turn faster
 _USUAL_STALL = 4.1  # N m, stall torque of an XM430
 _CYCLE_BYTES = 39  # on the wire per servo: goal, request and reply
 RATES = (400, 300, 250, 200, 160, 125, 100, 80, 64, 50, 40, 32, 25, 20)
-"""Sample rates [Hz] that a new file may have, spaced so closely that at most a quarter of a bus's capacity is lost."""
+"""Sample rates [Hz] for a new file, so close together that rounding down costs at most a quarter of the possible
+rate.
+"""
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class JointAnswers:
     """Answers about one joint.
 
     rest: angle at rest [rad]. swing: allowed deviation from it to either side [rad]. length: distance from this joint
-    to the next one, or to the tip [m]. voltage: its supply [V]; None if it was not read.
+    to the next one, or to the tip [m]. voltage: supply voltage of its servo [V]; None if it was not read.
     """
 
     name: str
@@ -43,10 +45,10 @@ class JointAnswers:
 
 @dataclass(frozen=True)
 class MeasuredBus:
-    """What was measured on the bus.
+    """Result of measuring the bus.
 
-    rate: sample rate to use [Hz]. sustained: the rate that the bus can sustain [Hz]. one_write, fast: how data are
-    exchanged at that rate.
+    rate: sample rate to use [Hz]. sustained: the rate that the bus can sustain [Hz]. one_write, fast: values of
+    port.one_write and port.fast_sync_read with which it was measured.
     """
 
     rate: float

@@ -1,7 +1,7 @@
 """Settings that a killed program left on the servos: what can be restored, and what another program has changed.
 
-A register that holds neither the value that the killed program set nor the one that it found was changed by something
-else. It is not restored, since a person may have wanted the change, but reported with its earlier value.
+If a register holds neither the value that the killed program set nor the value before that, another program has changed
+it. It is not restored, since a person may have wanted the change, but it is reported together with its earlier value.
 """
 
 from collections.abc import Mapping
@@ -38,7 +38,9 @@ class Left:
     is_to_restore: bool
 
     def told(self, title: str) -> str:
-        """What is restored and what is not, for the user."""
+        """Return a message that says what is restored and what is not; it begins with `title`, the name of the
+        servo.
+        """
         others = self.others if self.changed else ""
         if not self.is_to_restore:
             return f"{title}: {others}" if others else ""

@@ -437,7 +437,7 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
         tripped = servo.read("Bus Watchdog") == WATCHDOG_TRIPPED
         if tripped:
             yield Finding(
-                Level.OK, str(joint), "goals", "refused until its tripped Bus Watchdog is cleared, which a run does"
+                Level.OK, str(joint), "goals", "refused because its Bus Watchdog has tripped; a run clears it"
             )
             continue
         fix = (

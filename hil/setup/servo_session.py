@@ -61,10 +61,10 @@ REBOOT_S = 0.6
 
 
 _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
-"""Said if every servo has answered in the end and nothing else is wrong."""
+"""Message if every servo has answered in the end and nothing else is wrong."""
 
 _TELLS_OF_TORQUE = re.compile("torque (off )?is", re.IGNORECASE)
-"""Found in each sentence that says whether torque is off (`TorqueOff`)."""
+"""Matches every sentence that says whether torque is off (see `TorqueOff`)."""
 
 COUNT_DOWN_S = 5.0
 """Time between the warning that an arm will move again after a stopped run and switching torque on [s].
@@ -93,7 +93,7 @@ class ServoSession:
     _wanted: dict[Joint, dict[str, int]] = field(default_factory=dict)
     """Settings to restore: those saved, except for what another program changed since an earlier run was killed."""
     _left: dict[Joint, Kept] = field(default_factory=dict)
-    """Settings that an earlier run left changed; restoring a goal that a lowered limit cuts is retried only once."""
+    """Saved settings of the servos that an earlier run did not restore."""
     _refused: set[Joint] = field(default_factory=set)
     """Servos whose Current Limit another program has left too low for this run: its former value stays on file."""
     _is_ours: bool = False
@@ -103,7 +103,7 @@ class ServoSession:
     _on_again: dict[Joint, int] = field(default_factory=dict)
     """Servos whose torque another program has switched on since it was cut, with how often it was cut again."""
     _torque: dict[Joint, bool | None] = field(default_factory=dict)
-    """What was read last about each servo's torque (`ServoBus.torque_now`)."""
+    """Whether each servo's torque was on at the latest reading; None if unknown (`ServoBus.torque_now`)."""
     shared: int = 0
     """Number of inner blocks that have used the bus."""
     was_stopped: bool = False

@@ -1,8 +1,7 @@
 """Check that, until torque is switched on, the arm stays in the pose in which it was first read.
 
-Without torque, only a hand or gravity can move it. Any other change means that its readings are no longer correct: a
-horn has slipped, another servo answers, or another program has changed Homing Offset. From then on every angle would be
-wrong.
+Without torque, only a hand or gravity can move the arm. Any other change of its reported angles means that they are no
+longer correct: a horn has slipped, another servo answers, or another program has changed Homing Offset.
 """
 
 import math

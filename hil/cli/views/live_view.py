@@ -41,9 +41,9 @@ def layout_for(columns: int, name: int) -> Layout:
 
 
 class LiveView:
-    """Draws progress reports; keeps the latest values of what a sample may lack: positions, temperatures and voltages.
+    """Draws progress reports. If a sample lacks a position, temperature or voltage, the latest known value is shown.
 
-    The timing statistics start afresh with each run of a pilot.
+    The timing statistics are reset at the start of each run of a pilot.
     """
 
     def __init__(self, config: Config, columns: int) -> None:
