@@ -349,7 +349,7 @@ class ServoBus(TorqueSwitch):
         )
 
     def bear_others(self) -> None:
-        """From now on, do not raise BusOverheard for packets of another master; what it writes is still noticed."""
+        """From now on, do not raise BusOverheard for packets of another master; its writes are still detected."""
         self.prepared.heard.strangers = -math.inf
 
     def read_status_next(self) -> None:

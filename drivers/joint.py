@@ -73,7 +73,7 @@ class Joint:
         return self.direction * supply_voltage / FULL_PWM_TICKS
 
     def angle(self, position_ticks: int) -> float:
-        """Return the joint angle [rad] for a Present Position."""
+        """Return the joint angle [rad] for a value of Present Position [ticks]."""
         return (position_ticks - self.zero_ticks) * self.position_unit
 
     def within_turn(self, position_ticks: int) -> "Joint":

@@ -44,8 +44,8 @@ _ALWAYS = 1 << 62
 """Like `_LOOKS`, but for a line whose replies usually arrive earlier than its baud rate allows, such as a pty."""
 
 _EARLY_BITS = 9.0
-"""Bits per byte that are assumed, of ten in fact; a reply counts as early if it arrives before the request can have
-been transmitted at this number. The difference allows for inaccurate baud rates.
+"""Assumed number of bits per transmitted byte. A reply counts as early if it arrives before the request can have been
+transmitted at this number of bits. The true number is ten; the difference allows for inaccurate baud rates.
 """
 
 _WRITE_PATIENCE_S = 0.1

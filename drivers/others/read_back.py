@@ -56,7 +56,7 @@ _IN_DOUBT_S = 0.3
 
 
 _Sightings = deque[tuple[float, int]]
-"""Time [s] and value of each."""
+"""Time [s] and value of each read-back of a foreign value."""
 
 
 class Overruled(NamedTuple):

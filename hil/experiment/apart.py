@@ -13,7 +13,9 @@ from math import isnan
 from hil.drivers.joint import Joint
 
 ALLOWED_RAD = 0.1
-"""Tolerance for backlash of two gear trains, encoder nonlinearity, and twist of the joint between its servos."""
+"""Allowed change of the difference between the angles of two servos [rad], for backlash of both gear trains, encoder
+nonlinearity, and twist of the joint between the servos.
+"""
 
 
 def opposed(joint: Joint) -> str:

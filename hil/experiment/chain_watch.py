@@ -2,10 +2,10 @@
 
 Prior knowledge is the ensemble's mean and inflated covariance. The ensemble is drawn around the description, and
 updated after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
-A joint at a standstill at its rest angle is judged only by torques that would move it towards the side on which it has
-been, because on the way home it may reach its end stop before the other joints do. A joint that has been on both sides
-of its rest angle has no stop there. A joint that has not left its rest angle yet may rest against a stop on the side to
-which gravity pulls it: it is judged only while it is commanded to that side.
+A joint that stands still at its rest angle may lie against an end stop there, for example because it has come home
+before the other joints. It is therefore judged only by torques towards the side on which it has been. A joint that has
+been on both sides of its rest angle has no stop there. A joint that has not left its rest angle yet may rest against a
+stop on the side to which gravity pulls it: it is judged only while it is commanded to that side.
 """
 
 import math
@@ -81,7 +81,7 @@ class ChainWatch:
 
     @property
     def residual(self) -> Residual:
-        """What the model does not explain in the latest sample."""
+        """Torque in the latest sample that the model does not explain."""
         return Residual(self._observer.lacking, self._observer.torque, self._observer.is_beyond)
 
     def observe(self, state: State) -> int:

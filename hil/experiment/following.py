@@ -41,7 +41,7 @@ _FULL_WEIGHT = 2.0
 """
 
 _FEWEST = 2
-"""Minimum number of samples, however low the rate."""
+"""Minimum number of samples before a current counts as zero, however low the rate."""
 
 MEMORY = np.dtype(
     [
@@ -52,7 +52,7 @@ MEMORY = np.dtype(
 """Constants and state of the check of one joint.
 
 per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V]; share: the same, relative to the goal; follow_time:
-how long a larger one may last [s].
+how long a larger deviation may last [s].
 evidence, count: sum of the log likelihood ratios times seconds, and its number of samples.
 differs_for, differs: duration [s] and number of samples of a deviation.
 """

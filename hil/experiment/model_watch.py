@@ -47,11 +47,11 @@ _UNDESCRIBED = {"gravity": 10.0, "viscous": 1.0, "offset": 0.3, "tilt": 1.0}
 _INERTIA = 0.3
 """Standard deviations for an arm without a description, as multiples of the planned torque in SI units.
 
-If a small first torque moves an arm by a tenth of a radian, the arm's gravity torque is ten times as large. But the arm
-does move, which it would not if viscous friction or inertia were several times as large as the planned torque.
+Gravity may be ten times as large as a small first torque, which then moves the arm by a tenth of a radian. But viscous
+friction and inertia cannot be several times as large as the planned torque, because the arm would then hardly move.
 """
 _FLAT = 0.3
-"""Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the same units."""
+"""Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the units of `_INERTIA`."""
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
 """Time for which a joint must appear stationary under a torque that is held over several exchanges [s]."""
@@ -69,8 +69,8 @@ ones.
 """
 
 PLAY_RAD, CURVED = 0.015, 0.2
-"""Displacement within a jolt that gear backlash may cause [rad], twice that of a servo in its data sheet, and allowance
-for the curvature of ordinary motion, as a fraction of the usual change of velocity times the duration.
+"""Displacement within a jolt that gear backlash may cause [rad], twice the backlash in a servo's data sheet; and
+allowance for the curvature of ordinary motion, as a fraction of the usual change of velocity times the duration.
 """
 
 _USUAL_S = 1.0
@@ -283,7 +283,7 @@ class ModelWatch:
 
 
 def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
-    """Mean and covariance of the observer's parameters."""
+    """Initial mean and covariance of the parameters of the momentum observer."""
     if arms is None and config.arm.link_lengths is None:
         return _hardly_known(config, largest)
     arms = prior_ensemble(config, ARMS) if arms is None else arms

@@ -13,7 +13,7 @@ _FORGETS = 0.98
 
 
 def read_back(bus: ServoBus, guard: Guard, due: float) -> None:
-    """Look for another master just before the exchange that is due at `due` [s]; tell the guard about lost goals."""
+    """Check for goals of another program just before the exchange due at `due` [s]; report lost goals to the guard."""
     bus.check_not_overruled(due)
     if (lost := bus.goals_lost) is not None:
         guard.goals_are_lost(*lost)

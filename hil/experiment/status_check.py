@@ -34,13 +34,13 @@ _REMEMBERED = 256
 """Number of latest goals that are kept."""
 
 _HELD_BEFORE = 4
-"""Number of goals before a matching status that a servo may hold if its writes are lost."""
+"""If writes are lost, a servo may also hold one of this many goals that were sent before the latest matching status."""
 
 
 class StatusCheck:
     """Compares reported values with the commanded ones. `look` returns the fault, or None.
 
-    bears_errors: whether a hardware error that leaves the servo its torque is accepted.
+    bears_errors: whether to tolerate a hardware error as long as the servo keeps its torque.
     """
 
     def __init__(self, config: Config, *, bears_errors: bool = False) -> None:

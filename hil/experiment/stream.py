@@ -51,11 +51,11 @@ _BY_OTHER_GOALS = {
     *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
-"""Causes of a stop that another program's goals may have."""
+"""Causes of a stop that goals sent by another program may explain."""
 
 _BRAKING_WATCHDOG_S = 0.04
-"""Bus Watchdog while the arm is braked [s]: should the cable be unplugged meanwhile, the current of a brake must not
-flow for as long as that of an experiment might, whose next command may be late.
+"""Timeout of the Bus Watchdog while the arm is braked [s]. It is shorter than during the experiment, which must allow
+for late commands: if the cable is unplugged during braking, the current must not continue for long.
 """
 
 

@@ -15,8 +15,8 @@ import numpy as np
 __all__ = ["MEMORY", "TOLERANCE_RAD", "begin", "look"]
 
 TOLERANCE_RAD = 0.04
-"""A joint's sign is considered wrong if the work that its motor has taken out of the arm, divided by the joint's
-largest planned torque, exceeds this [rad].
+"""A motor is considered reversed if the work that it has taken out of the arm, divided by the joint's largest planned
+torque, exceeds this [rad].
 
 Because of delays, even a healthy motor takes some work out of the arm: up to 0.02 rad with a heavy arm at 20 Hz.
 """

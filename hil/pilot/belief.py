@@ -32,17 +32,17 @@ _LINEAR = ("offset", "zero")
 """Parameters of either sign, which are not represented by their logarithm."""
 
 _TIMES = 160
-"""Number of instants of a motion that are compared, per joint."""
+"""Number of instants at which the measured and the simulated motion of a joint are compared."""
 _LINEAR_RANGE = 0.02  # rad, below which displacements are compared linearly, and above it by their logarithms
 _ERROR = 0.08
-"""Relative model error of a compared displacement."""
+"""Assumed model error of a simulated displacement, relative to that displacement."""
 _LEAST_ERROR_STEPS = 1.5
 MOVED_STEPS = 26
 """Smallest range of motion of a joint that counts as having moved [encoder steps]."""
 _STILL = 0.02  # rad, allowed range of a simulated joint whose real counterpart stood still
 _MOST_RAISES, _RAISE = 12, (0.05, 0.25)
-"""If a simulated joint moves although the real one stood still, its log friction is increased at random: at most this
-many times, each time within this range.
+"""If a simulated joint moves although the real one stood still, the logarithm of its friction is increased: at most
+this many times, each time by a random amount from this range.
 """
 
 _INFLATIONS = (12.0, 6.0, 4.0, 2.0)

@@ -20,14 +20,15 @@ from hil.plan.stabiliser import DELAY_SAMPLES
 Array = NDArray[np.float64]
 
 FREQUENCY, DAMPING_RATIO = 3.0, 0.7
-"""Natural frequency [Hz] and damping ratio of each joint on the stabiliser's spring, unless the rate is too low."""
+"""Natural frequency [Hz] and damping ratio that the stabiliser gives each joint, unless the sample rate is too low."""
 
 
 @dataclass(frozen=True)
 class ChainGains:
     """Limits on the gains of each joint (joints,).
 
-    stiffness, damping: gains at a high rate [N m/rad, N m s/rad]. friction: least viscous friction [N m s/rad].
+    stiffness, damping: gains at a high rate [N m/rad, N m s/rad]. friction: smallest viscous friction of the ensemble
+    [N m s/rad].
     lightest: smallest inertia with the other joints free [kg m^2].
     """
 

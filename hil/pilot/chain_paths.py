@@ -31,8 +31,8 @@ class Reserve:
     """What a path leaves unused, to allow for errors of the assumed model.
 
     position: fraction of a joint's range that stays free at each limit. speed, torque: fractions of the limits that
-    the path may use. clearance: distance in addition to the margin [m], which transitions from and to the rest pose
-    need not keep.
+    the path may use. clearance: distance from obstacles in addition to the configured margin [m]; transitions from and
+    to the rest pose need not keep this additional distance.
     """
 
     position: float = POSITION_RESERVE
@@ -48,7 +48,7 @@ class Reserve:
 
 MORE = 1.4
 MOST_POSITION = 0.3
-"""Largest reserve of position: at one half, none of a joint's range would be left."""
+"""Largest value of Reserve.position: at 0.5, none of a joint's range would be left."""
 RESERVE = Reserve()
 
 

@@ -35,7 +35,7 @@ from hil.setup.servo_session import servo_session
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7
 RAISED = 1.3
-"""Another step precedes the full run if the safe share of the amplitude is at least this multiple of the last run's."""
+"""Another step precedes the full run if the amplitude that is safe now is at least this multiple of the last run's."""
 
 MOST_RAISE = 2.5
 """Largest ratio of a step's share of the amplitude to that of the previous run."""
@@ -123,12 +123,14 @@ class ChainSearch(SafeShares):
         return found
 
     def limit_after(self, error: ExperimentError, found: Found) -> None:
-        """Reduce the largest allowed amplitude after a run that exceeded a limit, but not if friction held a joint."""
+        """Reduce the largest allowed amplitude after a run that was stopped, unless it did not settle or a joint did
+        not move.
+        """
         if not isinstance(error, NotSettled | DidNotMove):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
-        """Play a run and set `last` to its share; return the error that ended it early, or None.
+        """Play a run and set `last` to its share of the amplitude; return the error that ended it early, or None.
 
         Only errors that are informative about the arm are returned; all others are raised.
         """

@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 DEFAULTS = PilotOptions()
 
 _LINES_FOR_DETECTION = 4
-"""Number of lines of the band per joint at which experiment.detection still excites enough of them."""
+"""Minimum number of spectral lines in the band per joint if experiment.detection leaves some of them unexcited."""
 
 
 @dataclass
@@ -56,7 +56,7 @@ class Search:
     """Joints that a stabiliser held (joints,)."""
     options: PilotOptions = DEFAULTS
     from_earlier: bool = False
-    """Whether the belief comes from an earlier run that no run so far has contradicted."""
+    """Whether the belief comes from the result of an earlier run, and no run so far has contradicted it."""
     earlier_swing: Array | None = None
     """Range of motion of each joint in the earlier run from which the belief comes (joints,) [rad], if known."""
 
@@ -150,7 +150,7 @@ class Search:
         return np.asarray(swing > MOVED_STEPS * step)
 
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
-        """The largest amplitude that is safe for all plausible arms.
+        """The largest amplitude that is safe for all plausible arms; share: fraction of each limit that they may use.
 
         If there is none, the amplitude of the last run is used, provided that the real arm has shown it to be safe, and
         otherwise a smaller one. Raises NoSafeTorque if there has been no run yet.

@@ -30,7 +30,8 @@ _LONGEST_SAG_S = 3.0  # wait for an arm that moves after torque off
 
 _LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
 """Longest wait for an arm to come to rest [s], interval between checks [s], and smallest change between two checks that
-counts as motion [rad]."""
+counts as motion [rad].
+"""
 
 
 def tolerance_now(config: Config) -> float:

@@ -88,7 +88,7 @@ class Lowering:
         self._thought.of(self._way.path(self._rest, np.zeros_like(self._rest)))  # compile in advance
 
     def slow_down(self, every: int) -> None:
-        """From now on, goals are computed for every `every`-th sample only: spring and damper must be softer."""
+        """From now on, compute goals only for every `every`-th sample, with a softer spring and damper."""
         rate = self._rate / every
         stiffness, damping = self._gains
         self._damping = np.minimum(damping, most_damping(rate, self._lightest))
@@ -117,8 +117,8 @@ class Lowering:
         """Start lowering from this sample, the latest that all servos answered; return the number of samples that
         lowering takes.
 
-        goal: latest goals [A or V]. recent: the latest exchanges. watch: the model's check, which has seen the motion
-        so far; without one, motors that turn against their goals are detected only once their joints run away.
+        goal: latest goals [A or V]. recent: the latest exchanges. watch: the check against the model, which has seen
+        the motion so far. Without it, a motor that turns against its goal is detected only when its joint runs away.
         """
         self._recent, self._watch = recent, watch
         position, velocity = np.array(state.position), np.array(recent.until(state).believed(state))
