@@ -201,7 +201,7 @@ class DescriptorPort(Port):
         poll.register(self._descriptor, select.POLLIN)
         self._wait_ms = poll.poll
         self._looks = _LOOKS
-        """Number of further requests before which `ask` looks for pending input."""
+        """Number of requests for which `ask` will still look for pending input before it writes."""
 
     def write(self, data: bytes) -> None:
         try:

@@ -4,8 +4,8 @@ The order matters. Torque off is sent to all servos at once, which takes 0.3 ms.
 that does not reply costs about 40 ms, so torque off is sent to all again afterwards: a servo may receive without being
 able to reply, and a packet may have been lost. If a servo still cannot be confirmed, the bus stays silent for as long
 as its Bus Watchdog waits: every packet feeds the watchdog of a servo that receives but does not obey, because it
-refuses instructions or its ID has changed. For the same reason servos that did not answer the last exchange are not
-polled before that. Then the remaining servos are tried again, several times.
+refuses instructions or its ID has changed. For the same reason, servos that did not answer the last exchange are not
+polled before this pause. Then the remaining servos are tried again, several times.
 
 Ctrl-C raises KeyboardInterrupt at any point of the program, even between two servos while torque is being cut. A
 program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
@@ -32,7 +32,7 @@ _INTERRUPTS_BORNE = 5
 """Attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
-"""Largest delay after its timeout with which a watchdog acts [s], since it counts in steps."""
+"""Largest time by which a watchdog may act later than its timeout [s], since it counts in steps of 20 ms."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
 """Further torque-off packets and the time between them [s], since one that collides with a reply is lost."""

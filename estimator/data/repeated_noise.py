@@ -74,9 +74,9 @@ def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
     """Return the standard deviation of the noise of one averaged sample in excess of white noise (joints,) [rad].
 
     It is 0 unless significant. On the lines on which the motion may have changed from pass to pass, the noise is
-    extrapolated: it is assumed to rise as much from the octave above to these lines as from the next higher octave to
-    that one. Noise with a long correlation is underestimated. Takes the arguments of `repeated_noise`, and returns None
-    in the same cases.
+    extrapolated: from the octave above to these lines, it is assumed to rise by the same factor as from the next higher
+    octave to that one. Noise with a long correlation is underestimated. Takes the arguments of `repeated_noise`, and
+    returns None in the same cases.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None

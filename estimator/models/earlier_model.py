@@ -7,8 +7,8 @@ all samples since then is therefore compared with the mean torque over that time
 ripple) cancel, and a push does not. Where the joint has hardly moved in that time, friction may have held it back: a
 gear gives way elastically before it slides.
 
-What a joint's equation, `torque - row theta`, contributes is summed over time, so that the mean between any two stored
-moments takes one subtraction. These functions are part of compiled loops.
+The terms of a joint's equation, `torque - row theta`, are summed over time, so that the mean between any two stored
+moments requires one subtraction. These functions are part of compiled loops.
 """
 
 from typing import Any
@@ -33,8 +33,8 @@ IN_A_ROW = 2
 """Number of successive lessons after which a mean residual torque that stays unexplained is reported."""
 
 ELASTIC_RAD = 0.03
-"""Distance from a reversal over which dry friction approaches that of a sliding joint [rad]: it may first differ by as
-much as it can hold at standstill; the difference falls exponentially with the distance covered.
+"""Distance after a reversal over which dry friction approaches its value in sliding [rad]. The difference between the
+two may at first be as large as static friction, and falls exponentially with the distance covered.
 """
 
 _SLOTS = max(BACK)
@@ -48,7 +48,7 @@ _STORED, _NEXT, _LASTS, _FOUND = 0, 1, 2, 4
 
 
 def memory(count: int) -> Array:
-    """Memory for two joints with `count` parameters each: nothing is stored yet."""
+    """Return an empty memory for two joints with `count` parameters each."""
     return np.zeros((_SLOTS + 2, 1 + 2 * (_ROW + count) + 4 + count + count * count))
 
 

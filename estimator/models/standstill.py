@@ -94,7 +94,8 @@ def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta:
 def keep(rest: Any, first: int, row: Any) -> None:
     """Store an equation from column `first` on.
 
-    Element by element: for the assignment of a slice, numba compiles an error message about shapes, which takes 2 s.
+    The elements are copied in a loop: numba would need 2 s more to compile the assignment of a slice, because of its
+    error message about shapes.
     """
     for i in range(row.size):
         rest[first + i] = row[i]
