@@ -16,7 +16,8 @@ __all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack"]
 _MODES_S = 0.025
 """Mean time between two read-backs of the modes [s]; all others read the goals.
 
-It is random: a program that overwrites goals regularly must not always do so when the modes are read.
+The actual time is random. Otherwise another program that overwrites goals regularly might always do so just when the
+modes are read.
 """
 
 _GOALS_PER_MODE_IN_DOUBT = 4

@@ -24,7 +24,7 @@ QUICK = LikelihoodOptions(
     integration=IntegrationOptions(max_substeps=16),
     coarse_integration=IntegrationOptions(max_step=2.6e-3, max_substeps=8),
 )
-"""Limits with which no substeps are wasted on bristles that become extremely stiff."""
+"""Options of a quick fit: with few iterations and substeps, little time is lost if bristles become extremely stiff."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,9 @@ class Choice:
 
     @property
     def cost(self) -> float:
-        """Increase of the base parameters' standard errors due to the added terms (geometric mean of ratios).
+        """Factor by which the added terms increase the standard errors of the base parameters (geometric mean).
 
-        They are compared with the standard errors that would result if the added terms were known exactly.
+        The reference is the standard errors that would result if the added terms were known exactly.
         """
         estimate = self.estimate
         std = estimate.std

@@ -2,7 +2,7 @@
 
 
 def exit_code(error: Exception) -> int | None:
-    """Exit code of an expected error; None for a bug in the program."""
+    """Return the exit code for an expected error; None for any other exception, which is a bug in the program."""
     from hil.drivers import errors as driver
     from hil.errors import HilError
     from hil.estimator.errors import EstimationError

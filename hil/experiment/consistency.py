@@ -23,8 +23,8 @@ perhaps during the last `LAG_S`. The distance covered before that must therefore
 the reported velocity is frozen. This detects a velocity that freezes near its peak sooner than the memories do, in
 which a lag could explain the difference.
 
-Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to twice the
-values estimated by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
+Lag and scale error are properties of a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to
+twice the values estimated by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
 that it keeps for a joint is a record of the type `MEMORY`.
@@ -107,7 +107,8 @@ _FADING = np.dtype(
 """A fading memory.
 
 apart: position minus integral of velocity [rad]. far: distance covered [rad]. mean, span: mean and range of the
-velocity [rad/s]. curved, unknown: uncertainties [rad].
+velocity [rad/s]. curved: uncertainty due to the
+motion between samples [rad]. unknown: uncertainty due to the times of the measurements [rad].
 """
 
 _STEPS = np.dtype([("square", "f8"), ("age", "f8"), ("since", "f8"), ("count", "f8")])

@@ -59,7 +59,11 @@ differs_for, differs: duration [s] and number of samples of a deviation.
 
 
 def begin(memory: Any, joint: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
-    """Set the constants of `memory`, a zero-filled record. planned: the joint's largest goal [A, or V under PWM]."""
+    """Set the constants of `memory`, a zero-filled record.
+
+    planned: the joint's largest goal [A, or V under PWM]. follow_share, follow_time: the settings of these names in
+    [safety].
+    """
     tick = abs(joint.joint.drive_unit(12.0))
     sigma = max(SIGMA_SHARE * planned, SIGMA_TICKS * tick)
     memory["per_square"] = 0.5 / sigma**2

@@ -128,7 +128,7 @@ class Jolts:
         return None if joint < 0 else (joint, float(self._joints["change"][joint]))
 
     def began(self, joint: int) -> float:
-        """Return the time of the sample before which a joint's latest jolt began [s]."""
+        """Return a time [s] before which a joint's latest jolt cannot have begun."""
         return float(self._joints["begun"][joint]) - len(self._former) * self._interval
 
     def usual(self, joint: int) -> float:

@@ -46,7 +46,9 @@ this many times, each time by a random amount from this range.
 """
 
 _INFLATIONS = (12.0, 6.0, 4.0, 2.0)
-"""Error inflation of each update; the reciprocals add up to 1, so that the data count once."""
+"""Factors by which successive updates multiply the variance of the measurement errors. Their reciprocals add up to 1,
+so that the data count once.
+"""
 _LONGEST_MOVE = 1.0  # largest change of a parameter per update, in e-folds or prior standard deviations
 _HOPELESS = 3.0  # multiple of the median misfit above which an arm is replaced
 _LEAST_SPREAD = 0.01  # relative model error, per doubling of the range of motion

@@ -70,7 +70,7 @@ class Paths:
     def of(cls, config: Config, thought: ChainTorque, reserve: Reserve = RESERVE, tell: Tell | None = None) -> "Paths":
         """Design the paths. Raises NoSafeTorque if no path is safe, ConfigError, or ArmFileError.
 
-        tell: called with the number of steps done and their total.
+        thought: assumed model of the arm. tell: called with the number of steps done and their total.
         """
         check_rest_pose(config)
         known, space = known_chain(config), Space.of(config)
@@ -116,7 +116,7 @@ class Paths:
         return max(float((_peaks(mine.path) / _peaks(its.path)).max()) for mine, its in pairs)
 
     def plan(self, config: Config, thought: ChainTorque, share: float) -> Plan:
-        """Plan both paths at this fraction of their amplitude."""
+        """Plan both paths at the fraction `share` of their amplitude. thought: assumed model of the arm."""
 
         def path(_: Config, role: str, __: int) -> Path:
             return self.designer.scaled(self.held_out if role == HELD_OUT else self.identify, share)

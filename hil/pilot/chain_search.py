@@ -112,7 +112,11 @@ class ChainSearch(SafeShares):
         )
 
     def step(self, name: str, folder: str, shares: tuple[float, ...]) -> Found:
-        """Play one step, compare it with the prediction, and update the belief."""
+        """Play one step, compare it with the prediction, and update the belief.
+
+        name: name of the step for messages. folder: name of its run folder. shares: fractions of the paths' amplitude
+        to try, in this order. Returns the one that was played, with its prediction.
+        """
         config = step_config(self.config)
         found = self.safe(config, shares, shares[0] if self.steps else np.inf)
         below = self.run.below(folder, config)

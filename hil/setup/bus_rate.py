@@ -137,10 +137,11 @@ def goal_register(joint: Joint) -> str:
 
 
 def goals_taken(bus: ServoBus) -> list[Joint]:
-    """The servos (as single-servo joints) that accept goals from a Sync Write. To be called only with torque off.
-    Raises DriverError.
+    """Return the servos (as single-servo joints) that accept goals from a Sync Write. Torque must be off. Raises
+    DriverError.
 
-    Each is sent a goal that differs from its present one. The goal is read back, then the previous one is restored.
+    Each servo is sent a goal that differs from its present one. The goal is read back, then the previous one is
+    restored.
     """
     before = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
     other = [goal - 1 if goal > 0 else goal + 1 for goal in before]

@@ -54,9 +54,10 @@ class Moved:
 
 
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
-    """The pose at these angles [rad].
+    """Return the pose of the arm at these joint angles [rad].
 
-    Whole turns, which a servo does not count while it is off, are removed if a joint's position limits reveal them.
+    An angle may be wrong by whole turns, since a servo does not count turns while it is off. They are removed where the
+    position limits show that there are any.
     """
     limits = [joint.position_limit for joint in config.joints]
     angles = tuple(within_limits(*each) for each in zip(angles, limits, strict=True))

@@ -392,9 +392,7 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     ticks = servo.read("Present Position")
     index = [joint.id in each.ids for each in config.joints].index(True)
     if joint.id != config.joints[index].id:
-        found = (
-            f"determined by the first servo (ID {config.joints[index].id}); only motion shows this servo's direction"
-        )
+        found = f"read from the first servo (ID {config.joints[index].id}); only motion shows this servo's direction"
         return Level.OK, "pose", found, ""
     angle = within_limits(joint.within_turn(ticks).angle(ticks), config.joints[index].position_limit)
     rest = config.arm.rest_pose[index]

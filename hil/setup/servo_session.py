@@ -2,8 +2,8 @@
 
 A session holds the port. A session inside another one for the same arm shares the port, so that the steps of a pilot
 write each EEPROM register only once. Each register is also restored only once, when the outermost block is left for
-whatever reason. If a killed program left saved settings behind, these count as the servos' own and are restored at the
-end (`killed_run`).
+whatever reason. If a killed program left saved settings behind, these are taken as the servos' original settings and
+restored at the end (`killed_run`).
 """
 
 import re
