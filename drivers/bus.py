@@ -267,8 +267,8 @@ class ServoBus(TorqueSwitch):
         return self._exchange
 
     def read_positions(self) -> tuple[float, ...]:
-        """Read each joint's angle [rad] outside the control cycle; for a joint with several servos, that of the first
-        one.
+        """Read each joint's angle [rad] outside the control cycle. If a joint has several servos, the first one is
+        read.
         """
         first = [self._of.index(index) for index in range(len(self.joints))]
         return tuple(

@@ -29,7 +29,7 @@ _DATA = 9
 """Index of the first data byte in a status packet."""
 
 NO_ERROR = "none"
-"""What `describe_error` returns if there is no error."""
+"""Result of `describe_error` if there is no error."""
 
 _BESIDE_DATA = 4
 """Bytes that LEN counts in addition to the data: INST, ERR, CRC."""

@@ -128,7 +128,8 @@ class ReadBack:
     def look(
         self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float, *, collided: bool = False
     ) -> Overruled | None:
-        """Compare the answers with what was written; return what only another master can have written.
+        """Compare the answers with the written values; return a value that only another master can have written, or
+        None.
 
         An answer with an error is ignored: a servo that refuses a read reveals nothing about its goal.
 

@@ -66,8 +66,8 @@ class TorqueOff:
     def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
         """The report after another program has switched torque on again.
 
-        on: joints whose servos still have torque on, however often it is cut. silent: those that have not answered
-        since.
+        on: joints whose servos still have torque on, however often it is cut. silent: joints whose
+        servos have not answered since.
         """
         why = "Another program had switched its torque on again, and it has not answered since."
         return replace(
@@ -183,7 +183,7 @@ def cut_torque(
 
 
 def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
-    """Send torque off to all servos in one packet; a failure is noticed when they are read back.
+    """Send torque off to all servos in one packet; a failure is detected when they are read back.
 
     The packet is a Sync Write to these servos only, since others on the bus may be in use. It is sent twice, since a
     packet may be lost.

@@ -1,4 +1,4 @@
-"""What may be wrong with recordings, as additional unknowns of a fit.
+"""Possible defects of recordings, described by additional unknowns of a fit.
 
 A defect either scales the measured angles or changes the parameters. In the latter case, each parameter changes by a
 fixed amount per unit of an unknown. The change may vary with time (friction that falls as it warms up, a load that is

@@ -30,7 +30,9 @@ VANISHED = 1e-3  # slope relative to its value below which a parameter has run i
 
 
 class Scatter:
-    """Computes S from a score (samples, causes) that is given piece by piece; lags: length of the windows [samples]."""
+    """Computes S from a score (samples, coordinates) that is given piece by piece; lags: length of the windows
+    [samples].
+    """
 
     def __init__(self, causes: int, lags: int) -> None:
         self._lags = lags
@@ -44,7 +46,7 @@ class Scatter:
         self._add_windows(extended)
 
     def sum(self) -> Array:
-        """Return S (causes, causes), including the last, incomplete windows."""
+        """Return S (coordinates, coordinates), including the last, incomplete windows."""
         self._add_windows(np.concatenate((self._before, np.zeros_like(self._before))))
         return self._total
 
@@ -115,7 +117,7 @@ def robust_covariance(
         samples: number of samples.
         count: number of coordinates to return.
         structured: part of the sum of squares that is due to model errors.
-        expected: what a prior has added to the normal equations (coordinates, coordinates); it keeps its weight where
+        expected: contribution of a prior to the normal equations (coordinates, coordinates); it keeps its weight where
             the data's variance is inflated.
     """
     if is_unpredictable(at, samples):
@@ -147,8 +149,8 @@ def is_unpredictable(at: Quadratic, samples: int) -> bool:
 def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: float, expected: Array) -> Array:
     """Return the factor (coordinates,) by which each coordinate's variance exceeds that under independent errors.
 
-    That is the ratio of the variances from the data alone, with and without what `robust_covariance` adds for
-    correlated errors and model errors. Arguments as in `robust_covariance`.
+    That is the ratio of the variances from the data alone, with and without the contributions that `robust_covariance`
+    adds for correlated errors and model errors. Arguments as in `robust_covariance`.
     """
     if is_unpredictable(at, samples):
         return np.ones(len(at.normal))

@@ -33,7 +33,7 @@ class Start:
     tracking: Array
     """Coordinates of the tracking fit, in which springs hold the simulated arm close to the measured motion."""
     free: Minimum
-    """Fit of the free motion; its iterations include those of all preceding fits."""
+    """Fit of the motion without springs; its iterations include those of all preceding fits."""
 
 
 @dataclass(frozen=True)

@@ -234,7 +234,7 @@ class _Errors:
     structured: float
     """Part of the sum of squares that is due to model errors."""
     expected: Array
-    """What the priors add to the normal equations (coordinates, coordinates)."""
+    """Contribution of the priors to the normal equations (coordinates, coordinates)."""
 
 
 def _errors(

@@ -35,9 +35,9 @@ class Trial:
     estimate: Estimate | None
     """Result of the fit; None if the fit or the prediction did not converge."""
     held_out: Array | None
-    """RMS error of the free prediction relative to the motion's RMS (joints,)."""
+    """RMS error of the open-loop prediction of the held-out motion, relative to that motion's RMS (joints,)."""
     score: float
-    """RMS error of the free prediction in units of the noise; without a held-out motion, the equivalent criterion."""
+    """RMS error of that prediction in units of the noise; without a held-out motion, the result of `criterion`."""
     seconds: float
     coarse: bool = False
     """Whether the fit was allowed to stop early if it left much of the motion unexplained."""

@@ -39,7 +39,7 @@ class Arriving(NamedTuple):
         return min(int((deadline - self.first) / self.byte_s) + 1, len(self.data))
 
     def after(self, count: int) -> "Arriving":
-        """Return what is left after the first `count` bytes."""
+        """Return the bytes that remain after the first `count`, with their arrival times."""
         return Arriving(self.data[count:], self.first + count * self.byte_s, self.byte_s)
 
 

@@ -50,7 +50,7 @@ class Motor(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ModelFacts:
-    """What distinguishes one model.
+    """Properties in which models differ.
 
     motor: its motor at the nominal voltage.
     differs: registers whose facts differ from those of the X series.

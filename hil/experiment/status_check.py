@@ -65,8 +65,8 @@ class StatusCheck:
 
     @property
     def is_in_doubt(self) -> bool:
-        """Whether one lost packet could explain what was wrong with the latest status, which should then be read again
-        at once.
+        """Whether a single lost packet could explain the fault in the latest status. The status should then be read
+        again at once.
         """
         return any(self._missed) or any(stale for *_, stale in self._clock)
 

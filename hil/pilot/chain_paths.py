@@ -28,7 +28,7 @@ _WAY_POSES = 40
 
 @dataclass(frozen=True)
 class Reserve:
-    """What a path leaves unused, to allow for errors of the assumed model.
+    """Margins that a path keeps from the limits and from obstacles, to allow for errors of the assumed model.
 
     position: fraction of a joint's range that stays free at each limit. speed, torque: fractions of the limits that
     the path may use. clearance: distance from obstacles in addition to the configured margin [m]; transitions from and
@@ -56,8 +56,8 @@ RESERVE = Reserve()
 class Paths:
     """The designed paths.
 
-    identify: optimised path. held_out: wide path around the same centre, with random phases. reserve: what both paths
-    leave unused.
+    identify: optimised path. held_out: wide path around the same centre, with random phases. reserve: margins
+    that both paths keep.
     """
 
     config: Config

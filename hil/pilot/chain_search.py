@@ -191,7 +191,7 @@ def identify_chain_in_steps(
     """Identify a spatial arm from its description, limits and rest pose. Returns a sentence about the torque state, and
     the result.
 
-    Raises whatever a run raises, and NoSafeTorque.
+    Raises the same errors as a run, and NoSafeTorque.
     """
     with StopRequest(), servo_session(config, run.path, say) as bus:
         if from_where_it_lies(config, bus.read_positions()) is not config and (moving := wait_for_rest(bus)):

@@ -102,7 +102,7 @@ class Search:
     def find(self) -> tuple[Config, Amplitude]:
         """Find the configuration and the amplitude of the full run.
 
-        Raises whatever a run raises, and ExperimentError if a joint does not move at its current limit.
+        Raises the same errors as a run, and ExperimentError if a joint does not move at its current limit.
         """
         self._pilot()
         return self._raise_to_limits()

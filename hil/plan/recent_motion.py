@@ -67,7 +67,7 @@ class RecentMotion:
             self._states.append(state)
 
     def until(self, state: State) -> "RecentMotion":
-        """What was known at the time of an earlier exchange."""
+        """Return the motion up to `state`, an earlier exchange."""
         then = copy(self)
         at = state.time_before_write
         then._states = deque((each for each in self._states if each.time_before_write <= at), self._states.maxlen)

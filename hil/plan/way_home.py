@@ -68,7 +68,7 @@ class WayHome:
         return np.column_stack((pose, self._stations[:, best::-1], self._rest))
 
     def path(self, pose: Array, velocity: Array) -> Path:
-        """The whole path, sampled at the stream's rate: braking from `velocity`, then home."""
+        """The whole path, sampled at the stream's rate: braking from `velocity`, then moving to the rest pose."""
         slowing = np.clip(np.abs(velocity).max() / BRAKING, SHORTEST_BRAKE_S, LONGEST_BRAKE_S)
         count = max(2, round(slowing * self._rate))
         time = np.arange(count) / self._rate

@@ -45,7 +45,7 @@ class Moved:
 
     joint: str
     asked: str
-    """What the user was asked to do with this joint."""
+    """Request that was shown to the user."""
     angles: tuple[float, ...]
     """Angles by which all joints moved [rad]."""
     well: bool

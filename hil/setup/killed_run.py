@@ -1,4 +1,4 @@
-"""Settings that a killed program left on the servos: what can be restored, and what another program has changed.
+"""Settings that a killed program left on the servos: some can be restored, others have been changed by another program.
 
 If a register holds neither the value that the killed program set nor the value before that, another program has changed
 it. It is not restored, since a person may have wanted the change, but it is reported together with its earlier value.
@@ -26,7 +26,7 @@ def left_behind(port: str, joint: Joint) -> Kept | None:
 
 @dataclass(frozen=True)
 class Left:
-    """What a killed program left on one servo.
+    """Settings that a killed program left on one servo.
 
     kept: the settings before that program. changed: the registers that another program has changed since then, each
     with its present value. wanted: the settings to restore; the changed registers keep their present values.
@@ -87,7 +87,7 @@ def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
 
 @dataclass(frozen=True)
 class Restored:
-    """What `recover` wrote, as text, and a sentence about what another program changed; "" if nothing."""
+    """The settings that `recover` wrote, and a sentence about changes by another program, both as text; "" if none."""
 
     written: list[str] = field(default_factory=list)
     others: str = ""

@@ -19,8 +19,8 @@ _VALUE, _LIMITS, _HEALTH = 7, 12, 14  # columns of a value, of a gauge's two lim
 
 @dataclass(frozen=True)
 class Layout:
-    """What fits into the terminal. gauge: width of a gauge in columns; gauges: how many of the two quantities, position
-    and goal, have a gauge.
+    """The parts of the display that fit into the terminal. gauge: width of a gauge in columns; gauges: how many of the
+    two quantities, position and goal, have a gauge.
     """
 
     gauge: int

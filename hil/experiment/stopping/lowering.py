@@ -32,14 +32,14 @@ from hil.plan.recent_motion import RecentMotion
 from hil.plan.way_home import PULL_PER_S, PULL_SHARE, WayHome
 
 LEAVES_RAD = 0.35
-"""Largest accepted tracking error: a joint with a larger one does not follow its path home."""
+"""Largest accepted tracking error [rad]: a joint with a larger one does not follow its path to the rest pose."""
 
 LYING_RAD = 0.06
 """An arm within this angle of its rest pose in every joint is already at rest."""
 
 RUNS_AWAY = 0.25
-"""Excess of a joint's velocity over that of the path home, relative to the velocity limit. A joint that exceeds this
-and still speeds up although its torque opposes the motion counts as not obeying its motor.
+"""Excess of a joint's velocity over the velocity of its path to the rest pose, relative to the velocity limit. A joint
+that exceeds this and still speeds up although its torque opposes the motion counts as not obeying its motor.
 """
 
 _GROWS_S = 0.015
@@ -57,7 +57,8 @@ def may_lower(config: Config, error: BaseException) -> bool:
 
 
 class Lowering:
-    """Computes the goals on the path home. Created before torque is switched on; call `begin` when a stop occurs.
+    """Computes the goals on the path to the rest pose. Created before torque is switched on; call `begin` when a stop
+    occurs.
 
     interval: time between two exchanges [s]; by default, that between two samples.
     """
@@ -162,7 +163,7 @@ class Lowering:
         return self._guard.clamp((torque / self._constants).tolist())
 
     def look(self, index: int, state: State, gap: float, *, between: bool = False) -> None:
-        """Process an exchange. Raises SafetyStop if the arm leaves its path home or a servo is faulty."""
+        """Process an exchange. Raises SafetyStop if the arm leaves its path to the rest pose or a servo is faulty."""
         self._guard.look(state, gap, between=between)
         away = np.abs(self._position[index] - np.array(state.position))
         if np.nanmax(away, initial=0.0) > LEAVES_RAD:
