@@ -315,7 +315,9 @@ class ServoBus(TorqueSwitch):
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """A joint that has missed many of the latest goals, and what was read back; None if there is none."""
+        """Index of a joint that has missed many of the latest goals, and a text with the value read back; None if there
+        is none.
+        """
         if (lost := self.prepared.lost) is None:
             return None
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"

@@ -84,7 +84,7 @@ def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
 
 
 def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, int]]:
-    """Restore the registers that differ from `settings`; return (old, new) for those that were written.
+    """Restore the registers that differ from `settings`; return their old and new values by name.
 
     Goals are restored as far as the servo's limits allow (`attainable`). Each register is read back. Raises
     WrongSetting if torque is on. Raises the errors of `Servo.write` only after all other registers have been tried.

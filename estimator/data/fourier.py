@@ -47,7 +47,7 @@ def noise_power(lines: Lines) -> Array:
 
 
 def white_noise(position: Array, valid: Mask | None = None) -> Array:
-    """Return the standard deviation of the white noise in one period of angles (joints, samples), per joint.
+    """Return the standard deviation (joints,) [rad] of the white noise in one period of angles (joints, samples) [rad].
 
     It is estimated from the upper quarter of the lines, far above the frequencies of any motion. A linear trend is
     removed first: if the arm drifts, the two ends of a period do not match, and the jump between them would spread over

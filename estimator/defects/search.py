@@ -170,7 +170,7 @@ class _Linear:
 
     @property
     def independent(self) -> float:
-        """Number of independent samples."""
+        """Number of samples, reduced according to the correlation of the residual."""
         return float(self.samples.sum()) / self.colour
 
     def score(self, altered: Altered, hypothesis: Hypothesis, tried: int) -> _Score:

@@ -158,7 +158,7 @@ class MomentumObserver:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Current parameter estimates by name."""
+        """Current parameter estimates by name [SI]."""
         return dict(zip(NAMES, self._memory[_THETA].tolist(), strict=True))
 
 

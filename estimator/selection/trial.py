@@ -70,7 +70,7 @@ class Choice:
 
     @property
     def gained(self) -> float:
-        """Ratio of the simplest model's error to the chosen one's."""
+        """Ratio of the simplest model's prediction error to the chosen model's."""
         return self.plainest.score / self.chosen.score
 
     @property
@@ -134,7 +134,10 @@ class Fitting:
 
 
 def criterion(estimate: Estimate, periods: Sequence[SettledPeriod]) -> float:
-    """Return exp(BIC / 2n) of the residual in units of the noise, comparable to a prediction error."""
+    """Return exp(BIC / 2n) of the residual in units of the noise, which is comparable to a prediction error.
+
+    BIC: Bayesian information criterion. n: number of samples, reduced according to the residual's correlation.
+    """
     noise = periods[0].noise
     size = np.nanmean((estimate.residual / noise[:, None]) ** 2)
     samples = sum(period.valid.sum() for period in periods) / estimate.correlation_time

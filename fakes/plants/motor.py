@@ -88,7 +88,7 @@ class Motor:
             drive.coulomb * dry * drive.stribeck_rise,
             1.0 / drive.stribeck_velocity,
         )
-        """Torque constant, offset, Coulomb level, Stribeck rise, 1 / Stribeck velocity."""
+        """Torque constant [N m/A], offset and Coulomb level [N m], Stribeck rise [1], 1 / Stribeck velocity [s/rad]."""
         self.viscous = drive.viscous * viscous
         self.plain = (*self.constants, self.viscous, self._lag)
         """`constants`, viscous friction [N m s/rad] and current lag [s]: all that matters while the drive is plain."""
@@ -151,7 +151,9 @@ class Motor:
         return end + (self.bristle_torque - end) * exp(-self.bristle_stiffness * abs(velocity) * step / self._level)
 
     def lag(self, step: float) -> tuple[float, float]:
-        """Return the remaining fraction of a current error at the end of a step, and its mean over the step."""
+        """Return the fraction of a current error that remains at the end of a step of `step` [s], and its mean over the
+        step.
+        """
         if self._lag and step != self._step:
             # Exact solution of a first-order lag under a constant command.
             self._step = step

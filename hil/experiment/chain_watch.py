@@ -150,8 +150,9 @@ def observed_parameters(arms: ChainArms) -> tuple[Array, Array]:
 def linear_parameters(arms: ChainArms) -> Array:
     """Base parameters, viscous and dry friction, and offsets of each arm (arms, base + 3 * joints).
 
-    They are divided by the torque scale, i.e. in units of the commanded torque. If the scales of the joints differ, a
-    base parameter that affects several joints is divided by the first one's scale.
+    They are in SI units, divided by the joint's ratio of actual to commanded torque, so that they refer to the
+    commanded torque. If the ratios of the joints differ, a base parameter that affects several joints is divided by the
+    first joint's ratio.
     """
     scale = arms.drive[:, 4]
     owner = np.array([int(name.rpartition("_")[2]) - 1 for name in arms.base.names])

@@ -284,7 +284,12 @@ class ModelWatch:
 
 
 def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
-    """Initial mean and covariance of the parameters of the momentum observer."""
+    """Return the initial mean, by name, and the covariance of the momentum observer's parameters, in the order of
+    NAMES.
+
+    largest: largest planned torque of each joint (joints,) [N m]. arms: prior knowledge of the arm; by default, from
+    the configuration.
+    """
     if arms is None and config.arm.link_lengths is None:
         return _hardly_known(config, largest)
     arms = prior_ensemble(config, ARMS) if arms is None else arms

@@ -24,7 +24,8 @@ _EMPTY = float("nan")
 
 TIMES = 10.0
 FLOOR_RAD = 0.05
-"""Deviation from the previous period that is always accepted, because stiction may end slightly earlier or later."""
+"""Deviation from the previous period that is always accepted [rad], because stiction may end slightly earlier or later.
+"""
 
 LASTING_S = 0.03
 UNJUDGED_S, _MOST_UNJUDGED = 0.2, 0.25

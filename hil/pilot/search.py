@@ -53,7 +53,7 @@ class Search:
     """Largest range of motion of each joint so far (joints,) [rad]."""
 
     springs: NDArray[np.bool_] | None = None
-    """Joints that a stabiliser held (joints,)."""
+    """Whether each joint was held in the last run with a stabiliser (joints,); None if there was none."""
     options: PilotOptions = DEFAULTS
     from_earlier: bool = False
     """Whether the belief comes from the result of an earlier run, and no run so far has contradicted it."""

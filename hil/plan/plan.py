@@ -29,8 +29,8 @@ class Segment:
 
     @property
     def ramp_in(self) -> NDArray[np.float64]:
-        """Goal currents before the first period: the end of a period, faded in, so that the first period starts at full
-        amplitude.
+        """Goal currents before the first period (samples, joints) [A]: the end of a period, faded in, so that the first
+        period starts at full amplitude.
         """
         count = self.ramp_samples
         fade = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
@@ -38,7 +38,7 @@ class Segment:
 
     @property
     def ramp_out(self) -> NDArray[np.float64]:
-        """Goal currents after the last period: the beginning of a period, faded out."""
+        """Goal currents after the last period (samples, joints) [A]: the beginning of a period, faded out."""
         count = self.ramp_samples
         fade = 0.5 + 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
         index = np.arange(count) % len(self.period_current)

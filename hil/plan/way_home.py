@@ -56,7 +56,7 @@ class WayHome:
         return self._space
 
     def poses(self, pose: Array) -> Array:
-        """Corners (joints, corners) of the path from a pose (joints,) to the rest pose."""
+        """Corners (joints, corners) [rad] of the path from a pose (joints,) [rad] to the rest pose."""
         least = min(0.0, float(self._space.room(pose[:, None], on_the_way=True)[0])) - _ALLOWED_M
         best, best_room = 0, -np.inf
         for station in range(self._stations.shape[1]):

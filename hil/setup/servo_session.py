@@ -54,7 +54,7 @@ SETTINGS_NAME = "servo_settings.json"
 
 
 _MOST_CUTS = 5
-"""How often torque is cut again at the end if another program switches it on."""
+"""Largest number of times that torque is cut again at the end if another program switches it on."""
 
 REBOOT_S = 0.6
 """A servo that does not answer at the end may be booting; it is tried again after this time [s]."""

@@ -35,7 +35,7 @@ LEAVES_RAD = 0.35
 """Largest accepted tracking error [rad]: a joint with a larger one does not follow its path to the rest pose."""
 
 LYING_RAD = 0.06
-"""An arm within this angle of its rest pose in every joint is already at rest."""
+"""If every joint is within this angle of the rest pose [rad], the arm counts as lying in it."""
 
 RUNS_AWAY = 0.25
 """Excess of a joint's velocity over the velocity of its path to the rest pose, relative to the velocity limit. A joint
