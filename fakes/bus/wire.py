@@ -112,8 +112,7 @@ class Wire:
         self.reply_by = max(self.reply_by, until)
 
     def take(self, size: int, deadline: float, now: float) -> tuple[bytes, float]:
-        """Return up to `size` bytes that have arrived by `deadline`, and when the last one arrived [s], at least `now`.
-        """
+        """Return up to `size` bytes that have arrived by `deadline`, and when the last one arrived [s], at least `now`."""
         arriving = self._arriving
         if arriving and len(arriving[0].data) == size:  # the usual case: the reply to one write, in one read
             segment = arriving[0]
