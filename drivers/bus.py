@@ -276,7 +276,7 @@ class ServoBus(TorqueSwitch):
         )
 
     def read_drives(self, joint: Joint) -> tuple[float, ...]:
-        """Read the joint angle [rad] according to each servo of a joint, the first servo's first; see
+        """Read the joint angle [rad] according to each servo of a joint, in the order of the servos; see
         `read_positions`.
         """
         return tuple(

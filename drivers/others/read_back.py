@@ -53,7 +53,7 @@ goal in a hundred is lost, missing three of six is rarer than missing two consec
 
 _FADES = 0.98
 _IN_DOUBT_S = 0.3
-"""Time after a foreign value was read, during which others are expected [s]."""
+"""Time after a foreign value was read during which more such values are expected [s]."""
 
 
 _Sightings = deque[tuple[float, int]]

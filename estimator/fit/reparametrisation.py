@@ -197,7 +197,7 @@ class Lever:
 
     coupling: int
     gravity: int
-    """Indices of coupling and gravity_2 among the parameters."""
+    """Index of gravity_2 among the parameters; `coupling`: index of coupling."""
     ratio: float
     """`Model.lever` [s^2]."""
     std: float

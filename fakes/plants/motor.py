@@ -1,4 +1,5 @@
-"""One joint's drive during a plant's time step: current lag, torque, friction, stops. Plain floats, called every step.
+"""One joint's drive during a plant's time step: current lag, torque, friction, stops. It runs in every step, so it uses
+plain floats.
 
 Presliding friction follows Canudas de Wit, Olsson, Astrom and Lischinsky (IEEE Transactions on Automatic Control 40
 (1995) 419): bristles deflect with the joint, and slip more the further they are deflected,

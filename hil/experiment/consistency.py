@@ -67,8 +67,8 @@ _LAG_SHARE = 0.25
 """Allowance for a lag that is not a pure delay, as a fraction of the lag times the range of velocities."""
 
 STEP_RAD, STEP_TIMES = 0.0077, 7.0
-"""Smallest difference that counts as a jump of the position [rad], five ticks, and its smallest ratio to the RMS of the
-usual differences.
+"""Smallest difference between the change of position and the integral of velocity that counts as a jump [rad] (five
+ticks), and its smallest ratio to the RMS of ordinary differences.
 """
 
 STEPS, STEPS_S = 4, 0.5
@@ -124,7 +124,8 @@ _SAME = np.dtype(
 """Motion since the velocity last changed.
 
 seconds, moved, unknown: time, change of position and its uncertainty [s, rad, rad]. since: time since values were last
-stored [s]. count: how often they were. d1, t1 to d3, t3: the latest three stored values of `moved` and `seconds`.
+stored [s]. count: number of values stored so far. d1, t1 to d3, t3: the latest three stored values of `moved` and
+`seconds`.
 """
 
 MEMORY = np.dtype(

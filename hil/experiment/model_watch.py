@@ -55,7 +55,7 @@ _FLAT = 0.3
 """Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the units of `_INERTIA`."""
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
-"""Time for which a joint must appear stationary under a torque that is held over several exchanges [s]."""
+"""If a torque is held over several exchanges, a joint must appear stationary for this time before it is judged [s]."""
 
 _LAG_S = 0.012
 """Time constant with which a torque step appears in the velocity [s]: current loop and velocity filter."""

@@ -50,10 +50,10 @@ _SUMS = np.dtype(
 )
 """Running sums of one joint.
 
-lowest, highest: range of its positions [rad]. first: first one compared, which is subtracted from the others to avoid
-cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of squares
-and number of changes from the period before. early_squared, early_pairs: the same for the first half of the period.
-sure_squared, sure_pairs: the same for the second half without its end.
+lowest, highest: range of its positions [rad]. first: first position compared, which is subtracted from the others to
+avoid cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of
+squares and number of changes from the period before. early_squared, early_pairs: the same for the first half of the
+period. sure_squared, sure_pairs: the same for the second half without its end.
 """
 
 

@@ -197,8 +197,8 @@ def prior_belief(config: Config, arms: int, seed: int = 0) -> Belief:
 def earlier_belief(config: Config, result: Result, arms: int, seed: int = 0) -> Belief:
     """Draw the belief from the result of an earlier run on the same arm. Raises ConfigError.
 
-    Terms that the result's model lacks are absent. Friction is drawn with a wider spread than its error bars, since it
-    varies with temperature.
+    Terms that the result's model lacks are left out. Friction is drawn with a wider spread than its error bars, since
+    it varies with temperature.
     """
     prior = prior_belief(config, arms, seed)
     random = np.random.default_rng((seed, 10))

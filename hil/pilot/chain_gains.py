@@ -2,8 +2,8 @@
 
 Both act on a state that is `DELAY_SAMPLES` old. The damper must be weak enough for the lightest joint not to oscillate.
 A delayed spring drives the motion like a negative damper, so at a low rate damping limits the stiffness. The stiffness
-is reduced no further than this requires, since a softer spring lets friction and unknown weights carry the arm away
-from its path.
+is reduced no further than this requires, since with a softer spring, friction and unknown gravity torques cause
+larger deviations from the path.
 """
 
 from dataclasses import dataclass

@@ -38,7 +38,7 @@ RAISED = 1.3
 """Another step precedes the full run if the amplitude that is safe now is at least this multiple of the last run's."""
 
 MOST_RAISE = 2.5
-"""Largest ratio of a step's share of the amplitude to that of the previous run."""
+"""Largest ratio of the amplitudes of successive runs."""
 
 SILENT_S = 30.0
 """Longest time without a message while searching for a safe motion [s]."""

@@ -27,7 +27,7 @@ from hil.plan.plan import Plan
 Array = NDArray[np.float64]
 
 SEARCH_ARMS, ARMS = 24, 72
-"""Number of arms simulated while searching for a share, and to confirm the one found."""
+"""Numbers of arms that are simulated in the search for a safe share of the amplitude, and for its confirmation."""
 
 PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
 SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4, 0.28, 0.18)

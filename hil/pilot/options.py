@@ -77,7 +77,9 @@ class PilotOptions:
     """Torque that is always allowed for an arm that falls over, as a fraction of what the current limit allows.
     """
     start_inside: float = 0.95
-    """An arm that a stopped run left beyond its limits is assumed to start within this fraction of them."""
+    """An arm that a stopped run left beyond its position limits is assumed to start within this fraction of its range,
+    measured from the middle.
+    """
 
     max_full_runs: int = 6
     """Maximum number of full runs if one exceeds a limit or does not settle; each has less torque than the last."""

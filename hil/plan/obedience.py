@@ -56,7 +56,7 @@ class _Test:
 
 
 class Obedience:
-    """Tests joints that move as if their motors were reversed. joints: their number."""
+    """Tests joints that move as if their motors were reversed. joints: number of joints of the arm."""
 
     def __init__(self, joints: int) -> None:
         self._tests: list[_Test | None] = [None] * joints

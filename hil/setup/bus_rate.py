@@ -38,8 +38,8 @@ choice.
 class ExchangeMode:
     """Measured timing of one exchange mode.
 
-    median_s, longest_s: round trips [s]. usual_s: time within which 90 % of the exchanges with the slowest kind of read
-    complete [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
+    median_s, longest_s: round trips [s]. usual_s: time that 90 % of the exchanges with the slowest kind of read do
+    not exceed [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
     """
 
     one_write: bool

@@ -84,7 +84,7 @@ def guided(
 def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Array) -> Moved:
     """Compare a motion `change` (joints,) [rad] with the requested one.
 
-    drives: motion of the requested joint according to each of its servos [rad], the first servo's first.
+    drives: motion of the requested joint according to each of its servos [rad], in the order of the servos.
     """
     joint = config.joints[asked_for]
     most = int(np.argmax(np.abs(change)))

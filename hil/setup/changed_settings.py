@@ -37,7 +37,7 @@ _MOVED = frozenset(
         Cause.EARLY_MOTION,
     }
 )
-"""Causes of a stop that a change of the other settings can explain."""
+"""Causes of a stop that a change of settings other than Return Delay Time can explain."""
 
 EXPLAINED = _MOVED | _LATE
 

@@ -62,14 +62,15 @@ class Left:
         )
 
     def is_refused(self, needed: Mapping[str, int]) -> bool:
-        """Whether another program has lowered the Current Limit below what a run with these values needs, so that it
-        cannot start.
+        """Whether a run cannot start because another program has lowered the Current Limit too far.
+
+        needed: the registers that the run sets, with their values.
         """
         return self.changed.get(_CURRENT_LIMIT, 0) < needed.get(_CURRENT_LIMIT, 0) and _CURRENT_LIMIT in self.changed
 
 
 def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
-    """Compare the settings before a killed program with the present ones. Raises the same errors as `Servo.read`.
+    """Compare the settings from before a killed program with the present ones. Raises the same errors as `Servo.read`.
 
     If another program changed the Operating Mode, the present goals and gains belong to the new mode and are left as
     they are.

@@ -16,7 +16,8 @@ from hil.rest_pose_hint import within_limits
 from hil.setup.servo_session import has_moved
 
 AFTER_A_RUN = 2.0
-"""Factor applied to the tolerance after a run: friction may hold the arm farther from its rest pose than before."""
+"""Factor applied to arm.rest_tolerance after a run: friction may hold the arm farther from its rest pose than before.
+"""
 
 NEAR_RAD = 0.02
 """Deviation up to which arm.rest_pose is used although the arm lies elsewhere [rad]."""

@@ -67,7 +67,7 @@ _TELLS_OF_TORQUE = re.compile("torque (off )?is", re.IGNORECASE)
 """Matches every sentence that says whether torque is off (see `TorqueOff`)."""
 
 COUNT_DOWN_S = 5.0
-"""Time between the warning that an arm will move again after a stopped run and switching torque on [s].
+"""After a stopped run: time from the warning that the arm will move again until torque is switched on [s].
 """
 
 
@@ -91,23 +91,26 @@ class ServoSession:
     lay: Lies = field(default_factory=dict)
     """Positions of the servos at the beginning."""
     _wanted: dict[Joint, dict[str, int]] = field(default_factory=dict)
-    """Settings to restore: those saved, except for what another program changed since an earlier run was killed."""
+    """Settings to restore: the saved ones, except for registers that another program has changed since a run was
+    killed.
+    """
     _left: dict[Joint, Kept] = field(default_factory=dict)
     """Saved settings of the servos that an earlier run did not restore."""
     _refused: set[Joint] = field(default_factory=set)
-    """Servos whose Current Limit another program has left too low for this run: its former value stays on file."""
+    """Servos whose Current Limit another program has left too low for this run; the file keeps its former value."""
     _is_ours: bool = False
     """Whether the servos are the arm's and no other program holds them, so that they may be written to."""
     _cut: dict[Joint, dict[str, int]] = field(default_factory=dict)
-    """Goals that could only be restored as far as a lowered limit allows, with their values."""
+    """Goals that could only be restored as far as a lowered limit allows, with the restored values."""
     _on_again: dict[Joint, int] = field(default_factory=dict)
-    """Servos whose torque another program has switched on since it was cut, with how often it was cut again."""
+    """Servos whose torque another program has switched on since it was cut, and the number of times it was cut again.
+    """
     _torque: dict[Joint, bool | None] = field(default_factory=dict)
     """Whether each servo's torque was on at the latest reading; None if unknown (`ServoBus.torque_now`)."""
     shared: int = 0
-    """Number of inner blocks that have used the bus."""
+    """Number of inner sessions that have used the bus."""
     was_stopped: bool = False
-    """Whether the last inner block ended with an exception: the arm went limp earlier than planned."""
+    """Whether the last inner session ended with an exception: the arm went limp earlier than planned."""
 
     def begin(self, config: Config, folder: Path | None) -> None:
         """Check that the servos answer and that no other program holds the arm, then save their settings.

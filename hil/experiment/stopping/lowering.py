@@ -1,8 +1,8 @@
 """Stop of an arm that cannot hang freely: brake, then lower it to its rest pose while its servos accept commands.
 
 The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the path
-home; if a joint stays off the path, an additional torque towards the path grows. Lowering is monitored like the
-experiment. It is aborted and torque is cut if a servo loses its torque, if a current does not follow its goal, if a
+to the rest pose; if a joint stays off the path, an additional torque towards the path grows. Lowering is monitored like
+the experiment. It is aborted and torque is cut if a servo loses its torque, if a current does not follow its goal, if a
 joint leaves the path, or if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities
 that agree with the positions.
 

@@ -1,4 +1,4 @@
-"""How often a lowered arm is commanded, and how long its replies are awaited: as slowly as late replies require.
+"""How often a lowered arm is commanded, and how long its replies are awaited; both are adapted to late replies.
 
 Servos hold their latest goal, so an arm can be lowered with fewer exchanges than the experiment needs. If replies come
 too late for one exchange per sample, only every second or third sample is exchanged from then on, until the end.
