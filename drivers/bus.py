@@ -29,7 +29,7 @@ from hil.drivers.torque.switch import TorqueSwitch
 __all__ = ["CHECK_S", "BusConfig", "ServoBus"]
 
 _PROBES = 3
-"""Unanswered Fast Sync Reads after which Sync Read is used instead."""
+"""Number of unanswered Fast Sync Reads after which Sync Read is used instead."""
 
 
 @dataclass(frozen=True)
@@ -329,14 +329,15 @@ class ServoBus(TorqueSwitch):
 
     @property
     def heard_instead(self) -> str:
-        """What was received in the last 0.1 s instead of complete and timely replies, and what to do about it; "" if
-        nothing was.
+        """Message about what was received in the last 0.1 s instead of complete and timely replies, with advice; "" if
+        nothing was received.
         """
         return self.prepared.heard.advice(self.port.clock.now(), self.port.url)
 
     @property
     def commanded_by_another(self) -> str:
-        """Which servo held a value that this program did not write when goals were last read back; "" if none did.
+        """Sentence about a servo that held a value not written by this program when goals were last read back; "" if
+        none.
 
         One such value does not prove another master: a servo that misses writes holds an older goal.
         """

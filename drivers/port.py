@@ -34,7 +34,7 @@ _MOST_OVERHEARD = 4096
 
 _LOOKS = 100
 """Number of replies in a row, each complete and none too early, after which `DescriptorPort.ask` no longer looks for
-pending input in advance: on such a line, pending input is noticed because it arrives too early.
+pending input in advance: on such a line, pending input is detected because it arrives too early.
 """
 
 _LOOKS_AFTER_LOSS = 2 * _LOOKS

@@ -19,7 +19,7 @@ from hil.drivers.sdk_port import ResyncingPacketHandler, SdkPort
 _T = TypeVar("_T")
 
 _ATTEMPTS = 3
-"""Attempts at a set-up exchange before a corrupted or missing reply is reported."""
+"""Number of attempts at a set-up exchange before a corrupted or missing reply is reported."""
 
 
 _LATE_S = 0.06

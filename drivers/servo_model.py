@@ -1,7 +1,7 @@
 """The meaning of each model's ticks: facts that the SDK's control tables leave out.
 
 Sources: ROBOTIS e-Manual, page of each model (current unit, resolution, Operating Mode, stall figures). None of the
-torque constants below was measured by us.
+torque constants below was measured in this project.
 """
 
 import math

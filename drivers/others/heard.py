@@ -1,4 +1,4 @@
-"""Unexpected bytes on the wire, in addition to the requested replies or instead of them, and what to do about them."""
+"""Unexpected bytes on the wire, in addition to the requested replies or instead of them, and advice for the user."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -36,8 +36,8 @@ class Heard:
         self._expected: frozenset[tuple[int, int]] = frozenset()
         self.expect(reads)
         self.damaged_at = self.late_at = -math.inf
-        """Times of the latest incomplete or damaged replies and of the latest unexpected one [s on the port's
-        clock].
+        """Times at which incomplete or damaged replies last arrived, and at which an unexpected reply last arrived [s
+        on the port's clock].
         """
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
@@ -93,8 +93,8 @@ class Heard:
             self._was_late(now)
 
     def advice(self, now: float, url: str) -> str:
-        """What was received in the last 0.1 s instead of complete and timely replies, and what to do about it; "" if
-        nothing was.
+        """Return a message about what was received in the last 0.1 s instead of complete and timely replies, with
+        advice; "" if nothing was received.
         """
         since = now - _RECENT_S
         if self.late_at > since:

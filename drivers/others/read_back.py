@@ -91,7 +91,9 @@ class ReadBack:
         kind = FastSyncRead if fast else SyncRead
         self.reads: tuple[GroupRead, GroupRead] = kind(ids, goal), kind(ids, mode)
         self.longest = 0.0
-        """Duration of the longest recent read-back, without its wire time [s]; decays from one to the next."""
+        """Duration of the longest recent read-back, without its wire time [s]; it decays from one read-back to the
+        next.
+        """
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
         self._modes = tuple(map(tuple, modes))
         self._settings = one_each(mode, len(ids))[0].registers[-len(self._modes[0]) :]

@@ -29,13 +29,13 @@ from hil.drivers.servo_model import WATCHDOG_UNIT
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _INTERRUPTS_BORNE = 5
-"""Attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
+"""Number of attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
 """Largest time by which a watchdog may act later than its timeout [s], since it counts in steps of 20 ms."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
-"""Further torque-off packets and the time between them [s], since one that collides with a reply is lost."""
+"""Number of further torque-off packets and the time between them [s]: a packet that collides with a reply is lost."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ class _Score:
 def probable_defect(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool) -> Defect | None:
     """Return the most probable defect, if one is significant and large enough to matter.
 
-    estimate: of a model without terms that could imitate a defect. gravity: whether gravity acts on the arm.
+    estimate: fit of a model without terms that could imitate a defect. gravity: whether gravity acts on the arm.
     """
     altered = Altered(recordings, estimate)
     if not FEWEST_SEGMENTS <= altered.segments <= MOST_SEGMENTS:
@@ -174,7 +174,7 @@ class _Linear:
         return float(self.samples.sum()) / self.colour
 
     def score(self, altered: Altered, hypothesis: Hypothesis, tried: int) -> _Score:
-        """Return the score test of a hypothesis, one of `tried`."""
+        """Return the score test of a hypothesis; tried: number of hypotheses that are tested."""
         base = np.eye(self.gradient.shape[1])[:, self.fitted]
         added = _added(hypothesis, altered, len(base))
         before = self._fall(base, None, hypothesis)

@@ -379,7 +379,7 @@ class FakeBus:
 
     @property
     def servos_refuse(self) -> bool:
-        """Whether an active fault makes servos refuse commands."""
+        """Whether an active fault makes the servos refuse commands."""
         return bool(self.faults.on_answers)
 
     def fault_error(self, servo: EmulatedServo, now: float) -> int:

@@ -100,10 +100,12 @@ class Motor:
         return not (self._shaped or self._width or self.bristle_stiffness or self.jammed or self.held_at is not None)
 
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
-        """Return the effect of the drive during one step, given angle and velocity at the middle of the step.
+        """Return the effect of the drive during a step of `step` [s], given angle and velocity at the middle of the
+        step.
 
-        Returns the mean torque without stiction [N m], the level of the dry friction that can hold the joint [N m], the
-        slope of the smooth friction at this velocity [N m s/rad], and the current at the end of the step [A].
+        command: commanded current [A]. Returns the mean torque without stiction [N m], the level of the dry friction
+        that can hold the joint [N m], the slope of the smooth friction at this velocity [N m s/rad], and the current at
+        the end of the step [A].
         """
         torque_constant, offset, level, rise, per_velocity = self.constants
         left, mean_left = self.lag(step)

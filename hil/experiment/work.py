@@ -22,7 +22,7 @@ Because of delays, even a healthy motor takes some work out of the arm: up to 0.
 """
 
 _OF_OTHERS = 0.5
-"""Share of the work put in by the other joints' motors that may come out at this joint."""
+"""Fraction of the work done by the other joints' motors that this joint's motor may take out of the arm."""
 
 MEMORY = np.dtype([("scale", "f8"), ("least", "f8"), ("done", "f8"), ("held", "f8")])
 """Constants and state of the check of one joint.

@@ -1,4 +1,4 @@
-"""How stiff and how damped a joint may be held at a sample rate, without oscillating."""
+"""Largest stiffness and damping with which a joint can be held at a sample rate without oscillating."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -24,8 +24,8 @@ LONGEST_TEST_S = 0.06
 
 TURNED, PUSHED = 1.1, 0.7
 """By how much the unexplained torque must fall, relative to the joint's own torque, when its goal is removed: 2 for a
-reversed motor, less right after the reversal, 1 for one without torque, 0 for a push. Between the two limits, the joint
-is tested again.
+reversed motor, less right after the reversal, 1 for a motor without torque, 0 for a push. Between the two limits, the
+joint is tested again.
 """
 
 MOVES_RAD_S = 0.1

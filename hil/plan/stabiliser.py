@@ -120,7 +120,7 @@ def feedback_of(config: Config) -> Feedback:
 
 
 def stabiliser_share(config: Config, samples: NDArray[np.void]) -> StabiliserShare:
-    """The stabiliser's share of the torque in consecutive rows of one multisine (hil.runs.recording)."""
+    """The stabiliser's share of the torque in consecutive samples of one multisine, rows of a recording."""
     torque = feedback_torque(config, samples)
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     commanded = samples["goal_current"][1:] * constants
