@@ -80,7 +80,7 @@ class Linearised:
 
     @cached_property
     def expected(self) -> Array:
-        """Normal equations of the priors of all unknowns (unknowns, unknowns)."""
+        """Contribution of the priors of all unknowns to the normal equations (unknowns, unknowns)."""
         expected = np.zeros_like(self.normal)
         count = len(self.names)
         expected[:count, :count] = np.diag(self.precision)
