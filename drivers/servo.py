@@ -165,7 +165,7 @@ class Servo:
         if result == COMM_RX_TIMEOUT:
             raise NoReply(
                 f"{self.title} does not answer at {self.port.baud} baud on {self.port.url} ({what}). Check its supply "
-                "and its cable; `hil scan` finds it at another ID or baud rate."
+                "and its cable; `hil scan` shows whether it has another ID or baud rate."
             )
         if result != COMM_SUCCESS:
             text = self._sdk.getTxRxResult(result).removeprefix("[TxRxResult] ").rstrip("!. ").lower()

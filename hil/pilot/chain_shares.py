@@ -143,8 +143,8 @@ class SafeShares:
         if not self.is_exhausted:
             return ""
         return (
-            f" The search ended early, after {self.simulated / 3600.0:.0f} h of simulated motion: a different "
-            "experiment.seed starts from other paths."
+            f" The search ended early, after {self.simulated / 3600.0:.0f} h of simulated motion: try a different "
+            "experiment.seed, which gives other paths."
         )
 
     def _helped_by_rate(self, config: Config, shares: tuple[float, ...]) -> str:
@@ -292,8 +292,8 @@ def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
 def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
     """Return the changes by which a user may make a path safe that was rejected as `unsafe`."""
     if not foreseen.is_clear:
-        helps = "A rest_pose farther from obstacles, or more room in [clearance] (floor, boxes, margin)"
-        return f"{helps}, if the arm allows it, helps. {_better_known(config)}"
+        helps = "A rest_pose farther from obstacles, or less restrictive [clearance] settings (floor, boxes, margin)"
+        return f"{helps}, if the arm allows it, can help. {_better_known(config)}"
     return limit_remedy(config, foreseen.peaks, stiffness)
 
 

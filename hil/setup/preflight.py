@@ -175,7 +175,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
     try:
         number = servo.ping()
     except NoReply:
-        fix = f"Check supply and cable. `hil scan {config.port.url}` finds it at another ID or baud rate."
+        fix = f"Check supply and cable. `hil scan {config.port.url}` shows whether it has another ID or baud rate."
         yield Finding(Level.STOP, where, "answers", f"nothing at {config.port.baud} baud", fix)
         return
     except DriverError as error:
@@ -318,7 +318,8 @@ def _baud(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo
     value = servo.read("Baud Rate")
     found = str(BAUD_RATES[value]) if value < len(BAUD_RATES) else f"unknown value {value}"
     fix = (
-        f"Slow. Type: hil setup {_port(config)} --id {joint_config.id} --new-baud 1000000; then set port.baud = 1000000"
+        f"This baud rate is slow. Type: hil setup {_port(config)} --id {joint_config.id} --new-baud 1000000; then set "
+        f"port.baud = 1000000"
     )
     return _graded(config.port.baud >= 1_000_000, "baud", found, fix, Level.WARNING)
 
