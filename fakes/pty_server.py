@@ -49,7 +49,7 @@ class LinkError(OSError):
 
 
 class ServerClock:
-    """The machine's monotonic clock minus the time lost. Only the server itself waits on it."""
+    """The machine's monotonic clock minus the time that was not simulated. Only the server itself waits on it."""
 
     def __init__(self) -> None:
         self.lost_s = 0.0

@@ -40,7 +40,7 @@ class Scatter:
         self._total = np.zeros((causes, causes))
 
     def add(self, score: Array) -> None:
-        """Add the next samples."""
+        """Add the score of the next samples (samples, coordinates)."""
         extended = np.concatenate((self._before, score))
         self._before = extended[extended.shape[0] - (self._lags - 1) :]
         self._add_windows(extended)

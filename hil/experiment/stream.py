@@ -237,7 +237,7 @@ class Stream:
             differences.append(difference)
             if difference <= self._plan.settle_within:
                 self._note(
-                    f"{segment.role}: period {period} has settled; it differs from the previous one by {difference:.2%}"
+                    f"{segment.role}: period {period} has settled; it differs from the one before by {difference:.2%}"
                 )
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)
