@@ -261,7 +261,7 @@ class ServoBus(TorqueSwitch):
 
     @property
     def prepared(self) -> Exchange:
-        """The prepared exchange; raises RuntimeError before `prepare`."""
+        """The prepared exchange; raises RuntimeError if `prepare` has not been called."""
         if self._exchange is None:
             raise RuntimeError("ServoBus.prepare has not been called")
         return self._exchange

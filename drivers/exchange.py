@@ -191,8 +191,8 @@ class Exchange:
     def add_read_back(
         self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[Sequence[int]]
     ) -> None:
-        """Prepare `overruled` (see `ReadBack`). goal: spans that end with the goal. mode: spans that end with the
-        settings; `modes` are their values.
+        """Prepare the read-backs that `overruled` makes (see `ReadBack`). goal: spans that end with the goal. mode:
+        spans that end with the settings; `modes` are their values.
         """
         back = self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
         self._wire_s |= {read: self._port.wire_time(self._bytes(read)) for read in back.reads}

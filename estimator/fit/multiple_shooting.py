@@ -46,7 +46,7 @@ class ShootingEstimate:
 
     model: Model
     names: tuple[str, ...]
-    """`model.names`."""
+    """Parameter names, as in `Model.names`."""
     units: tuple[str, ...]
     value: Array
     """Values (parameters,) [SI]."""

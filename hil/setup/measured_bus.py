@@ -1,4 +1,4 @@
-"""The sample rate of a new arm's file, measured on its bus with torque off."""
+"""Sample rate for the file of a new arm, measured on its bus with torque off."""
 
 from pathlib import Path
 

@@ -15,7 +15,7 @@ STEP_RAD = 0.04
 """Smallest step [rad]; smaller ones are left to the feedback."""
 
 BENDS_RAD_S2 = 200.0
-"""Acceleration that no joint of a lowered arm exceeds [rad/s^2]; it makes predictions uncertain."""
+"""Largest acceleration assumed for a joint of a lowered arm [rad/s^2]; it determines the uncertainty of predictions."""
 
 MOST_STEPS = 6
 """Largest number of steps of one joint that are corrected; a single false reading causes two."""
