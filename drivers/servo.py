@@ -32,7 +32,7 @@ NO_ERROR = "none"
 """Result of `describe_error` if there is no error."""
 
 _BESIDE_DATA = 4
-"""Bytes that LEN counts in addition to the data: INST, ERR, CRC."""
+"""Number of bytes that LEN counts in addition to the data: INST, ERR, CRC."""
 
 
 class Servo:

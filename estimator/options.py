@@ -115,8 +115,8 @@ class LikelihoodOptions:
     """Tolerance of the fit of the initial state alone."""
 
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=1e-4)
-    """A width at its lower bound of 1e-4 rad/s cannot be distinguished from stiction; one of 3e-4 could be, by half a
-    standard error.
+    """A width at its lower bound of 1e-4 rad/s cannot be distinguished from stiction; a width of 3e-4 rad/s differs
+    from it by half a standard error.
     """
     minimiser: MinimiserOptions = MinimiserOptions()
     integration: IntegrationOptions = IntegrationOptions()

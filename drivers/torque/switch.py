@@ -168,7 +168,7 @@ class TorqueSwitch:
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
 
     def has_torque(self) -> bool:
-        """Read whether every servo has its torque, outside the control cycle; False if one does not answer."""
+        """Read whether torque is on at every servo, outside the control cycle; False if one does not answer."""
         return all(is_torque_on(servo) for servo in self._servos.values())
 
     def cut_foreign_torque(self, on: Collection[Joint]) -> None:

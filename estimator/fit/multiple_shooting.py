@@ -49,7 +49,7 @@ class ShootingEstimate:
     """Parameter names, as in `Model.names`."""
     units: tuple[str, ...]
     value: Array
-    """Values (parameters,) [SI]."""
+    """Parameter values (parameters,) [SI]."""
     covariance: Array
     """Covariance (parameters, parameters), robust to model errors: see `Segmented.covariance`."""
     zeros: Array
@@ -71,7 +71,7 @@ class ShootingEstimate:
 
     @property
     def std(self) -> Array:
-        """Standard errors (parameters,)."""
+        """Standard errors of the parameters (parameters,) [SI]."""
         std: Array = np.sqrt(np.diag(self.covariance))
         return std
 
