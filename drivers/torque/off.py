@@ -66,8 +66,8 @@ class TorqueOff:
     def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
         """The report after another program has switched torque on again.
 
-        on: joints whose servos still have torque on, however often it is cut. silent: joints whose
-        servos have not answered since.
+        on: joints whose servos still have torque on, however often it is cut. silent: joints whose servos have not
+        answered since.
         """
         why = "Another program had switched its torque on again, and it has not answered since."
         return replace(

@@ -63,10 +63,8 @@ def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta:
     """Process a sample; return the distance of its residual torque from the most distant one since the joint came to
     rest.
 
-    The residual torque is `torque - row theta`. The distance is in N m.
-
-    It is positive if the smallest residual is the most distant one, negative if the largest is, and 0 while the joint
-    moves.
+    The residual torque is `torque - row theta`. The distance [N m] is positive if the smallest residual is the most
+    distant one, negative if the largest is, and 0 while the joint moves.
 
     rest: one joint's row of `memory`. stands: filtered indicator of standstill, 0 to 1. torque, row: equation of the
     joint at this sample [N m]. theta: parameters.

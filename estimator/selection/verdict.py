@@ -54,7 +54,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence in addition to the estimate and its validation."""
+    """Evidence for a verdict, in addition to the estimate and its validation."""
 
     held_out: Array | None = None
     """RMS error of the open-loop prediction of a held-out motion, relative to that motion's RMS (joints,), excluding

@@ -219,7 +219,7 @@ class FakeBus:
                 self._change_faults(now)
 
     def advance(self, until: float) -> None:
-        """Advance plant, servos and faults to `until`; do nothing if that is in the past."""
+        """Advance plant, servos and faults to the time `until` [s]; do nothing if that is in the past."""
         if until <= self._now:
             return
         event = until >= self._next_tick or until - self._origin >= self.faults.next_change

@@ -107,8 +107,8 @@ _FADING = np.dtype(
 """A fading memory.
 
 apart: position minus integral of velocity [rad]. far: distance covered [rad]. mean, span: mean and range of the
-velocity [rad/s]. curved: uncertainty due to the
-motion between samples [rad]. unknown: uncertainty due to the times of the measurements [rad].
+velocity [rad/s]. curved: uncertainty due to the motion between samples [rad]. unknown: uncertainty due to the times of
+the measurements [rad].
 """
 
 _STEPS = np.dtype([("square", "f8"), ("age", "f8"), ("since", "f8"), ("count", "f8")])

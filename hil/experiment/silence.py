@@ -1,8 +1,8 @@
 """How long servos have been silent, counting only the time during which this program was listening to them.
 
-While the computer is stalled, it receives nothing, which reveals nothing about the servos. Such time is limited in the
-same way as missed deadlines (`hil.experiment.deadlines`). Only the time in which this program waited for a reply that
-did not come counts as silence.
+A stalled computer cannot receive replies, so their absence reveals nothing about the servos. Such time is limited in
+the same way as missed deadlines (`hil.experiment.deadlines`). Only the time in which this program waited for a reply
+that did not come counts as silence.
 
 A busy computer also delays what it has received: the kernel passes on the bytes of a serial port in a separate thread.
 Like any other program, this thread has to wait for a core, for 4 to 10 ms at a time. So while this program itself wakes

@@ -28,7 +28,7 @@ _CLOCK_DRIFT = 0.01
 _LEARNT_READINGS = 3
 _STALE_READINGS = 2
 _GOALS_MISSED = 2
-"""Consecutive mismatches before a goal counts as lost, because a single packet may be lost."""
+"""Number of consecutive mismatches before goals count as lost, because a single packet may be lost."""
 
 _REMEMBERED = 256
 """Number of latest goals that are kept."""

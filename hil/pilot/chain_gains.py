@@ -28,8 +28,7 @@ class ChainGains:
     """Limits on the gains of each joint (joints,).
 
     stiffness, damping: gains at a high rate [N m/rad, N m s/rad]. friction: smallest viscous friction of the ensemble
-    [N m s/rad].
-    lightest: smallest inertia with the other joints free [kg m^2].
+    [N m s/rad]. lightest: smallest inertia with the other joints free [kg m^2].
     """
 
     stiffness: Array

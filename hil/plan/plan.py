@@ -86,7 +86,7 @@ class Plan:
 
     @property
     def capacity(self) -> int:
-        """Largest possible number of samples."""
+        """Largest number of samples that the plan may take."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
         still = self.rest_samples + 3 * self.end_samples

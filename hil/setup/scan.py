@@ -42,9 +42,8 @@ class Found(NamedTuple):
 class Heard(NamedTuple):
     """The replies at one baud rate.
 
-    baud: over TCP, the baud rate that the servos report, or the port's if none answered.
-
-    trouble: description of a problem on the whole bus; empty if there is none.
+    baud: over TCP, the baud rate that the servos report, or the port's if none answered. trouble: description of a
+    problem on the whole bus; empty if there is none.
     """
 
     baud: int
