@@ -77,7 +77,7 @@ class ShootingEstimate:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values by name [SI]."""
+        """Parameter values by name [SI]."""
         return dict(zip(self.names, self.value.tolist(), strict=True))
 
 

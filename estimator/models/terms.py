@@ -318,7 +318,7 @@ RIGID_BODY: dict[int, tuple[str, ...]] = {
 }
 """Base parameters of the links, by number of joints."""
 BASE_FRICTION = ("viscous", "coulomb", "offset")
-"""The other base terms, one per joint."""
+"""Base terms other than those of the links, one per joint."""
 
 
 def kind_of(name: str) -> str:
