@@ -29,7 +29,7 @@ from hil.drivers.torque.switch import TorqueSwitch
 __all__ = ["CHECK_S", "BusConfig", "ServoBus"]
 
 _PROBES = 3
-"""Unanswered Fast Sync Reads after which Sync Read is used instead."""
+"""Number of unanswered Fast Sync Reads after which Sync Read is used instead."""
 
 
 @dataclass(frozen=True)
@@ -261,14 +261,14 @@ class ServoBus(TorqueSwitch):
 
     @property
     def prepared(self) -> Exchange:
-        """The prepared exchange; raises RuntimeError before `prepare`."""
+        """The prepared exchange; raises RuntimeError if `prepare` has not been called."""
         if self._exchange is None:
             raise RuntimeError("ServoBus.prepare has not been called")
         return self._exchange
 
     def read_positions(self) -> tuple[float, ...]:
-        """Read each joint's angle [rad] outside the control cycle; for a joint with several servos, that of the first
-        one.
+        """Read each joint's angle [rad] outside the control cycle. If a joint has several servos, the first one is
+        read.
         """
         first = [self._of.index(index) for index in range(len(self.joints))]
         return tuple(
@@ -276,7 +276,7 @@ class ServoBus(TorqueSwitch):
         )
 
     def read_drives(self, joint: Joint) -> tuple[float, ...]:
-        """Read the joint angle [rad] according to each servo of a joint, the first servo's first; see
+        """Read the joint angle [rad] according to each servo of a joint, in the order of the servos; see
         `read_positions`.
         """
         return tuple(
@@ -315,7 +315,9 @@ class ServoBus(TorqueSwitch):
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """A joint that has missed many of the latest goals, and what was read back; None if there is none."""
+        """Index of a joint that has missed many of the latest goals, and a text with the value read back; None if there
+        is none.
+        """
         if (lost := self.prepared.lost) is None:
             return None
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"
@@ -327,14 +329,15 @@ class ServoBus(TorqueSwitch):
 
     @property
     def heard_instead(self) -> str:
-        """What was received in the last 0.1 s instead of complete and timely replies, and what to do about it; "" if
-        nothing was.
+        """Message about what was received in the last 0.1 s instead of complete and timely replies, with advice; "" if
+        nothing was received.
         """
         return self.prepared.heard.advice(self.port.clock.now(), self.port.url)
 
     @property
     def commanded_by_another(self) -> str:
-        """Which servo held a value that this program did not write when goals were last read back; "" if none did.
+        """Sentence about a servo that held a value not written by this program when goals were last read back; "" if
+        none.
 
         One such value does not prove another master: a servo that misses writes holds an older goal.
         """
@@ -349,7 +352,7 @@ class ServoBus(TorqueSwitch):
         )
 
     def bear_others(self) -> None:
-        """From now on, do not raise BusOverheard for packets of another master; what it writes is still noticed."""
+        """From now on, do not raise BusOverheard for packets of another master; its writes are still detected."""
         self.prepared.heard.strangers = -math.inf
 
     def read_status_next(self) -> None:

@@ -55,7 +55,7 @@ class Reply(NamedTuple):
     """The result of one exchange.
 
     time_before_write, time_after_read: times on the port's clock [s].
-    span: index of the span that was read; len(spans) stands for the status.
+    span: index of the span that was read; len(spans) if the status was read.
     servos: one answer per servo as described in hil.drivers.sync_read, None for a servo that did not reply.
     """
 
@@ -177,7 +177,7 @@ class Exchange:
 
     def accept_any_order(self) -> None:
         """From now on, accept answers in any order. Use this only where the replies to one request have all arrived, or
-        count as lost, before the next request: nothing else shows to which of them an answer belongs.
+        count as lost, before the next request: nothing else shows to which request an answer belongs.
         """
         for plan in self._plans:
             if isinstance(plan.read, SyncRead):
@@ -191,8 +191,8 @@ class Exchange:
     def add_read_back(
         self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[Sequence[int]]
     ) -> None:
-        """Prepare `overruled` (see `ReadBack`). goal: spans that end with the goal. mode: spans that end with the
-        settings; `modes` are their values.
+        """Prepare the read-backs that `overruled` makes (see `ReadBack`). goal: spans that end with the goal. mode:
+        spans that end with the settings; `modes` are their values.
         """
         back = self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
         self._wire_s |= {read: self._port.wire_time(self._bytes(read)) for read in back.reads}
@@ -226,7 +226,7 @@ class Exchange:
         hold right before a cycle shows who commands them. Missing replies are ignored here; the next cycle detects
         them.
 
-        Raises PortLost.
+        Returns a value that only another master can have written, or None. Raises PortLost.
         """
         back = self._read_back
         if back is None or not self._sent:

@@ -26,7 +26,7 @@ class Joint:
 
     direction: +1 or -1, the joint's sense of rotation relative to the servo's.
     zero_ticks: Present Position at joint angle zero.
-    mode: what a goal is: a current [A] or a voltage [V]. Raises ValueError for current mode if the servo has none.
+    mode: kind of goal, a current [A] or a voltage [V]. Raises ValueError for current mode if the servo has none.
     near: approximate joint angle when the bus is opened [rad], which selects the turn; None to take Present Position as
     it is.
     seconds: further servos of the same model on this joint. A goal is divided equally among all servos; the measured
@@ -73,15 +73,15 @@ class Joint:
         return self.direction * supply_voltage / FULL_PWM_TICKS
 
     def angle(self, position_ticks: int) -> float:
-        """Return the joint angle [rad] for a Present Position."""
+        """Return the joint angle [rad] for a value of Present Position [ticks]."""
         return (position_ticks - self.zero_ticks) * self.position_unit
 
     def within_turn(self, position_ticks: int) -> "Joint":
         """Return this joint with its zero shifted by whole turns, so that its angle is closest to `near`.
 
         Without `near` the joint is returned unchanged. A servo measures its position within one turn when it is
-        switched on, and counts turns from there. A joint that rests just beyond the end of that turn therefore starts a
-        whole turn away.
+        switched on, and counts turns from there. The reading of a joint that rests just beyond the end of that turn is
+        therefore a whole turn away from the expected one.
         """
         if self.near is None:
             return self

@@ -19,7 +19,7 @@ HEADER = b"\xff\xff\xfd\x00"
 BROADCAST_ID = 0xFE
 MAX_ID = 252
 MAX_LENGTH = 1024
-"""Longest LEN accepted; above it, the bytes are noise that looks like a header."""
+"""Largest LEN that is accepted; with a larger one, the bytes count as noise that looks like a header."""
 
 _FRONT = Struct("<4sBH")  # header, ID, LEN
 _STUFFED = b"\xff\xff\xfd"

@@ -34,7 +34,7 @@ _MOST_OVERHEARD = 4096
 
 _LOOKS = 100
 """Number of replies in a row, each complete and none too early, after which `DescriptorPort.ask` no longer looks for
-pending input in advance: on such a line, pending input is noticed because it arrives too early.
+pending input in advance: on such a line, pending input is detected because it arrives too early.
 """
 
 _LOOKS_AFTER_LOSS = 2 * _LOOKS
@@ -44,8 +44,8 @@ _ALWAYS = 1 << 62
 """Like `_LOOKS`, but for a line whose replies usually arrive earlier than its baud rate allows, such as a pty."""
 
 _EARLY_BITS = 9.0
-"""Bits per byte that are assumed, of ten in fact; a reply counts as early if it arrives before the request can have
-been transmitted at this number. The difference allows for inaccurate baud rates.
+"""Assumed number of bits per transmitted byte. A reply counts as early if it arrives before the request can have been
+transmitted at this number of bits. The true number is ten; the difference allows for inaccurate baud rates.
 """
 
 _WRITE_PATIENCE_S = 0.1
@@ -201,7 +201,7 @@ class DescriptorPort(Port):
         poll.register(self._descriptor, select.POLLIN)
         self._wait_ms = poll.poll
         self._looks = _LOOKS
-        """Number of further requests before which `ask` looks for pending input."""
+        """Number of requests for which `ask` will still look for pending input before it writes."""
 
     def write(self, data: bytes) -> None:
         try:

@@ -12,10 +12,10 @@ PATIENCE_S = 0.018
 
 
 _SHORTEST = 11
-"""Bytes of a status packet without data."""
+"""Number of bytes of a status packet without data."""
 
 _BEFORE_LENGTH, _FRONT = 7, 8
-"""Bytes of a packet that LEN does not count, and up to its instruction."""
+"""Number of bytes of a packet that LEN does not count, and number of bytes up to and including its instruction."""
 
 
 class SdkPort:

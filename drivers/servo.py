@@ -19,7 +19,7 @@ from hil.drivers.sdk_port import ResyncingPacketHandler, SdkPort
 _T = TypeVar("_T")
 
 _ATTEMPTS = 3
-"""Attempts at a set-up exchange before a corrupted or missing reply is reported."""
+"""Number of attempts at a set-up exchange before a corrupted or missing reply is reported."""
 
 
 _LATE_S = 0.06
@@ -29,10 +29,10 @@ _DATA = 9
 """Index of the first data byte in a status packet."""
 
 NO_ERROR = "none"
-"""What `describe_error` returns if there is no error."""
+"""Result of `describe_error` if there is no error."""
 
 _BESIDE_DATA = 4
-"""Bytes that LEN counts in addition to the data: INST, ERR, CRC."""
+"""Number of bytes that LEN counts in addition to the data: INST, ERR, CRC."""
 
 
 class Servo:
@@ -165,7 +165,7 @@ class Servo:
         if result == COMM_RX_TIMEOUT:
             raise NoReply(
                 f"{self.title} does not answer at {self.port.baud} baud on {self.port.url} ({what}). Check its supply "
-                "and its cable; `hil scan` finds it at another ID or baud rate."
+                "and its cable; `hil scan` shows whether it has another ID or baud rate."
             )
         if result != COMM_SUCCESS:
             text = self._sdk.getTxRxResult(result).removeprefix("[TxRxResult] ").rstrip("!. ").lower()

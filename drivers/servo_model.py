@@ -1,7 +1,7 @@
 """The meaning of each model's ticks: facts that the SDK's control tables leave out.
 
 Sources: ROBOTIS e-Manual, page of each model (current unit, resolution, Operating Mode, stall figures). None of the
-torque constants below was measured by us.
+torque constants below was measured in this project.
 """
 
 import math
@@ -183,7 +183,7 @@ class ServoModel:
 
     @property
     def torque_per_volt(self) -> Published:
-        """Torque at the output shaft at rest per volt [N m/V]: stall torque over supply voltage.
+        """Torque at the output shaft per volt at standstill [N m/V]: stall torque divided by supply voltage.
 
         In PWM mode the motor's torque is this times the applied voltage, minus the effect of the back-EMF; an
         identified viscous friction then includes the back-EMF.

@@ -30,7 +30,7 @@ class Slow(NamedTuple):
 
 
 class Status(NamedTuple):
-    """What a servo reports every few cycles in addition to its state.
+    """Values that a servo reports every few cycles in addition to its state.
 
     watchdog: Bus Watchdog [20 ms], 255 after it has tripped.
     goal: the goal that the servo holds [A, or V in PWM mode].
@@ -254,7 +254,7 @@ def _column(answers: Sequence[Answer], index: int, unit: float) -> tuple[float, 
 
 
 def fold(state: State, of: Sequence[int], count: int) -> State:
-    """Return the state of the joints, given that of their servos.
+    """Combine the values of the servos into one value per joint.
 
     of: the joint index of each servo, in ascending order. count: number of joints.
     Goals and currents are summed; angle, velocity and clock are the first servo's; the lowest voltage and the highest

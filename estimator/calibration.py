@@ -72,7 +72,7 @@ class KnownMass:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Torque constants and the arm's parameters in true units."""
+    """Result: the joints' torque constants, and the parameters of the arm that follow from them."""
 
     factor: Array
     """Ratio of true to assumed torque constant of each joint (joints,)."""
@@ -107,7 +107,7 @@ def calibrate(
         options: tolerances and limits.
 
     Returns:
-        Factors of the torque constants, and the arm's parameters in true units.
+        The ratio of true to assumed torque constant of each joint, and the arm's parameters with the true constants.
 
     Raises:
         ModelError: if the periods differ in their number of joints.

@@ -67,7 +67,7 @@ def identify(
     Args:
         periods: one settled period, or several of the same arm, which are fitted together.
         model: the model to fit.
-        coarse: for comparing models: stop early if the residual is well above the noise.
+        coarse: whether to stop early if the residual is well above the noise, which suffices to compare models.
         starts: parameters by name [SI], from another experiment or similar arms, used only as additional initial
             guesses.
         near: point known to be close to a minimum, used as the only initial guess, which is much faster.

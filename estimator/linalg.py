@@ -50,9 +50,9 @@ def _guarded(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
             if not isinstance(error, np.linalg.LinAlgError) and not NOT_FINITE.search(str(error)):
                 raise
             raise ConvergenceError(
-                f"the equations of the fit cannot be solved ({error}): a simulated motion diverges, or the motion says "
-                "nothing about some parameter. Check the units and signs of torque and angle, and whether the arm was "
-                "the same throughout the recording"
+                f"the equations of the fit cannot be solved ({error}): a simulated motion diverges, or the motion "
+                "provides no information on some parameter. Check the units and signs of torque and angle, and "
+                "whether the arm was the same throughout the recording"
             ) from error
 
     return guarded

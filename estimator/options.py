@@ -76,7 +76,9 @@ class LinearOptions:
     """Options of stage 1, the regression on Fourier lines."""
 
     coulomb_width: float = 0.05
-    """Width of the smoothed Coulomb step [rad/s], about a sticking joint's velocity error due to omitted lines."""
+    """Width of the smoothed Coulomb step [rad/s]: about the error that omitted lines cause in a sticking joint's
+    velocity.
+    """
     max_condition: float = 1e8
 
 
@@ -113,8 +115,8 @@ class LikelihoodOptions:
     """Tolerance of the fit of the initial state alone."""
 
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=1e-4)
-    """A width at its lower bound of 1e-4 rad/s cannot be distinguished from stiction; one of 3e-4 could be, by half a
-    standard error.
+    """A width at its lower bound of 1e-4 rad/s cannot be distinguished from stiction; a width of 3e-4 rad/s differs
+    from it by half a standard error.
     """
     minimiser: MinimiserOptions = MinimiserOptions()
     integration: IntegrationOptions = IntegrationOptions()
@@ -144,8 +146,8 @@ class LikelihoodOptions:
     An arm that swings past the upright pose amplifies parameter errors, so it is first held to the measured motion.
     """
     tracking_loss: float = 1.5
-    """The run's beginning is fitted first if the cost of the free motion exceeds that of the tracking fit by this
-    factor.
+    """The beginning of a run is fitted first if the cost of the fit without springs exceeds that of the tracking fit by
+    this factor.
     """
     horizons: tuple[float, ...] = (0.125, 0.25, 0.5)
     """Lengths of the initial parts of a run that are fitted before the whole, as fractions of the run, in this
@@ -261,8 +263,8 @@ class SelectionOptions:
     simpler one's.
     """
     steady_residual: float = 5.0
-    """RMS residual in units of the noise below which a change of friction is searched for: worse models may mimic
-    one.
+    """RMS residual in units of the noise below which a change of friction is searched for: a worse model may
+    imitate such a change.
     """
     presliding_residual: float = 1.2
     """RMS residual in units of the noise above which a fit with presliding is tried; such fits are slow."""

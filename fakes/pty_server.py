@@ -29,8 +29,8 @@ OVERRUN_S = 1e-3
 """A reply delivered later than this after it was due counts as a real-time overrun [s]."""
 
 TOO_SLOW_S = 5e-3
-"""If simulating the arm takes this much longer than the simulated time, twice in a row, the excess is lost [s]; after a
-single stall of the computer the arm catches up instead.
+"""If simulating the arm takes this much longer than the simulated time, twice in a row, the excess is not simulated
+[s]. After a single stall of the computer, the arm catches up instead.
 """
 
 LONGEST_SLEEP_S = 0.05
@@ -49,7 +49,7 @@ class LinkError(OSError):
 
 
 class ServerClock:
-    """The machine's monotonic clock minus the time lost. Only the server itself waits on it."""
+    """The machine's monotonic clock minus the time that was not simulated. Only the server itself waits on it."""
 
     def __init__(self) -> None:
         self.lost_s = 0.0

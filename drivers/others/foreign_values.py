@@ -1,4 +1,4 @@
-"""Whether a servo has held values that this program cannot have written, and has done so too often for chance."""
+"""Detection of values on a servo that this program cannot have written, found too often to be chance."""
 
 from collections import deque
 

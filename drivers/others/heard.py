@@ -1,4 +1,4 @@
-"""Unexpected bytes on the wire, in addition to the requested replies or instead of them, and what to do about them."""
+"""Unexpected bytes on the wire, in addition to the requested replies or instead of them, and advice for the user."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,7 +12,7 @@ MOST_STRANGERS = 2
 """Tolerated number of foreign packets heard during an experiment; a late reply can look like one."""
 
 MOST_MIXED_UP = 2
-"""Tolerated number of replies with IDs that do not fit; no answer in such a reply is used."""
+"""Tolerated number of replies whose IDs do not match the request; no answer in such a reply is used."""
 
 _RECENT_S = 0.1
 _INSTRUCTIONS = frozenset(Instruction) - {Instruction.STATUS}
@@ -36,13 +36,15 @@ class Heard:
         self._expected: frozenset[tuple[int, int]] = frozenset()
         self.expect(reads)
         self.damaged_at = self.late_at = -math.inf
-        """Times of the latest incomplete or damaged replies and of the latest unexpected one [s on the port's
-        clock].
+        """Times at which incomplete or damaged replies last arrived, and at which an unexpected reply last arrived [s
+        on the port's clock].
         """
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """Number of replies with one answer per servo but IDs that do not fit, since a reply was last late."""
+        """Number of replies since the last late one that had one answer per servo, but IDs that do not match the
+        request.
+        """
         self.strangers: float = 0
         """Number of received packets that this program neither sent nor requested: another master is on the bus."""
 
@@ -91,8 +93,8 @@ class Heard:
             self._was_late(now)
 
     def advice(self, now: float, url: str) -> str:
-        """What was received in the last 0.1 s instead of complete and timely replies, and what to do about it; "" if
-        nothing was.
+        """Return a message about what was received in the last 0.1 s instead of complete and timely replies, with
+        advice; "" if nothing was received.
         """
         since = now - _RECENT_S
         if self.late_at > since:
@@ -112,7 +114,7 @@ class Heard:
         return "Bytes arrived, but damaged or incomplete: check the cables and what else may be sending on the bus."
 
     def mixed_up_advice(self, url: str) -> str:
-        """What to do about servos that answer with IDs that do not fit."""
+        """Advice to the user about replies whose IDs do not match the request."""
         return (
             f"Intact replies came with the IDs {', '.join(map(str, self.senders))}, although each servo was "
             "asked once: replies are repeated or mixed up, or two servos have the same ID. "

@@ -16,7 +16,8 @@ __all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack"]
 _MODES_S = 0.025
 """Mean time between two read-backs of the modes [s]; all others read the goals.
 
-It is random: a program that overwrites goals regularly must not always do so when the modes are read.
+The actual time is random. Otherwise another program that overwrites goals regularly might always do so just when the
+modes are read.
 """
 
 _GOALS_PER_MODE_IN_DOUBT = 4
@@ -52,11 +53,11 @@ goal in a hundred is lost, missing three of six is rarer than missing two consec
 
 _FADES = 0.98
 _IN_DOUBT_S = 0.3
-"""Time after a foreign value was read, during which others are expected [s]."""
+"""Time after a foreign value was read during which more such values are expected [s]."""
 
 
 _Sightings = deque[tuple[float, int]]
-"""Time [s] and value of each."""
+"""Time [s] and value of each read-back of a foreign value."""
 
 
 class Overruled(NamedTuple):
@@ -90,7 +91,9 @@ class ReadBack:
         kind = FastSyncRead if fast else SyncRead
         self.reads: tuple[GroupRead, GroupRead] = kind(ids, goal), kind(ids, mode)
         self.longest = 0.0
-        """Duration of the longest recent read-back, without its wire time [s]; decays from one to the next."""
+        """Duration of the longest recent read-back, without its wire time [s]; it decays from one read-back to the
+        next.
+        """
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
         self._modes = tuple(map(tuple, modes))
         self._settings = one_each(mode, len(ids))[0].registers[-len(self._modes[0]) :]
@@ -127,7 +130,8 @@ class ReadBack:
     def look(
         self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float, *, collided: bool = False
     ) -> Overruled | None:
-        """Compare the answers with what was written; return what only another master can have written.
+        """Compare the answers with the written values; return a value that only another master can have written, or
+        None.
 
         An answer with an error is ignored: a servo that refuses a read reveals nothing about its goal.
 

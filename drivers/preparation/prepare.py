@@ -99,7 +99,7 @@ def overruled(joint: Joint, found: Overruled) -> BusShared:
 def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     """Prepare a servo: torque off, no fault, settings that permit an experiment, and the joint's operating mode.
 
-    others: IDs of the arm's other servos. Raises ServoFault, WrongSetting, and whatever `Servo.write` raises.
+    others: IDs of the arm's other servos. Raises ServoFault, WrongSetting, and the errors of `Servo.write`.
     """
     servo.write("Torque Enable", 0)
     fault = servo.hardware_error()

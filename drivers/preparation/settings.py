@@ -70,7 +70,7 @@ def read_settings(servo: Servo) -> dict[str, int]:
 
 
 def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
-    """The settings, with goals clamped to the limits, which another program may have lowered meanwhile.
+    """Return the settings with goals clamped to the limits, which another program may have lowered meanwhile.
 
     A limit that is among the settings is restored before its goal; for any other limit, the servo's present value
     applies. Raises the same errors as `Servo.read`.
@@ -84,7 +84,7 @@ def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
 
 
 def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, int]]:
-    """Restore the registers that differ from `settings`; return (old, new) for those that were written.
+    """Restore the registers that differ from `settings`; return their old and new values by name.
 
     Goals are restored as far as the servo's limits allow (`attainable`). Each register is read back. Raises
     WrongSetting if torque is on. Raises the errors of `Servo.write` only after all other registers have been tried.

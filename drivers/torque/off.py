@@ -4,8 +4,8 @@ The order matters. Torque off is sent to all servos at once, which takes 0.3 ms.
 that does not reply costs about 40 ms, so torque off is sent to all again afterwards: a servo may receive without being
 able to reply, and a packet may have been lost. If a servo still cannot be confirmed, the bus stays silent for as long
 as its Bus Watchdog waits: every packet feeds the watchdog of a servo that receives but does not obey, because it
-refuses instructions or its ID has changed. For the same reason servos that did not answer the last exchange are not
-polled before that. Then the remaining servos are tried again, several times.
+refuses instructions or its ID has changed. For the same reason, servos that did not answer the last exchange are not
+polled before this pause. Then the remaining servos are tried again, several times.
 
 Ctrl-C raises KeyboardInterrupt at any point of the program, even between two servos while torque is being cut. A
 program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
@@ -29,13 +29,13 @@ from hil.drivers.servo_model import WATCHDOG_UNIT
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _INTERRUPTS_BORNE = 5
-"""Attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
+"""Number of attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
-"""Largest delay after its timeout with which a watchdog acts [s], since it counts in steps."""
+"""Largest time by which a watchdog may act later than its timeout [s], since it counts in steps of 20 ms."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
-"""Further torque-off packets and the time between them [s], since one that collides with a reply is lost."""
+"""Number of further torque-off packets and the time between them [s]: a packet that collides with a reply is lost."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class TorqueOff:
     def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
         """The report after another program has switched torque on again.
 
-        on: joints whose servos still have torque on, however often it is cut. silent: those that have not answered
-        since.
+        on: joints whose servos still have torque on, however often it is cut. silent: joints whose servos have not
+        answered since.
         """
         why = "Another program had switched its torque on again, and it has not answered since."
         return replace(
@@ -183,7 +183,7 @@ def cut_torque(
 
 
 def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
-    """Send torque off to all servos in one packet; a failure is noticed when they are read back.
+    """Send torque off to all servos in one packet; a failure is detected when they are read back.
 
     The packet is a Sync Write to these servos only, since others on the bus may be in use. It is sent twice, since a
     packet may be lost.

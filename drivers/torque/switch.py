@@ -162,13 +162,13 @@ class TorqueSwitch:
         tell_torque_off(self.port, self._servos)
 
     def torque_now(self) -> dict[Joint, bool | None]:
-        """Read whether torque is on at each servo that is not reported as unconfirmed; None where that is unknown."""
+        """Read whether each servo's torque is on, except for those reported as unconfirmed; None if it is unknown."""
         report = self.torque_off_report
         unconfirmed = set() if report is None else {joint for joint, _ in report.unconfirmed}
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
 
     def has_torque(self) -> bool:
-        """Read whether every servo has its torque, outside the control cycle; False if one does not answer."""
+        """Read whether torque is on at every servo, outside the control cycle; False if one does not answer."""
         return all(is_torque_on(servo) for servo in self._servos.values())
 
     def cut_foreign_torque(self, on: Collection[Joint]) -> None:

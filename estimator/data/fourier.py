@@ -47,14 +47,14 @@ def noise_power(lines: Lines) -> Array:
 
 
 def white_noise(position: Array, valid: Mask | None = None) -> Array:
-    """Return the standard deviation of the white noise in one period of angles (joints, samples), per joint.
+    """Return the standard deviation (joints,) [rad] of the white noise in one period of angles (joints, samples) [rad].
 
     It is estimated from the upper quarter of the lines, far above the frequencies of any motion. A linear trend is
     removed first: if the arm drifts, the two ends of a period do not match, and the jump between them would spread over
     all lines.
 
     valid: samples that were received (joints, samples); the others are interpolated linearly, which reduces noise at
-    high frequencies. White noise interpolated in the same way shows by how much.
+    high frequencies. The result is corrected for this with simulated white noise that is interpolated in the same way.
     """
     noise = _upper_noise(without_jump(position))
     if valid is None or valid.all():
@@ -64,7 +64,7 @@ def white_noise(position: Array, valid: Mask | None = None) -> Array:
 
 
 def without_jump(position: Array) -> Array:
-    """Return a period (joints, samples) without the linear trend that keeps it from closing."""
+    """Return a period (joints, samples) without the linear trend from its beginning to its end."""
     samples = position.shape[1]
     closed: Array = position - _jump(position)[:, None] * (np.arange(samples) / samples)
     return closed
@@ -92,7 +92,9 @@ def _interpolated_noise(valid: Mask) -> float:
 
 
 def interpolated_noise(valid: Mask) -> Array:
-    """Return white noise with a standard deviation of 1 (draws, samples), interpolated except at `valid` (samples,)."""
+    """Return white noise with a standard deviation of 1 (draws, samples); samples that are not `valid` are
+    interpolated.
+    """
     index = np.arange(valid.size)
     drawn = np.random.default_rng(_DRAWS).standard_normal((_DRAWS, valid.size))
     drawn[:, ~valid] = [np.interp(index[~valid], index[valid], row[valid]) for row in drawn]

@@ -63,7 +63,7 @@ def settling_difference(former: Array, latest: Array) -> float:
 class Decay:
     """A change from period to period that decreases by about the same factor each time.
 
-    ratio: that factor. further: how many more periods it takes until successive periods differ little enough.
+    ratio: that factor. further: number of further periods until the change is within the tolerance.
     """
 
     ratio: float
@@ -72,8 +72,8 @@ class Decay:
     def is_warming(self, correlation: float) -> bool:
         """Whether the change looks like friction warming up rather than a transient that has not died out.
 
-        Friction decreases over many periods, and the motion always changes in the same direction. A transient
-        oscillates at the arm's own frequencies, or decays faster. correlation: see `correlation_of_changes`.
+        Friction that warms up decreases over many periods, so that the motion keeps changing in the same direction. A
+        transient oscillates at the arm's own frequencies, or decays faster. correlation: see `correlation_of_changes`.
         """
         return self.ratio >= SLOWLY and correlation >= ALIKE
 

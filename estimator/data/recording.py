@@ -63,7 +63,7 @@ class Recording:
 
     @property
     def longest_interval(self) -> float:
-        """Interval between samples above which there is a gap [s]."""
+        """Longest interval between samples that does not count as a gap [s]."""
         return max(MOST_INTERVALS * self.interval, SHORTEST_GAP)
 
     @cached_property

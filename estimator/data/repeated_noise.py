@@ -4,18 +4,18 @@ Whatever repeats with the motion cancels: the motion itself, however fast, and t
 remains of a rounded angle depends on its noise. Without noise, both passes are rounded alike and nothing remains; the
 more noise there is before rounding, the more of the rounding error differs as well. With independent Gaussian noise of
 standard deviation s, a slow drift d from one pass to the next, and angles spread evenly over the steps, half the mean
-square of the fast part of the difference is
+square of the difference at high frequencies is
 
     s^2 + 1/12 - sum over k of exp(-(2 pi k s)^2) cos(2 pi k d) / (2 pi^2 k^2)   [steps^2],
 
 where the sum is the part of the rounding error's power 1/12 that repeats (Fourier series of the rounding error; B.
-Widrow and I. Kollar, Quantization Noise, 2008). The drift is the slow part of the difference and is caused by
+Widrow and I. Kollar, Quantization Noise, 2008). The drift is the difference at low frequencies and is caused by
 changing friction. Solving for s gives the error variance of one reading, s^2 + 1/12. It is an upper bound, since other
 differences between the passes increase it.
 
 This applies to noise that is white before rounding. Noise that a servo has filtered is stronger at low frequencies. Its
-excess there over the fast part is measured from the same difference, except at frequencies at which there may be drift
-(`coloured_noise`).
+excess there over the noise at high frequencies is measured from the same difference, except at frequencies at which
+there may be drift (`coloured_noise`).
 """
 
 from collections.abc import Sequence
@@ -74,9 +74,9 @@ def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
     """Return the standard deviation of the noise of one averaged sample in excess of white noise (joints,) [rad].
 
     It is 0 unless significant. On the lines on which the motion may have changed from pass to pass, the noise is
-    extrapolated: it is assumed to rise as much from the octave above to these lines as from the next higher octave to
-    that one. Noise with a long correlation is underestimated. Takes the arguments of `repeated_noise`, and returns None
-    in the same cases.
+    extrapolated: from the octave above to these lines, it is assumed to rise by the same factor as from the next higher
+    octave to that one. Noise with a long correlation is underestimated. Takes the arguments of `repeated_noise`, and
+    returns None in the same cases.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
         return None

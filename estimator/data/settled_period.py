@@ -73,7 +73,8 @@ class SettledPeriod:
     """Standard deviation of one sample's error (joints,) [rad]: the measured white noise, but at least that of
     rounding, and coloured noise.
 
-    If a motion is sampled slowly, its fastest lines are not only noise: what repeats from period to period is left out.
+    At a low sampling rate, the highest lines of a motion are not only noise. The part of them that repeats from period
+    to period is then left out.
     """
 
     def __post_init__(self) -> None:

@@ -1,1 +1,1 @@
-"""Defects of recordings, told apart by what each would do to the residuals."""
+"""Detection of defects in recordings, which differ in their effect on the residuals."""

@@ -1,4 +1,4 @@
-"""Fits in which a defect of the recordings is unknown, too."""
+"""Fits that determine a defect of the recordings together with the parameters."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -24,8 +24,8 @@ IGNORED = 1e-3  # weight of a segment in which a sudden change happens
 
 @dataclass(frozen=True)
 class AlteredFit:
-    """Result of a fit. values: parameters by name [SI]; unknowns: those of the defect; left: mean square of the
-    residual in units of the noise.
+    """Result of a fit. values: parameters by name [SI]; unknowns: the unknowns that describe the defect; left: mean
+    square of the residual in units of the noise.
     """
 
     values: dict[str, float]
@@ -68,7 +68,8 @@ class Altered:
 
     def linear(self, number: int) -> tuple[Array, Array]:
         """Residual of a segment at the estimate (rows,), and its derivatives with respect to the parameters `names`,
-        the encoder zeros and the scales of the angles (rows, all); what the initial state explains is left out.
+        the encoder zeros and the scales of the angles (rows, all); both without the part that the initial state
+        explains.
         """
         problem, own = self.problem, self.estimate.own[number]
         rows, columns = problem.derivative_by_values(number, self.values, self.offsets, own, self.names)
@@ -91,7 +92,9 @@ class Altered:
 
     @staticmethod
     def sizes(hypothesis: Hypothesis, value: Array) -> Array:
-        """What the changes of `direction` refer to: the parameters `value` (names,), or 1 if they are absolute."""
+        """Factors that convert relative changes to SI units (names,): the parameters `value`, or 1 for absolute
+        changes.
+        """
         return np.ones_like(value) if hypothesis.is_absolute else value
 
     def fit(self, hypothesis: Hypothesis | None, near: AlteredFit | None = None) -> AlteredFit:
@@ -186,7 +189,7 @@ class _Posed:
         return value if self._hypothesis is None else self._altered.sizes(self._hypothesis, value)
 
     def begun(self, value: Array, unknowns: Array) -> Array:
-        """Shared coordinates with these parameters and unknowns."""
+        """Return the shared coordinates of the fit for these parameters and these unknowns of the defect."""
         return np.concatenate((self.coordinates.coordinates(value), self._altered.offsets, unknowns))
 
     def minimum(self, shared: Array, own: Array, ftol: float = OPTIONS.ftol_refine) -> Segmented:

@@ -1,7 +1,8 @@
-"""What may be wrong with recordings, as additional unknowns of a fit.
+"""Possible defects of recordings, described by additional unknowns of a fit.
 
-A defect acts on the parameters, each by a fixed amount per unit of an unknown, with a course in time that is constant
-within a segment (friction that falls as it warms up, a load that is picked up), or it scales the measured angles.
+A defect either scales the measured angles or changes the parameters. In the latter case, each parameter changes by a
+fixed amount per unit of an unknown. The change may vary with time (friction that falls as it warms up, a load that is
+picked up), but is constant within a segment.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,7 +19,7 @@ from hil.estimator.models.terms import kind_of, term_of
 Kind = Literal["scale", "load", "friction", "torque", "offset", "arm"]
 CourseKind = Literal["always", "step", "linear", "decay", "recording"]
 Direction = Mapping[str, float]
-"""Change of each parameter per unit of an unknown, relative to its value; of an offset, absolute [N m]."""
+"""Change of each parameter per unit of an unknown, as a fraction of the parameter; for an offset, in N m."""
 
 MOST_STEPS = 24  # instants at which a sudden change is tried
 EDGE = 2  # segments before and after a sudden change
@@ -29,8 +30,10 @@ TORQUE_UNITS = ("kg m^2", "N m", "N m s/rad", "N m/rad")
 
 @dataclass(frozen=True)
 class Course:
-    """How a defect develops. time: of a step, or the time constant of a decay [s]; recording: of a step, or the one
-    that differs.
+    """How a defect develops over time.
+
+    time: instant of a step, or time constant of a decay [s]. recording: index of the recording that contains the step,
+    or that differs from the others.
     """
 
     kind: CourseKind
@@ -40,17 +43,17 @@ class Course:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A defect. joints: those concerned, from 1; empty for the whole arm."""
+    """A defect to be tested. joints: joints that it affects, counted from 1; empty for the whole arm."""
 
     kind: Kind
     joints: tuple[int, ...]
     course: Course
     directions: tuple[Direction, ...]
-    """One for each unknown, of order 1; empty for scales of angles, which have one unknown for each joint."""
+    """One direction for each unknown; empty for scales of angles, which have one unknown for each joint."""
     strength: Array
-    """The course during each segment (segments,)."""
+    """Strength of the defect in each segment (segments,), as given by its course."""
     used: Mask
-    """Segments that show it (segments,): not the one in which a sudden change happens."""
+    """Whether each segment is used (segments,): all but the one in which a sudden change happens."""
 
     @property
     def is_absolute(self) -> bool:

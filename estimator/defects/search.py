@@ -28,12 +28,12 @@ FITTED = 3  # hypotheses, each of another kind or joint
 PROMISING = 0.45  # fraction of the residual beyond the noise: what explains less, in the score test or fitted, is left
 CERTAIN = 2.0  # decrease of the sum of squares relative to that expected by chance
 LEAST = {"scale": 0.01, "load": 0.02, "friction": 0.04, "torque": 0.01, "offset": 0.01, "arm": 0.03}
-"""Smallest change that matters: relative, for an offset relative to the RMS torque."""
+"""Smallest change that matters, as a fraction of the parameters; for an offset, as a fraction of the RMS torque."""
 
 
 @dataclass(frozen=True)
 class Defect:
-    """A defect that explains the recordings. fit: with its unknowns; given: without."""
+    """A defect that explains the recordings. fit: fit with the unknowns of the defect; given: fit without them."""
 
     hypothesis: Hypothesis
     fit: AlteredFit
@@ -41,7 +41,7 @@ class Defect:
 
     @property
     def explained(self) -> float:
-        """Fraction of the residual beyond the noise that it explains."""
+        """Fraction of the residual power beyond the noise that the defect explains."""
         return (self.given.left - self.fit.left) / max(self.given.left - 1.0, 1e-6)
 
 
@@ -60,7 +60,7 @@ class _Score:
 def probable_defect(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool) -> Defect | None:
     """Return the most probable defect, if one is significant and large enough to matter.
 
-    estimate: of a model without terms that could imitate a defect. gravity: whether gravity acts on the arm.
+    estimate: fit of a model without terms that could imitate a defect. gravity: whether gravity acts on the arm.
     """
     altered = Altered(recordings, estimate)
     if not FEWEST_SEGMENTS <= altered.segments <= MOST_SEGMENTS:
@@ -170,11 +170,11 @@ class _Linear:
 
     @property
     def independent(self) -> float:
-        """Number of independent samples."""
+        """Number of samples, reduced according to the correlation of the residual."""
         return float(self.samples.sum()) / self.colour
 
     def score(self, altered: Altered, hypothesis: Hypothesis, tried: int) -> _Score:
-        """Return the score test of a hypothesis, one of `tried`."""
+        """Return the score test of a hypothesis; tried: number of hypotheses that are tested."""
         base = np.eye(self.gradient.shape[1])[:, self.fitted]
         added = _added(hypothesis, altered, len(base))
         before = self._fall(base, None, hypothesis)

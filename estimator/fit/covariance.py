@@ -2,8 +2,9 @@
 
 N = J'WJ is the information, S the scatter of the score J'Wr. For independent errors S = N. Rounding errors of a slow
 joint, and model errors, are correlated between samples. S takes this into account if the products of the score are
-summed over lags (Newey and West, Econometrica 55 (1987) 703). Bartlett's kernel with L lags equals the sum, over all
-windows of L samples, of the window's score times itself, divided by L: one pass for any L.
+summed over lags (Newey and West, Econometrica 55 (1987) 703). With Bartlett's kernel and L lags, this equals the
+sum, over all windows of L samples, of the outer product of the window's score with itself, divided by L. It takes one
+pass for any L.
 
 A model error is not only correlated: it repeats at every reversal, so averaging does not remove it, and the part that
 resembles a parameter leaves no residual at all. Therefore the non-white part of the residual widens the errors further:
@@ -29,7 +30,9 @@ VANISHED = 1e-3  # slope relative to its value below which a parameter has run i
 
 
 class Scatter:
-    """Sums a score (samples, causes), given piece by piece, over windows of `lags` samples."""
+    """Computes S from a score (samples, coordinates) that is given piece by piece; lags: length of the windows
+    [samples].
+    """
 
     def __init__(self, causes: int, lags: int) -> None:
         self._lags = lags
@@ -37,13 +40,13 @@ class Scatter:
         self._total = np.zeros((causes, causes))
 
     def add(self, score: Array) -> None:
-        """Add the next samples."""
+        """Add the score of the next samples (samples, coordinates)."""
         extended = np.concatenate((self._before, score))
         self._before = extended[extended.shape[0] - (self._lags - 1) :]
         self._add_windows(extended)
 
     def sum(self) -> Array:
-        """Return S (causes, causes), including the last, incomplete windows."""
+        """Return S (coordinates, coordinates), including the last, incomplete windows."""
         self._add_windows(np.concatenate((self._before, np.zeros_like(self._before))))
         return self._total
 
@@ -103,7 +106,7 @@ def robust_covariance(
     structured: float = 0.0,
     expected: Array | None = None,
 ) -> Array:
-    """Return the covariance of the first `count` coordinates (count, count); the others count as unknown, too.
+    """Return the covariance of the first `count` coordinates (count, count) if all coordinates are unknown.
 
     It is the larger of the sandwich and the covariance for independent errors, direction by direction, since a short
     recording cannot prove that its errors cancel. It is infinite for a coordinate without influence on the residual.
@@ -114,7 +117,7 @@ def robust_covariance(
         samples: number of samples.
         count: number of coordinates to return.
         structured: part of the sum of squares that is due to model errors.
-        expected: what a prior has added to the normal equations (coordinates, coordinates); it keeps its weight where
+        expected: contribution of a prior to the normal equations (coordinates, coordinates); it keeps its weight where
             the data's variance is inflated.
     """
     if is_unpredictable(at, samples):
@@ -146,8 +149,8 @@ def is_unpredictable(at: Quadratic, samples: int) -> bool:
 def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: float, expected: Array) -> Array:
     """Return the factor (coordinates,) by which each coordinate's variance exceeds that under independent errors.
 
-    That is the ratio of the variances from the data alone, with and without what `robust_covariance` adds for
-    correlated errors and model errors. Arguments as in `robust_covariance`.
+    That is the ratio of the variances from the data alone, with and without the contributions that `robust_covariance`
+    adds for correlated errors and model errors. Arguments as in `robust_covariance`.
     """
     if is_unpredictable(at, samples):
         return np.ones(len(at.normal))

@@ -46,10 +46,10 @@ class ShootingEstimate:
 
     model: Model
     names: tuple[str, ...]
-    """`model.names`."""
+    """Parameter names, as in `Model.names`."""
     units: tuple[str, ...]
     value: Array
-    """Values (parameters,) [SI]."""
+    """Parameter values (parameters,) [SI]."""
     covariance: Array
     """Covariance (parameters, parameters), robust to model errors: see `Segmented.covariance`."""
     zeros: Array
@@ -71,13 +71,13 @@ class ShootingEstimate:
 
     @property
     def std(self) -> Array:
-        """Standard errors (parameters,)."""
+        """Standard errors of the parameters (parameters,) [SI]."""
         std: Array = np.sqrt(np.diag(self.covariance))
         return std
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values by name [SI]."""
+        """Parameter values by name [SI]."""
         return dict(zip(self.names, self.value.tolist(), strict=True))
 
 

@@ -33,7 +33,7 @@ class Start:
     tracking: Array
     """Coordinates of the tracking fit, in which springs hold the simulated arm close to the measured motion."""
     free: Minimum
-    """Fit of the free motion; its iterations include those of all preceding fits."""
+    """Fit of the motion without springs; its iterations include those of all preceding fits."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,9 @@ class Search:
     """The objective with coarse integration steps."""
     options: LikelihoodOptions
     coarse: bool
-    """Whether to stop before full convergence if the residual is well above the noise, for comparing models."""
+    """Whether to stop before full convergence if the residual is well above the noise, which suffices to compare
+    models.
+    """
 
     @property
     def samples(self) -> int:
@@ -67,7 +69,7 @@ class Search:
         return int(sum(period.valid.sum() for period in self.periods))
 
     def minimum(self, guesses: Sequence[Array], springs: Array) -> tuple[Refined, Minimum]:
-        """Return the best minimum from `guesses` (coordinates), the last of which has a wide Coulomb step.
+        """Return the best minimum from `guesses`, each (coordinates,), the last of which has a wide Coulomb step.
 
         springs: tracking stiffness (joints,) [N m/rad]. Raises ConvergenceError.
         """

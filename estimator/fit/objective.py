@@ -157,7 +157,10 @@ class Objective:
         return tuple(run.position(physics, self.start(x, index)) for index, run in enumerate(self.runs))
 
     def scatter(self, x: Array, lags: int) -> Array:
-        """Return the sum of products of the scores (coordinates, coordinates); see `hil.estimator.fit.covariance`."""
+        """Return the sum of products of the scores (coordinates, coordinates) over windows of `lags` samples.
+
+        See `hil.estimator.fit.covariance`.
+        """
         physics = self.physics(x)
         total = self._expected(x).normal
         for index, (run, weight) in enumerate(zip(self.runs, self.weights, strict=True)):

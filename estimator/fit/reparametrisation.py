@@ -1,9 +1,10 @@
 """Unconstrained coordinates for the likelihood: no step can leave the physical range.
 
 The range, scale and longest step of each parameter are declared in `hil.estimator.models.terms`. Positive parameters
-are exponentials. Coupling is a fraction of its bound, sqrt(inertia_1 inertia_2) tanh(z). This bound holds for every arm
-with positive masses and keeps the mass matrix positive definite. Likewise, the asymmetry of viscous friction is viscous
-tanh(z), which keeps friction positive in both directions. The width of the smoothed Coulomb step stays above a floor.
+are exponentials of their coordinates. Coupling is a fraction of its bound: sqrt(inertia_1 inertia_2) tanh(z), where z
+is its coordinate. This bound holds for every arm with positive masses and keeps the mass matrix positive definite.
+Likewise, the asymmetry of viscous friction is viscous tanh(z), which keeps friction positive in both directions. The
+width of the smoothed Coulomb step stays above a floor.
 """
 
 from dataclasses import dataclass
@@ -62,8 +63,9 @@ class Coordinates:
     def moved(self, x: Array, step: Array) -> Array:
         """Return the point reached by `step` (coordinates,) from `x`; other coordinates may follow in both arrays.
 
-        A step changes a width linearly rather than its logarithm, since the motion depends linearly on it. With
-        exponential steps it would never reach its floor, and the parameters that compensate for it would overshoot.
+        A step changes a width itself rather than its logarithm, since the motion depends linearly on the width. With
+        exponential steps the width would never reach its floor, and the parameters that compensate for it would
+        overshoot.
         """
         y = x + step
         widths = np.flatnonzero(self._floors)
@@ -75,7 +77,7 @@ class Coordinates:
         """Tighten, in place, the bounds on the change of each coordinate in one step from `x` (coordinates,).
 
         A width is limited relative to itself, other parameters by their `Term.max_step`. If a width shrank to its floor
-        in a single step, the motion would no longer depend on it, and nothing would bring it back.
+        in a single step, the motion would no longer depend on it, and no later step would increase it again.
         """
         least[: x.size] = np.maximum(least[: x.size], -self._longest)
         most[: x.size] = np.minimum(most[: x.size], self._longest)
@@ -92,7 +94,7 @@ class Coordinates:
         """Return `x` with constant Stribeck rises turned into Coulomb friction; other coordinates may follow in `x`.
 
         Where the Stribeck velocity is beyond all speeds of the motion, only the sum of rise and Coulomb friction is
-        determined, and a fit that has drifted there hardly finds its way back.
+        determined, and a fit that has drifted there rarely returns to lower Stribeck velocities.
         """
         changed = x.copy()
         for index, name in enumerate(self.names):
@@ -197,7 +199,7 @@ class Lever:
 
     coupling: int
     gravity: int
-    """Indices of coupling and gravity_2 among the parameters."""
+    """Index of gravity_2 among the parameters; `coupling`: index of coupling."""
     ratio: float
     """`Model.lever` [s^2]."""
     std: float

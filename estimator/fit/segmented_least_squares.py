@@ -141,7 +141,9 @@ class _Blocks:
     """J'r of the own coordinates (segments, own)."""
 
     def reduced(self, damping: float) -> tuple[Array, Array, Array, Array]:
-        """Return information and scores with own coordinates eliminated, and the terms that recover those."""
+        """Return information and scores with own coordinates eliminated, and the two terms from which these are
+        recovered.
+        """
         eye = np.eye(self.own.shape[1])
         scale = np.diagonal(self.own, axis1=1, axis2=2).max(axis=1)[:, None, None] * 1e-14
         damped = self.own + damping * self.own * eye + scale * eye

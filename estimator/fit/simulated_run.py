@@ -80,13 +80,13 @@ class SimulatedRun:
     ) -> Iterator[tuple[slice, Array, Array]]:
         """Simulate the run piece by piece, with derivatives.
 
-        Yields the samples of each piece, their angles (joints, samples) [rad], and the derivatives of these (joints,
-        samples, causes).
+        Yields the samples of each piece, their angles (joints, samples) [rad], and the derivatives of these angles with
+        respect to `names`, then the initial state (joints, samples, causes).
 
         Args:
             physics: physical constants.
             start: state at the first sample (2, joints) [rad, rad/s].
-            names: parameters with respect to which to differentiate, followed by the initial state.
+            names: parameters with respect to which to differentiate.
             tracking_stiffness: stiffness of springs that pull the simulated arm to the measured angles (joints,) [N
                 m/rad].
             horizon: fraction of the samples to simulate.

@@ -28,7 +28,7 @@ class LinearEstimate:
     names: tuple[str, ...]
     """Names of the base parameters."""
     value: Array
-    """Values (parameters,) [SI]."""
+    """Parameter values (parameters,) [SI]."""
     std: Array
     """Standard errors assuming a white residual (parameters,): too optimistic if the friction is not as modelled."""
     delay: float

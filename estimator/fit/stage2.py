@@ -88,7 +88,7 @@ def fit_runs(
         periods: settled periods of one arm.
         model: the model to fit.
         linear: stage 1's estimate for the same periods.
-        coarse: for comparing models: stop early if the residual is well above the noise.
+        coarse: whether to stop early if the residual is well above the noise, which suffices to compare models.
         starts: parameters by name [SI], additional initial guesses that are tried before all others.
         near: point known to be close to a minimum, used as the only initial guess.
         options: tolerances and limits.
@@ -234,7 +234,7 @@ class _Errors:
     structured: float
     """Part of the sum of squares that is due to model errors."""
     expected: Array
-    """What the priors add to the normal equations (coordinates, coordinates)."""
+    """Contribution of the priors to the normal equations (coordinates, coordinates)."""
 
 
 def _errors(

@@ -65,8 +65,10 @@ def finite_std(std: Array, white: Array) -> Array:
 
 
 def matters(names: tuple[str, ...], beyond: Mask, step: Array, std: Array) -> bool:
-    """Return whether a base parameter, other than an offset, is at its bound (`beyond`) or would move, without bounds,
-    by more than its standard error `std`, which includes the misfit that a parameter's own bound may have caused.
+    """Return whether parameters at their bounds affect the base parameters.
+
+    They do if a base parameter other than an offset is at its bound (`beyond`), or would move by more than its standard
+    error `std` without the bounds. `std` includes the misfit, which a bound may itself have caused.
     """
     base = np.array([term_of(name).part == "base" and kind_of(name) != "offset" for name in names])
     return bool(beyond[base].any() or np.any(np.abs(step[base]) > MOVED * std[base]))

@@ -51,7 +51,7 @@ class Conflict:
     """Standard error of `value`."""
     expected: float
     spread: float
-    """Standard deviation of `expected`, relative to it if `relative`."""
+    """Standard deviation of `expected`; if `relative`, of its logarithm."""
     relative: bool
     deviations: float
     """Distance in combined standard deviations of `value` and `expected`."""

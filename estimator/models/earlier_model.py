@@ -7,8 +7,8 @@ all samples since then is therefore compared with the mean torque over that time
 ripple) cancel, and a push does not. Where the joint has hardly moved in that time, friction may have held it back: a
 gear gives way elastically before it slides.
 
-What a joint's equation, `torque - row theta`, contributes is summed over time, so that the mean between any two stored
-moments takes one subtraction. These functions are part of compiled loops.
+The terms of a joint's equation, `torque - row theta`, are summed over time, so that the mean between any two stored
+moments requires one subtraction. These functions are part of compiled loops.
 """
 
 from typing import Any
@@ -30,11 +30,11 @@ is not exact in the next one: in a fast swing, terms several times as large as t
 """
 
 IN_A_ROW = 2
-"""Number of successive lessons after which a mean residual torque that stays unexplained is reported."""
+"""Number of successive lessons (updates of the model) after which an unexplained mean residual torque is reported."""
 
 ELASTIC_RAD = 0.03
-"""Distance from a reversal over which dry friction approaches that of a sliding joint [rad]: it may first differ by as
-much as it can hold at standstill; the difference falls exponentially with the distance covered.
+"""Distance after a reversal over which dry friction approaches its value in sliding [rad]. The difference between the
+two may at first be as large as static friction, and falls exponentially with the distance covered.
 """
 
 _SLOTS = max(BACK)
@@ -48,7 +48,7 @@ _STORED, _NEXT, _LASTS, _FOUND = 0, 1, 2, 4
 
 
 def memory(count: int) -> Array:
-    """Memory for two joints with `count` parameters each: nothing is stored yet."""
+    """Return an empty memory for two joints with `count` parameters each."""
     return np.zeros((_SLOTS + 2, 1 + 2 * (_ROW + count) + 4 + count + count * count))
 
 
@@ -60,7 +60,8 @@ def forget(past: Any) -> None:
 def add(past: Any, j: int, torque: float, stands: float, velocity: float, row: Any, dt: float) -> None:
     """Add a sample of joint `j`, `dt` [s] after the previous one.
 
-    torque, row: equation of the joint, filtered [N m]. stands: filtered indicator of standstill. velocity: in rad/s.
+    torque, row: equation of the joint, filtered [N m]. stands: filtered indicator of standstill. velocity: velocity
+    [rad/s].
     """
     now, at = past[_SLOTS], 1 + j * (_ROW + row.size)
     if j == 0:
@@ -96,8 +97,8 @@ def store(past: Any, theta: Any, covariance: Any) -> None:
 def compare(past: Any, j: int, back: int, count: int, floor: float, rounding: float, filter_s: float) -> float:
     """Return joint `j`'s mean residual torque over the last `back` lessons [N m]; 0 if the earlier model explains it.
 
-    count: number of parameters. floor: smallest mean that counts [N m]. rounding: variance of one sample's residual due
-    to rounded velocities. filter_s: time constant of the equation's filter [s].
+    Lessons are updates of the model. count: number of parameters. floor: smallest mean that counts [N m]. rounding:
+    variance of one sample's residual due to rounded velocities. filter_s: time constant of the equation's filter [s].
     """
     now, head = past[_SLOTS], past[_SLOTS + 1]
     if head[_STORED] < back:

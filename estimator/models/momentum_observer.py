@@ -23,8 +23,9 @@ What friction can hold includes the viscous friction at the speeds of the usual 
 the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once the joint has
 stopped.
 
-While little is known about an arm, the model follows a disturbance as if it were the arm. Then the mean torque over the
-last tenths of a second is also compared with the model from before (`earlier_model`).
+While little is known about an arm, the updates of the parameters follow a disturbance as if it were a property of the
+arm. Therefore the mean torque over the last tenths of a second is then also compared with an earlier state of the model
+(`earlier_model`).
 
 Errors of the model last longer than the interval between two updates, and so does the rounding of a velocity that stays
 below one tick: they are not new information each time. Therefore each update counts only as a fraction of one.
@@ -96,8 +97,8 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: `largest` is raised to at least this multiple of dry friction, as far as that is known: near standstill,
-    friction behaves differently from the model.
+    frictions: the thresholds follow from `largest`, or from this multiple of the dry friction in `mean` if that is
+    larger: near standstill, friction behaves differently from the model.
     hardly_known: whether only the torque is known beforehand; mean torques are then also compared with the earlier
     model.
     """
@@ -157,7 +158,7 @@ class MomentumObserver:
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Current parameter estimates by name."""
+        """Current parameter estimates by name [SI]."""
         return dict(zip(NAMES, self._memory[_THETA].tolist(), strict=True))
 
 

@@ -7,9 +7,9 @@ offset cancel in these differences, and so do their errors. Only the changes due
 be modelled.
 
 A torque outside the band accelerates a free joint. The joint counts as blocked once a free joint would have gained
-enough momentum to show in the velocity register. Half of the excess may be on the other side of the band, since its
-position is unknown. If a joint does move again, friction had been holding it: a torque that did not move it before
-never raises an alarm again.
+enough momentum to show in the velocity register. Twice that momentum is required, because only half of the excess is
+certain to act on the joint: the position of the band is unknown. If a joint does move again, friction had been holding
+it: a torque that did not move it before never raises an alarm again.
 
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """
@@ -60,9 +60,11 @@ def forget(rest: Any) -> None:
 
 
 def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta: Any) -> float:
-    """Process a sample; return its residual's distance from the farthest one since the joint came to rest [N m].
+    """Process a sample; return the distance of its residual torque from the most distant one since the joint came to
+    rest.
 
-    It is positive if the smallest residual is the farthest, negative if the largest is, and 0 while the joint moves.
+    The residual torque is `torque - row theta`. The distance [N m] is positive if the smallest residual is the most
+    distant one, negative if the largest is, and 0 while the joint moves.
 
     rest: one joint's row of `memory`. stands: filtered indicator of standstill, 0 to 1. torque, row: equation of the
     joint at this sample [N m]. theta: parameters.
@@ -94,7 +96,8 @@ def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta:
 def keep(rest: Any, first: int, row: Any) -> None:
     """Store an equation from column `first` on.
 
-    Element by element: for the assignment of a slice, numba compiles an error message about shapes, which takes 2 s.
+    The elements are copied in a loop: numba would need 2 s more to compile the assignment of a slice, because of its
+    error message about shapes.
     """
     for i in range(row.size):
         rest[first + i] = row[i]

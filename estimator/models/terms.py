@@ -110,15 +110,16 @@ class Term:
     absent: float = 0.0
     """Value that disables the term in the simulation [unit]: 1 for factors and divisors."""
     fastest: float | None = None
-    """Upper bound of a speed, as a multiple of the joint's highest speed; None for no bound.
+    """Upper bound of a term that is a speed, as a multiple of the joint's highest speed; None for no bound.
 
-    A term that hardly changes over all speeds of the motion is another term in disguise: a Stribeck rise that never
+    A term that hardly changes over all speeds of the motion is equivalent to another term: a Stribeck rise that never
     falls is Coulomb friction, a Coulomb step that is never complete is viscous friction.
     """
     max_step: float | None = None
     """Maximum change of its coordinate (for positive terms, of the logarithm) per iteration; None: the fit's limit."""
     standstill: bool = False
-    """Whether it shapes friction near standstill, which has local minima and is fitted from several initial guesses."""
+    """Whether it shapes friction near standstill: its fit has local minima and is started from several initial guesses.
+    """
     replaced_by: str | None = None
     """The option that replaces this term."""
     simulated: bool = True
@@ -149,7 +150,7 @@ _DECLARED = (
     Term(
         "armature",
         "kg m^2",
-        "reflected rotor inertia, felt by its own joint only",
+        "reflected rotor inertia, acting on its own joint only",
         part="base",
         first_joint=2,
         scale="inertia",
@@ -317,7 +318,7 @@ RIGID_BODY: dict[int, tuple[str, ...]] = {
 }
 """Base parameters of the links, by number of joints."""
 BASE_FRICTION = ("viscous", "coulomb", "offset")
-"""The other base terms, one per joint."""
+"""Base terms other than those of the links, one per joint."""
 
 
 def kind_of(name: str) -> str:

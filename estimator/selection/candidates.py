@@ -80,7 +80,7 @@ class Linearised:
 
     @cached_property
     def expected(self) -> Array:
-        """Normal equations of the priors of all unknowns (unknowns, unknowns)."""
+        """Contribution of the priors of all unknowns to the normal equations (unknowns, unknowns)."""
         expected = np.zeros_like(self.normal)
         count = len(self.names)
         expected[:count, :count] = np.diag(self.precision)
@@ -99,7 +99,7 @@ class Linearised:
         return [self.names.index(name) for name in names]
 
     def fall(self, names: Sequence[str]) -> tuple[float, Array]:
-        """Return the decrease of the sum of squares if these parameters are freed, and their changes.
+        """Return the decrease of the sum of squares if these parameters are freed, and the resulting changes of them.
 
         The initial state is freed as well.
         """
@@ -192,8 +192,8 @@ def ranked(
 
 
 def considered(period: SettledPeriod, estimate: Estimate) -> Array:
-    """Return the estimate's covariance (parameters, parameters), including the effect of omitted terms that cannot be
-    ruled out.
+    """Return the estimate's covariance (parameters, parameters) [SI], including the effect of omitted terms that cannot
+    be ruled out.
 
     Each such parameter is described by its prior and the information from the motion, as if it were fitted as well.
     Since it is not fitted, the change that fitting it would make counts as an error, too.
@@ -305,7 +305,7 @@ def by_parameters(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def columns_of(run: Run, physics: Physics, start: Array, names: tuple[str, ...], weight: Array) -> tuple[Array, Array]:
-    """Return weighted derivatives (joints samples, unknowns) and simulated positions (joints, samples)."""
+    """Return weighted derivatives (joints * samples, unknowns) and simulated positions (joints, samples) [rad]."""
     pieces = list(run.pieces(physics, start, names))
     derivative = np.concatenate([each for _, _, each in pieces], axis=1) * weight[:, :, None]
     position = np.concatenate([each for _, each, _ in pieces], axis=1)

@@ -35,7 +35,7 @@ class Drift:
     """Relative change of each joint's friction from the fitted periods to later ones."""
 
     change: Array
-    """Relative change (joints,); negative if friction fell."""
+    """Change as a fraction of the friction in the fitted periods (joints,); negative if friction fell."""
     std: Array
     """Standard error of the change (joints,)."""
     seconds: float
@@ -66,7 +66,8 @@ class Drift:
 
 
 def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
-    """Return the covariance (parameters, parameters) including the effect of friction that changed during `period`.
+    """Return the estimate's covariance (parameters, parameters) [SI], including the effect of friction that changed
+    during `period`.
 
     The fit assumes constant friction. If friction changes at the rate of `drift`, other parameters absorb part of this
     slow change of torque. This mainly concerns parameters whose torque also varies slowly, such as the gravity terms

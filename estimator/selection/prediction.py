@@ -48,7 +48,7 @@ def prediction_errors(
     """Predict segments of recordings; return RMS errors (segments, joints) [rad] and numbers of samples (segments,).
 
     The simulation is restarted for every segment from the angle and velocity estimated from the surrounding samples,
-    and then uses only the torque. A diverging simulation counts as an error of pi.
+    and then uses only the torque. A diverging simulation counts as an error of pi rad.
 
     Args:
         recordings: recordings of one arm.

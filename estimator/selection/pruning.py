@@ -1,4 +1,4 @@
-"""Terms of a model that do not differ significantly from zero, judged by its covariance without another fit."""
+"""Removal of terms that do not differ significantly from zero. The covariance decides, without another fit."""
 
 from collections.abc import Sequence
 from dataclasses import replace

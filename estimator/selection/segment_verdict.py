@@ -36,7 +36,7 @@ IMPROVEMENT = {
 
 @dataclass(frozen=True)
 class SegmentEvidence:
-    """Evidence in addition to the estimate."""
+    """Evidence for a verdict, in addition to the estimate."""
 
     held_out: Array | None
     """RMS error of predictions of held-out segments, relative to the motion's RMS (joints,)."""

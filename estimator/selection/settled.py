@@ -1,7 +1,7 @@
 """Friction model selection: models are fitted from simple to rich and judged on a held-out motion.
 
-A richer model always has a smaller residual on the motion to which it was fitted. Its free prediction of another
-motion, from rest, improves only if its terms are real, or by chance. Therefore it must also reduce the residual more
+A richer model always has a smaller residual on the motion to which it was fitted. Its open-loop prediction of another
+motion improves only if its terms are real, or by chance. Therefore a richer model must also reduce the residual more
 than meaningless terms would. Without another motion, the Bayesian information criterion is used (Schwarz, Annals of
 Statistics 6 (1978) 461), with the number of samples reduced according to the residual's correlation.
 """
@@ -47,13 +47,13 @@ def choose(
     """Fit `periods` with the terms that the data support.
 
     First, Stribeck friction is fitted together with the encoders' zeros and the ratio of two torque constants, which
-    are never known exactly. If that does not explain the motion, or if the score test finds something in the residual
-    (`hil.estimator.selection.candidates`), all other smooth terms are added at once: load, direction, saturation,
-    cables, encoder nonlinearity. Adding them one by one would be misleading, since each takes over the effects of the
-    missing ones; together, with typical sizes as a prior, they can be separated. Then presliding friction and torque
-    ripple are tried, and finally insignificant terms are removed. A model that predicts `held_out` worse than a simpler
-    one is not chosen. If friction differs between the two recordings, it also changed within each of them, which is
-    corrected (`hil.estimator.selection.steadied`).
+    are never known exactly. If that does not explain the motion, or if a score test finds a significant term in the
+    residual (`hil.estimator.selection.candidates`), all other smooth terms are added at once: load, direction,
+    saturation, cables, encoder nonlinearity. Adding them one by one would be misleading, since each takes over the
+    effects of the missing ones; together, with typical sizes as a prior, they can be separated. Then presliding
+    friction and torque ripple are tried, and finally insignificant terms are removed. A model that predicts `held_out`
+    worse than a simpler one is not chosen. If friction differs between the two recordings, it also changed within each
+    of them, which is corrected (`hil.estimator.selection.steadied`).
 
     Args:
         periods: settled periods of one arm to be fitted; the first is used to find missing terms.

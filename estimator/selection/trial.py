@@ -24,7 +24,7 @@ QUICK = LikelihoodOptions(
     integration=IntegrationOptions(max_substeps=16),
     coarse_integration=IntegrationOptions(max_step=2.6e-3, max_substeps=8),
 )
-"""Limits with which no substeps are wasted on bristles that become extremely stiff."""
+"""Options of a quick fit: with few iterations and substeps, little time is lost if bristles become extremely stiff."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Trial:
     estimate: Estimate | None
     """Result of the fit; None if the fit or the prediction did not converge."""
     held_out: Array | None
-    """RMS error of the free prediction relative to the motion's RMS (joints,)."""
+    """RMS error of the open-loop prediction of the held-out motion, relative to that motion's RMS (joints,)."""
     score: float
-    """RMS error of the free prediction in units of the noise; without a held-out motion, the equivalent criterion."""
+    """RMS error of that prediction in units of the noise; without a held-out motion, the result of `criterion`."""
     seconds: float
     coarse: bool = False
     """Whether the fit was allowed to stop early if it left much of the motion unexplained."""
@@ -70,14 +70,14 @@ class Choice:
 
     @property
     def gained(self) -> float:
-        """Ratio of the simplest model's error to the chosen one's."""
+        """Ratio of the simplest model's prediction error to the chosen model's."""
         return self.plainest.score / self.chosen.score
 
     @property
     def cost(self) -> float:
-        """Increase of the base parameters' standard errors due to the added terms (geometric mean of ratios).
+        """Factor by which the added terms increase the standard errors of the base parameters (geometric mean).
 
-        They are compared with the standard errors that would result if the added terms were known exactly.
+        The reference is the standard errors that would result if the added terms were known exactly.
         """
         estimate = self.estimate
         std = estimate.std
@@ -134,7 +134,10 @@ class Fitting:
 
 
 def criterion(estimate: Estimate, periods: Sequence[SettledPeriod]) -> float:
-    """Return exp(BIC / 2n) of the residual in units of the noise, comparable to a prediction error."""
+    """Return exp(BIC / 2n) of the residual in units of the noise, which is comparable to a prediction error.
+
+    BIC: Bayesian information criterion. n: number of samples, reduced according to the residual's correlation.
+    """
     noise = periods[0].noise
     size = np.nanmean((estimate.residual / noise[:, None]) ** 2)
     samples = sum(period.valid.sum() for period in periods) / estimate.correlation_time

@@ -1,9 +1,9 @@
 """Friction model selection for recordings without a settled period.
 
 The procedure is the same as for settled periods (`hil.estimator.selection.settled`). Stribeck friction is fitted first.
-If it does not explain the motion, or if score tests find something, all other smooth terms are added at once, with
-their typical sizes as a prior; then insignificant terms are removed. Every fit but the first starts from an earlier
-result.
+If it does not explain the motion, or if score tests find a significant term, all other smooth terms are added at once,
+with their typical sizes as a prior; then insignificant terms are removed. Every fit but the first starts from an
+earlier result.
 
 If the motion is explained down to the noise, the likelihood decides. Otherwise a richer model may merely compensate for
 another missing term. Then every other segment of each recording is fitted and the remaining ones are predicted, also by
@@ -64,7 +64,7 @@ class SegmentChoice:
 
     @property
     def gained(self) -> float:
-        """Ratio of the simplest model's error to the chosen one's."""
+        """Ratio of the simplest model's prediction error to the chosen model's."""
         fitted = [each for each in self.trials if each.held_out is not None]
         return min(fitted, key=lambda each: len(each.model.names)).score / self.chosen.score
 
@@ -102,9 +102,10 @@ def choose_by_shooting(
 
 
 def held_out_error(recordings: Sequence[Recording], estimate: ShootingEstimate, start: Array) -> Array | None:
-    """Return the error of the estimate's model on every other segment when fitted to the remaining ones (joints,).
+    """Fit the estimate's model to every other segment and return its prediction error on the remaining ones (joints,).
 
-    None if no recording has two segments.
+    The error is the RMS error relative to the motion's RMS. None if the fit does not converge or no recording has two
+    segments. start: initial guess as in `estimate_by_shooting`.
     """
     length, zeros = estimate.segment_length, bool(estimate.zeros.size)
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):

@@ -54,11 +54,11 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence in addition to the estimate and its validation."""
+    """Evidence for a verdict, in addition to the estimate and its validation."""
 
     held_out: Array | None = None
-    """RMS error of the free prediction of a held-out motion, relative to that motion's RMS (joints,), excluding encoder
-    noise.
+    """RMS error of the open-loop prediction of a held-out motion, relative to that motion's RMS (joints,), excluding
+    encoder noise.
 
     If friction has changed since the fitted motion, the prediction uses one factor per joint taken from the held-out
     motion itself.

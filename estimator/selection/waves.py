@@ -30,10 +30,10 @@ def wave_peaks(
     """Return the numbers of `cycles` per turn with which a wave explains more of the residual than with neighbouring
     numbers, best first.
 
-    Whatever the fitted parameters can explain is removed from residual and waves first. The result is by parameter
-    name. If the estimate's model includes a wave that is searched for, that wave is disabled first. If other terms have
-    absorbed part of a wave, the best number may be wrong. Therefore other numbers are returned as well if they explain
-    at least the fraction `COMPARABLE` of the sum of squares that the best one explains.
+    Whatever the fitted parameters can explain is removed from residual and waves first. The result is keyed by
+    parameter name. If the estimate's model includes a wave that is searched for, that wave is disabled first. If other
+    terms have absorbed part of a wave, the best number may be wrong. Therefore other numbers are returned as well if
+    they explain at least the fraction `COMPARABLE` of the sum of squares that the best one explains.
 
     only: joints, from 1, that are considered; by default all.
     """

@@ -105,7 +105,8 @@ def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> NDA
 
     Within one substep, a reversal of dry friction may take a joint through a quarter of its Coulomb step's width. The
     numbers are powers of two, so that small changes of the physics seldom change them, and with them the last digits of
-    the motion. They differ between joints, since the velocity of a joint with a wide step is nearly always within it.
+    the motion. They differ between joints, since the velocity of a joint with a wide step is nearly always within that
+    width.
     """
     needed = [min(4.0 * step / max(time, 1e-12), most) for time in physics.crossing_times()]
     return np.array([2 ** math.ceil(math.log2(max(each, 1.0))) for each in needed], dtype=np.int64)
@@ -197,7 +198,9 @@ def pieces_now(p: Any, v1: float, v2: float, a1: float, a2: float, piece: float,
 def step_on(
     p: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, h: float
 ) -> tuple[float, float, float, float, float, float]:
-    """Return angles, velocities and mean accelerations after a step of `h` [s] with motor torques t1 and t2 [N m]."""
+    """Return angles and velocities after a step of `h` [s] with motor torques t1 and t2 [N m], and the step's mean
+    accelerations.
+    """
     m22 = p[2] + p[3]
     m11, m12, f1, f2, slope_1, slope_2 = _forces(p, q1, q2, v1, v2, t1, t2)
     # Stage 1: (M + gamma h S) k = f, with S the slopes of friction.

@@ -68,7 +68,7 @@ def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Arr
 
 
 def neglected(physics: Physics) -> dict[str, float]:
-    """Return the standard deviations of the joints' own inertias due to what this description neglects [kg m^2].
+    """Return the standard deviations of the joints' own inertias due to effects that this model neglects [kg m^2].
 
     The effect of friction on the motor's current is delayed by lag' - lag, which is of second order in b lag' / J:
     negligible on most arms, but 5 % of the inertia of an XL430 with hardly any load. The result is by name.

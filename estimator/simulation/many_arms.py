@@ -39,7 +39,7 @@ class SettlingRule:
     """Rule for the number of periods to simulate.
 
     within: two successive periods that differ by at most this fraction of the motion's RMS count as settled.
-    most_periods: maximum number of periods after the first to wait for that.
+    most_periods: maximum number of periods, after the first, in which the motion may settle.
     periods: total number of settled periods that are then simulated.
     """
 

@@ -287,7 +287,11 @@ def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple
 
 
 def arm_step(p: Any, x: Any, t1: float, t2: float, h: float, now: int, room: Any) -> tuple[float, float]:
-    """Advance the state x (2, joints) by one step, with its rows and scalars; return the accelerations."""
+    """Advance the state x (2, joints) by a step of `h` [s], with its rows and scalars; return the accelerations
+    [rad/s^2].
+
+    t1, t2: motor torques [N m].
+    """
     _, numbers, here, left, slope, _, _, _ = room
     gh, half = GAMMA * h, 0.5 * h * h
     m22 = p[2] + p[3]

@@ -66,7 +66,7 @@ class FakeBus:
         """Number of times the adapter's cable was unplugged. A port that was open at the time stays lost."""
         self.cable_is_out = False
         self.pulled_at = -math.inf
-        """Time at which the cable was last unplugged."""
+        """Time on `clock` at which the cable was last unplugged [s]."""
         self._servos = tuple(servos)
         self._joints = Joints(servos, plant, joints)
         self._one_each = self._joints.one_each
@@ -193,12 +193,14 @@ class FakeBus:
 
     @property
     def sent_by(self) -> float:
-        """Time at which the last byte written by the host has been sent."""
+        """Time on `clock` at which the last byte written by the host has been sent [s]."""
         return self._sent_by
 
     @property
     def next_reply_by(self) -> float:
-        """Time at which the next contiguous group of replies will have arrived; infinite if there is none."""
+        """Time on `clock` at which the next contiguous group of replies will have arrived [s]; infinite if there is
+        none.
+        """
         return self._wire.next_reply_by
 
     def discard_input(self) -> None:
@@ -217,7 +219,7 @@ class FakeBus:
                 self._change_faults(now)
 
     def advance(self, until: float) -> None:
-        """Advance plant, servos and faults to `until`; do nothing if that is in the past."""
+        """Advance plant, servos and faults to the time `until` [s]; do nothing if that is in the past."""
         if until <= self._now:
             return
         event = until >= self._next_tick or until - self._origin >= self.faults.next_change
@@ -377,7 +379,7 @@ class FakeBus:
 
     @property
     def servos_refuse(self) -> bool:
-        """Whether an active fault makes servos refuse commands."""
+        """Whether an active fault makes the servos refuse commands."""
         return bool(self.faults.on_answers)
 
     def fault_error(self, servo: EmulatedServo, now: float) -> int:

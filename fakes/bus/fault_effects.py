@@ -40,7 +40,7 @@ def begin(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], 
 
 
 def end(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], plant: Plant) -> None:
-    """Undo a fault if its effect is temporary: a heated servo stays hot, and an error stays until a reboot."""
+    """Undo a fault if its effect is temporary. A heated servo stays hot, and an error remains until a reboot."""
     for joint, servo in zip(joints, servos, strict=True):
         if not fault.concerns(servo.id):
             continue

@@ -57,7 +57,7 @@ class FaultKind(StrEnum):
 
 
 class FaultFacts(NamedTuple):
-    """What a kind of fault does, and the meaning and default of its `amount`."""
+    """Effect of a kind of fault, and the meaning and default of its `amount`."""
 
     does: str
     amount: str = ""
@@ -73,9 +73,9 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
         "the adapter delays a status packet, and with it those that directly follow", "seconds", 0.02
     ),
     FaultKind.NOISE: FaultFacts("random bytes precede a status packet", "bytes", 8),
-    FaultKind.LOST_INSTRUCTION: FaultFacts("an instruction packet is not received, by one servo or by all"),
+    FaultKind.LOST_INSTRUCTION: FaultFacts("an instruction packet is lost on its way to one servo, or to all servos"),
     FaultKind.CORRUPTED_INSTRUCTION: FaultFacts(
-        "an instruction packet arrives with a wrong CRC, at one servo or at all"
+        "an instruction packet arrives with a wrong CRC at one servo, or at all servos"
     ),
     FaultKind.STATUS_ERROR: FaultFacts(
         "a servo refuses commands and answers with an error; with 128 (only the Alert bit) it obeys and sets Alert",
@@ -96,7 +96,7 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
         "the adapter's cable is unplugged, and replugged when the fault ends; the port must be reopened"
     ),
 }
-"""What every kind of fault does."""
+"""Effect of every kind of fault."""
 
 REPLY_FAULTS = frozenset(
     {

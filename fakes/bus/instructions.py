@@ -33,7 +33,7 @@ from hil.fakes.servo.backup import RESET_ALL
 from hil.fakes.servo.servo import EmulatedServo
 
 Part = tuple[int, int, int]
-"""What a group read requests from one servo: ID, address, length."""
+"""The part of a group read that concerns one servo: its ID, and the address and number of the bytes to read."""
 
 
 class Line(Protocol):

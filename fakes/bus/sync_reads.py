@@ -49,7 +49,7 @@ class _Request(NamedTuple):
     address: int
     length: int
     is_of_state: bool
-    """Whether it reads the state, rather than registers that only a write can change."""
+    """Whether the group read covers the joint state, rather than registers that only a write can change."""
 
 
 class GroupReads:

@@ -1,4 +1,4 @@
-"""What a serial receiver reads from bytes sent at a different baud rate."""
+"""The bytes that a serial receiver reads when data are sent at a different baud rate."""
 
 _IDLE = 1
 _STOP = 9  # index of the stop bit among the ten bits of a byte: start, eight data bits, stop

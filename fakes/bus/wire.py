@@ -39,7 +39,7 @@ class Arriving(NamedTuple):
         return min(int((deadline - self.first) / self.byte_s) + 1, len(self.data))
 
     def after(self, count: int) -> "Arriving":
-        """Return what is left after the first `count` bytes."""
+        """Return the bytes that remain after the first `count`, with their arrival times."""
         return Arriving(self.data[count:], self.first + count * self.byte_s, self.byte_s)
 
 
@@ -82,8 +82,8 @@ class Wire:
     def put(self, data: bytes, start: float, late_s: float = 0.0) -> float:
         """Transmit a servo's data from time `start`; return the time at which the transmission ends.
 
-        late_s: additional delay in the adapter [s], which also holds back what directly follows on the wire: it is in
-        the same buffer. If another reply is being transmitted, both are lost.
+        late_s: additional delay in the adapter [s]. It also holds back the bytes that directly follow on the wire,
+        because they are in the same buffer. If another reply is being transmitted, both are lost.
         """
         byte_s = self.byte_s
         end = start + len(data) * byte_s
@@ -112,7 +112,9 @@ class Wire:
         self.reply_by = max(self.reply_by, until)
 
     def take(self, size: int, deadline: float, now: float) -> tuple[bytes, float]:
-        """Return up to `size` bytes that have arrived by `deadline`, and when the last one arrived (at least `now`)."""
+        """Return up to `size` bytes that have arrived by `deadline`, and the arrival time of the last one [s], at least
+        `now`.
+        """
         arriving = self._arriving
         if arriving and len(arriving[0].data) == size:  # the usual case: the reply to one write, in one read
             segment = arriving[0]

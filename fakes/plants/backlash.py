@@ -155,8 +155,8 @@ class _Links:
 
     @property
     def lightness(self) -> float:
-        """Upper bound, over all poses, on the acceleration per unit of torque at the joints [1/(kg m^2)]: trace over
-        determinant of the mass matrix.
+        """Upper bound, over all poses, on the acceleration per unit of torque at the joints [1/(kg m^2)]: the
+        trace of the mass matrix divided by its determinant.
         """
         if len(self.angle) == 1:
             return 1.0 / self._first

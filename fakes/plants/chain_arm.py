@@ -65,7 +65,7 @@ class ChainArm(Described):
 
     @property
     def description(self) -> ArmDescription:
-        """The URDF's arm; raises ArmFileError."""
+        """The arm as its URDF describes it; raises ArmFileError."""
         return read_arm(Path(self.urdf), self.joints)
 
     @property

@@ -1,4 +1,5 @@
-"""One joint's drive during a plant's time step: current lag, torque, friction, stops. Plain floats, called every step.
+"""One joint's drive during a plant's time step: current lag, torque, friction, stops. It runs in every step, so it uses
+plain floats.
 
 Presliding friction follows Canudas de Wit, Olsson, Astrom and Lischinsky (IEEE Transactions on Automatic Control 40
 (1995) 419): bristles deflect with the joint, and slip more the further they are deflected,
@@ -88,7 +89,7 @@ class Motor:
             drive.coulomb * dry * drive.stribeck_rise,
             1.0 / drive.stribeck_velocity,
         )
-        """Torque constant, offset, Coulomb level, Stribeck rise, 1 / Stribeck velocity."""
+        """Torque constant [N m/A], offset and Coulomb level [N m], Stribeck rise [1], 1 / Stribeck velocity [s/rad]."""
         self.viscous = drive.viscous * viscous
         self.plain = (*self.constants, self.viscous, self._lag)
         """`constants`, viscous friction [N m s/rad] and current lag [s]: all that matters while the drive is plain."""
@@ -99,10 +100,12 @@ class Motor:
         return not (self._shaped or self._width or self.bristle_stiffness or self.jammed or self.held_at is not None)
 
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
-        """Return the effect of the drive during one step, given angle and velocity at the middle of the step.
+        """Return the effect of the drive during a step of `step` [s], given angle and velocity at the middle of the
+        step.
 
-        Returns the mean torque without stiction [N m], the level of the dry friction that can hold the joint [N m], the
-        slope of the smooth friction at this velocity [N m s/rad], and the current at the end of the step [A].
+        command: commanded current [A]. Returns the mean torque without stiction [N m], the level of the dry friction
+        that can hold the joint [N m], the slope of the smooth friction at this velocity [N m s/rad], and the current at
+        the end of the step [A].
         """
         torque_constant, offset, level, rise, per_velocity = self.constants
         left, mean_left = self.lag(step)
@@ -151,7 +154,9 @@ class Motor:
         return end + (self.bristle_torque - end) * exp(-self.bristle_stiffness * abs(velocity) * step / self._level)
 
     def lag(self, step: float) -> tuple[float, float]:
-        """Return the remaining fraction of a current error at the end of a step, and its mean over the step."""
+        """Return the fraction of a current error that remains at the end of a step of `step` [s], and its mean over the
+        step.
+        """
         if self._lag and step != self._step:
             # Exact solution of a first-order lag under a constant command.
             self._step = step

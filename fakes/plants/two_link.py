@@ -17,7 +17,7 @@ and just large enough to bring the joint to rest, so stiction is exact. A step i
 is split there.
 
 In a process that has loaded numba anyway, as hil's own experiments do, the loop is compiled for arms with plain drives.
-Its results are the same to the last bit, so a fake that is used on its own is not compiled.
+Its results are the same to the last bit. Without numba, the loop is not compiled.
 """
 
 import sys
@@ -30,8 +30,8 @@ from hil.fakes.plants.arm import Arm, Link, armature
 from hil.fakes.plants.motor import SHORTEST_STEP, Motor
 
 State = tuple[float, float, float, float, float, float, float, float]
-"""Angles, velocities, accelerations of the last step, currents. The accelerations are used to extrapolate velocities to
-the middle of the next step.
+"""Two angles [rad], velocities [rad/s], accelerations of the last step [rad/s^2] and currents [A]. The accelerations
+are used to extrapolate velocities to the middle of the next step.
 """
 
 

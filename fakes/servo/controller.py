@@ -25,7 +25,7 @@ FULL_PWM = 885
 """Goal PWM at which the whole supply voltage is applied to the motor."""
 
 IN_POSITION_TICKS = 20
-"""Distance from the goal below which Moving Status reports in-position. Uncertain."""
+"""Distance from the goal below which Moving Status reports in-position; the value is uncertain."""
 
 _TIME_BASED = 0x04  # bit of Drive Mode
 

@@ -58,10 +58,10 @@ class Reading:
         """Whether its only error is rounding."""
 
     def steady(self, ticks: float) -> float:
-        """Return the reading without noise, before rounding, if a perfect encoder would read `ticks`."""
+        """Return the reading [ticks] without noise, before rounding, if a perfect encoder would read `ticks`."""
         return ticks if self._encoder.is_linear else ticks + self._encoder.error(ticks)
 
     def sample(self, ticks: float) -> float:
-        """Return one reading with noise, before rounding, if a perfect encoder would read `ticks`."""
+        """Return one reading [ticks] with noise, before rounding, if a perfect encoder would read `ticks`."""
         read = self.steady(ticks)
         return read if self._noise is None else read + self._noise.gauss(0.0, self._encoder.noise_ticks)

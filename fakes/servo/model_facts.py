@@ -50,7 +50,7 @@ class Motor(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ModelFacts:
-    """What distinguishes one model.
+    """Properties in which models differ.
 
     motor: its motor at the nominal voltage.
     differs: registers whose facts differ from those of the X series.
@@ -76,7 +76,7 @@ _Facts = RegisterFacts
 _GAIN = (0, 16_383)
 _READ_ONLY = _Facts(writable=False)
 NEVER = 256
-"""A firmware version that no servo has."""
+"""A firmware version that no servo has, for features that no firmware supports."""
 
 INDIRECT_MOVED_FIRMWARE = 52
 """First firmware with which the 330 series has its indirect data at address 208.

@@ -13,11 +13,11 @@ from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, Emulate
 
 PRESENT_START = 120
 PRESENT_END = 147
-"""Address of the first present register, and the address after the last."""
+"""Address after the last of the present registers, which begin at `PRESENT_START`."""
 
 STATE_START = 126
 STATE_END = 136
-"""Start and end addresses of the block Present Current, Velocity and Position (end exclusive)."""
+"""Address after the block Present Current, Velocity and Position, which begins at `STATE_START`."""
 
 _TICKS_PER_RAD = TICKS_PER_TURN / math.tau
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM

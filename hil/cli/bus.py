@@ -1,4 +1,4 @@
-"""The subcommands that work on the servos of a bus: scan, check, setup.
+"""The subcommands that work on the servos of a bus: scan, check, pose, setup.
 
 The modules that do the work are imported inside the commands, so that `hil --help` responds immediately.
 """

@@ -2,7 +2,7 @@
 
 
 def exit_code(error: Exception) -> int | None:
-    """Exit code of an expected error; None for a bug in the program."""
+    """Return the exit code for an expected error; None for any other exception, which is a bug in the program."""
     from hil.drivers import errors as driver
     from hil.errors import HilError
     from hil.estimator.errors import EstimationError
@@ -18,9 +18,10 @@ def exit_code(error: Exception) -> int | None:
 
 
 def message(error: Exception) -> str:
-    """Return the error's message, that of an expected error that was being handled when it occurred, and its notes.
+    """Return the text to print for an error: its message and its notes.
 
-    The notes end with the next command, if they name one.
+    If the error occurred while another expected error was being handled, the message of that error is included. If the
+    notes name a command to type next, they end with it.
     """
     lines = [f"hil: {error}"]
     cause = None if error.__suppress_context__ else error.__context__

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from hil.api.run import Estimation, Identification
 
 TakeOver = Annotated[
-    bool, typer.Option("--take-over", help="Take over an arm whose torque is on: support it by hand; it sinks slowly.")
+    bool,
+    typer.Option(
+        "--take-over", help="Take over an arm whose torque is already on. It sinks slowly: support it by hand."
+    ),
 ]
 StartFrom = Annotated[
     Path | None,

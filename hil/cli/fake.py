@@ -48,7 +48,9 @@ def list_faults() -> None:
 
 
 def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
-    """Move (while their torque is off) or release joints of the fake arm served at `device`. Raises ConfigError."""
+    """Move or release joints of the fake arm served at `device`. They only move while torque is off. Raises
+    ConfigError.
+    """
     try:
         for servo in release:
             ask_hand(device, f"release {servo}")

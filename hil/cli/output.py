@@ -1,4 +1,4 @@
-"""Handle standard output that its reader closed early or that goes to a full disk. Results have been saved by then."""
+"""Handle failures of standard output: its reader has closed the pipe, or the disk is full. Results are saved before."""
 
 import errno
 import os

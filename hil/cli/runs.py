@@ -12,7 +12,7 @@ from hil import strict_json
 from hil.cli.options import Json, RunPath
 
 _WHOLE = 100.0
-"""Change [%] beyond which no figure is given: these runs reveal nothing about that term."""
+"""Smallest detectable change [%] above which the output gives no figure: the runs reveal nothing about that term."""
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

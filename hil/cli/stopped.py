@@ -50,8 +50,8 @@ def how_to_go_on(stopped: BaseException) -> list[str]:
 
 
 def same_again(stopped: BaseException) -> list[str]:
-    """Return a line that suggests the same command again, unless the notes attached to the interruption name a next
-    command.
+    """Return a list with one line that suggests the same command again; empty if the notes attached to the
+    interruption name a next command.
     """
     notes = getattr(stopped, "__notes__", [])
     return [] if any("hil " in note for note in notes) else [next_step(*sys.argv[1:])]

@@ -36,10 +36,10 @@ _NARROW = 76
 """Smallest terminal width into which the bar fits [columns]."""
 
 _QUIET_S = 0.7
-"""Time without a report, once the arm is at rest, after which the display says what is being computed [s]."""
+"""If the arm is at rest and no report has arrived for this time [s], the display says what is being computed."""
 
 _CELLS = 3
-"""Smallest number of cells for a line to count as a row of a table."""
+"""A line counts as a row of a table if it has at least this many cells."""
 
 
 class Terminal:

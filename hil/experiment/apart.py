@@ -2,7 +2,7 @@
 
 Two servos on one joint are coupled by their horns. A horn that slips, a loose screw or a broken gear lets one of them
 turn without the other. The joint's angle is taken from the first servo and does not show this. The difference between
-their angles is compared with what it was at the first sample, because horns may be mounted at any angle. If the
+their angles is compared with its value at the first sample, because horns may be mounted at any angle. If the
 configured direction of one servo is wrong, the servos work against each other. The joint then does not turn at all, as
 if an obstacle held it.
 """
@@ -13,7 +13,9 @@ from math import isnan
 from hil.drivers.joint import Joint
 
 ALLOWED_RAD = 0.1
-"""Tolerance for backlash of two gear trains, encoder nonlinearity, and twist of the joint between its servos."""
+"""Allowed change of the difference between the angles of two servos [rad], for backlash of both gear trains, encoder
+nonlinearity, and twist of the joint between the servos.
+"""
 
 
 def opposed(joint: Joint) -> str:

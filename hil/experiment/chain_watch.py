@@ -2,10 +2,10 @@
 
 Prior knowledge is the ensemble's mean and inflated covariance. The ensemble is drawn around the description, and
 updated after each step of a pilot. While the arm is in its rest pose, something may support it, so nothing is judged.
-A joint at a standstill at its rest angle is judged only by torques that would move it towards the side on which it has
-been, because on the way home it may reach its end stop before the other joints do. A joint that has been on both sides
-of its rest angle has no stop there. A joint that has not left its rest angle yet may rest against a stop on the side to
-which gravity pulls it: it is judged only while it is commanded to that side.
+A joint that stands still at its rest angle may lie against an end stop there, for example because it has reached it
+before the other joints. It is therefore judged only by torques towards the side on which it has been. A joint that has
+been on both sides of its rest angle has no stop there. A joint that has not left its rest angle yet may rest against a
+stop on the side to which gravity pulls it: it is judged only while it is commanded to that side.
 """
 
 import math
@@ -34,8 +34,8 @@ WIDENED = 1.5
 
 LYING_RAD = 0.08
 _FRICTIONS = 8.0
-"""Lower bound on the torque scale, in multiples of the mean dry friction: up to twice that friction must not raise an
-alarm.
+"""Lower bound on the torque from which the alarm thresholds follow, in multiples of the mean dry friction: twice that
+friction must not raise an alarm.
 """
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
@@ -81,7 +81,7 @@ class ChainWatch:
 
     @property
     def residual(self) -> Residual:
-        """What the model does not explain in the latest sample."""
+        """Torque in the latest sample that the model does not explain."""
         return Residual(self._observer.lacking, self._observer.torque, self._observer.is_beyond)
 
     def observe(self, state: State) -> int:
@@ -150,8 +150,9 @@ def observed_parameters(arms: ChainArms) -> tuple[Array, Array]:
 def linear_parameters(arms: ChainArms) -> Array:
     """Base parameters, viscous and dry friction, and offsets of each arm (arms, base + 3 * joints).
 
-    They are divided by the torque scale, i.e. in units of the commanded torque. If the scales of the joints differ, a
-    base parameter that affects several joints is divided by the first one's scale.
+    They are in SI units, divided by the joint's ratio of actual to commanded torque, so that they refer to the
+    commanded torque. If the ratios of the joints differ, a base parameter that affects several joints is divided by the
+    first joint's ratio.
     """
     scale = arms.drive[:, 4]
     owner = np.array([int(name.rpartition("_")[2]) - 1 for name in arms.base.names])

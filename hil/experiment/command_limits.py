@@ -1,4 +1,4 @@
-"""Limits on what is commanded: each joint's goal limit, its rate of change, and rejection of values that are not
+"""Limits on commanded goals: the largest goal of each joint, its rate of change, and rejection of values that are not
 finite.
 """
 
@@ -10,7 +10,7 @@ from hil.errors import Cause, SafetyStop
 
 
 class CommandLimits:
-    """Clamps goals, regardless of what computed them."""
+    """Clamps goals from any source."""
 
     def __init__(self, config: Config) -> None:
         self._names = [joint.joint.title for joint in config.joints]

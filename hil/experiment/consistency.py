@@ -23,8 +23,8 @@ perhaps during the last `LAG_S`. The distance covered before that must therefore
 the reported velocity is frozen. This detects a velocity that freezes near its peak sooner than the memories do, in
 which a lag could explain the difference.
 
-Lag and scale error belong to a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to twice the
-values estimated by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
+Lag and scale error are properties of a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to
+twice the values estimated by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
 that it keeps for a joint is a record of the type `MEMORY`.
@@ -67,8 +67,8 @@ _LAG_SHARE = 0.25
 """Allowance for a lag that is not a pure delay, as a fraction of the lag times the range of velocities."""
 
 STEP_RAD, STEP_TIMES = 0.0077, 7.0
-"""Smallest difference that counts as a jump of the position [rad], five ticks, and its smallest ratio to the RMS of the
-usual differences.
+"""Smallest difference between the change of position and the integral of velocity that counts as a jump [rad] (five
+ticks), and its smallest ratio to the RMS of ordinary differences.
 """
 
 STEPS, STEPS_S = 4, 0.5
@@ -107,7 +107,8 @@ _FADING = np.dtype(
 """A fading memory.
 
 apart: position minus integral of velocity [rad]. far: distance covered [rad]. mean, span: mean and range of the
-velocity [rad/s]. curved, unknown: uncertainties [rad].
+velocity [rad/s]. curved: uncertainty due to the motion between samples [rad]. unknown: uncertainty due to the times of
+the measurements [rad].
 """
 
 _STEPS = np.dtype([("square", "f8"), ("age", "f8"), ("since", "f8"), ("count", "f8")])
@@ -123,7 +124,8 @@ _SAME = np.dtype(
 """Motion since the velocity last changed.
 
 seconds, moved, unknown: time, change of position and its uncertainty [s, rad, rad]. since: time since values were last
-stored [s]. count: how often they were. d1, t1 to d3, t3: the latest three stored values of `moved` and `seconds`.
+stored [s]. count: number of values stored so far. d1, t1 to d3, t3: the latest three stored values of `moved` and
+`seconds`.
 """
 
 MEMORY = np.dtype(

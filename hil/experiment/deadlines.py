@@ -1,4 +1,4 @@
-"""Missed deadlines: how long the arm may go without a command, and what share of the deadlines may be missed."""
+"""Missed deadlines: how long the arm may go without a command, and what fraction of the deadlines may be missed."""
 
 from collections.abc import Callable
 from math import inf
@@ -23,8 +23,8 @@ class Deadlines:
     """Counts missed deadlines of the samples. Every method may raise SafetyStop.
 
     heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did. any_share:
-    whether any share of deadlines may be missed, as while an arm is being lowered, when only the time without a command
-    matters.
+    whether any fraction of the deadlines may be missed. This is so while an arm is lowered, when only the time without
+    a command matters.
     """
 
     def __init__(self, config: Config, heard_instead: Callable[[], str] = str, *, any_share: bool = False) -> None:

@@ -41,7 +41,7 @@ _FULL_WEIGHT = 2.0
 """
 
 _FEWEST = 2
-"""Minimum number of samples, however low the rate."""
+"""Minimum number of samples before a current counts as zero, however low the rate."""
 
 MEMORY = np.dtype(
     [
@@ -52,14 +52,18 @@ MEMORY = np.dtype(
 """Constants and state of the check of one joint.
 
 per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V]; share: the same, relative to the goal; follow_time:
-how long a larger one may last [s].
+how long a larger deviation may last [s].
 evidence, count: sum of the log likelihood ratios times seconds, and its number of samples.
 differs_for, differs: duration [s] and number of samples of a deviation.
 """
 
 
 def begin(memory: Any, joint: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
-    """Set the constants of `memory`, a zero-filled record. planned: the joint's largest goal [A, or V under PWM]."""
+    """Set the constants of `memory`, a zero-filled record.
+
+    planned: the joint's largest goal [A, or V under PWM]. follow_share, follow_time: the settings of these names in
+    [safety].
+    """
     tick = abs(joint.joint.drive_unit(12.0))
     sigma = max(SIGMA_SHARE * planned, SIGMA_TICKS * tick)
     memory["per_square"] = 0.5 / sigma**2

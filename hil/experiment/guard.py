@@ -33,7 +33,8 @@ from hil.plan.recent_motion import RecentMotion
 __all__ = ["MOST_OUTSIDE_RAD", "Guard"]
 
 JUMP_FACTOR = 1.5
-"""Ratio of the distance a joint may appear to move between two samples to the distance its velocity limit allows."""
+"""Ratio of the distance that a joint may appear to move between two samples to the one that its velocity limit allows.
+"""
 
 EARLY_MOTION_RAD = 0.05
 """Largest motion allowed while the arm rests before the start [rad]."""
@@ -44,8 +45,8 @@ limit.
 """
 
 _ERRORS_IN_A_ROW = 3
-"""Number of consecutive replies with values and an error number after which the arm is stopped: that servo may be
-rejecting its goals.
+"""If this many consecutive replies of a servo contain both values and an error number, the arm is stopped: the servo
+may be rejecting its goals.
 """
 
 NONE_HEARD = "No servo was heard"
@@ -121,7 +122,7 @@ class Guard:
         self._status = StatusCheck(config, bears_errors=is_lowering)
         self._missing = self._silence.counts
         self._errors = [0] * len(config.joints)
-        """Number of consecutive replies with values and an error, by joint."""
+        """Number of consecutive replies that contained both values and an error number, by joint."""
         self._was_irregular = False
         """Whether replies were missing or reported an error in the previous exchange."""
         self._resting: Sequence[float] | None = None

@@ -34,9 +34,10 @@ WIDENED = 1.5
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
 _FRICTIONS, _FRICTIONS_UNDESCRIBED = 8.0, 3.0
-"""Lower bounds on the torque scale, in multiples of the mean dry friction, with and without a description of the arm.
-They keep friction of up to twice the expected value from raising an alarm. Without a description, the friction of
-typical servos is assumed; the bound then matters only if the planned torque is barely larger than that friction.
+"""Lower bounds on the torque from which the alarm thresholds follow, in multiples of the mean dry friction, with and
+without a description of the arm. They keep friction of up to twice the expected value from raising an alarm. Without a
+description, the friction of typical servos is assumed; the bound then matters only if the planned torque is barely
+larger than that friction.
 """
 _TILT_SHARE = 0.2  # standard deviation of gravity perpendicular to the assumed direction, relative to gravity
 _FRICTION_SPREAD = 3.0
@@ -47,14 +48,14 @@ _UNDESCRIBED = {"gravity": 10.0, "viscous": 1.0, "offset": 0.3, "tilt": 1.0}
 _INERTIA = 0.3
 """Standard deviations for an arm without a description, as multiples of the planned torque in SI units.
 
-If a small first torque moves an arm by a tenth of a radian, the arm's gravity torque is ten times as large. But the arm
-does move, which it would not if viscous friction or inertia were several times as large as the planned torque.
+Gravity may be ten times as large as a small first torque, which then moves the arm by a tenth of a radian. But viscous
+friction and inertia cannot be several times as large as the planned torque, because the arm would then hardly move.
 """
 _FLAT = 0.3
-"""Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the same units."""
+"""Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the units of `_INERTIA`."""
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
-"""Time for which a joint must appear stationary under a torque that is held over several exchanges [s]."""
+"""If a torque is held over several exchanges, a joint must appear stationary for this time before it is judged [s]."""
 
 _LAG_S = 0.012
 """Time constant with which a torque step appears in the velocity [s]: current loop and velocity filter."""
@@ -69,8 +70,8 @@ ones.
 """
 
 PLAY_RAD, CURVED = 0.015, 0.2
-"""Displacement within a jolt that gear backlash may cause [rad], twice that of a servo in its data sheet, and allowance
-for the curvature of ordinary motion, as a fraction of the usual change of velocity times the duration.
+"""Displacement within a jolt that gear backlash may cause [rad], twice the backlash in a servo's data sheet; and
+allowance for the curvature of ordinary motion, as a fraction of the usual change of velocity times the duration.
 """
 
 _USUAL_S = 1.0
@@ -127,7 +128,7 @@ class Jolts:
         return None if joint < 0 else (joint, float(self._joints["change"][joint]))
 
     def began(self, joint: int) -> float:
-        """Return the time of the sample before which a joint's latest jolt began [s]."""
+        """Return a time [s] before which a joint's latest jolt cannot have begun."""
         return float(self._joints["begun"][joint]) - len(self._former) * self._interval
 
     def usual(self, joint: int) -> float:
@@ -283,7 +284,12 @@ class ModelWatch:
 
 
 def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
-    """Mean and covariance of the observer's parameters."""
+    """Return the initial mean, by name, and the covariance of the momentum observer's parameters, in the order of
+    NAMES.
+
+    largest: largest planned torque of each joint (joints,) [N m]. arms: prior knowledge of the arm; by default, from
+    the configuration.
+    """
     if arms is None and config.arm.link_lengths is None:
         return _hardly_known(config, largest)
     arms = prior_ensemble(config, ARMS) if arms is None else arms

@@ -13,16 +13,17 @@ _FORGETS = 0.98
 
 
 def read_back(bus: ServoBus, guard: Guard, due: float) -> None:
-    """Look for another master just before the exchange that is due at `due` [s]; tell the guard about lost goals."""
+    """Check for goals of another program just before the exchange due at `due` [s]; report lost goals to the guard."""
     bus.check_not_overruled(due)
     if (lost := bus.goals_lost) is not None:
         guard.goals_are_lost(*lost)
 
 
 class Pace:
-    """Sends goals when they are due. Every method but `interval` may raise what `ServoBus.exchange` raises.
+    """Sends goals when they are due. Every method may raise the errors of `ServoBus.exchange`.
 
-    rate: samples per second. guard: is told when this program wakes up, and about goals that do not arrive.
+    rate: samples per second. guard: receives the times at which this program wakes up, and reports of goals that do not
+    arrive.
     """
 
     def __init__(self, bus: ServoBus, rate: float, guard: Guard) -> None:

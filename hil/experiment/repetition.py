@@ -24,7 +24,8 @@ _EMPTY = float("nan")
 
 TIMES = 10.0
 FLOOR_RAD = 0.05
-"""Deviation from the previous period that is always accepted, because stiction may end slightly earlier or later."""
+"""Deviation from the previous period that is always accepted [rad], because stiction may end slightly earlier or later.
+"""
 
 LASTING_S = 0.03
 UNJUDGED_S, _MOST_UNJUDGED = 0.2, 0.25
@@ -49,10 +50,10 @@ _SUMS = np.dtype(
 )
 """Running sums of one joint.
 
-lowest, highest: range of its positions [rad]. first: first one compared, which is subtracted from the others to avoid
-cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of squares
-and number of changes from the period before. early_squared, early_pairs: the same for the first half of the period.
-sure_squared, sure_pairs: the same for the second half without its end.
+lowest, highest: range of its positions [rad]. first: first position compared, which is subtracted from the others to
+avoid cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of
+squares and number of changes from the period before. early_squared, early_pairs: the same for the first half of the
+period. sure_squared, sure_pairs: the same for the second half without its end.
 """
 
 

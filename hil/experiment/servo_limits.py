@@ -1,7 +1,6 @@
 """The servos' own current and PWM limits: read, compared with the configuration, lowered, and read back.
 
-Once its own Current Limit is lowered, a servo refuses larger goals even if this program fails. The session restores the
-limit.
+A servo with a lowered Current Limit refuses larger goals, even if this program fails. The session restores the limit.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,8 +1,8 @@
 """How long servos have been silent, counting only the time during which this program was listening to them.
 
-A stalled computer neither receives nor sends anything, which reveals nothing about the servos. That time is limited as
-missed deadlines are (`hil.experiment.deadlines`); only the time in which this program waited for a reply that did not
-come counts as silence.
+A stalled computer cannot receive replies, so their absence reveals nothing about the servos. Such time is limited in
+the same way as missed deadlines (`hil.experiment.deadlines`). Only the time in which this program waited for a reply
+that did not come counts as silence.
 
 A busy computer also delays what it has received: the kernel passes on the bytes of a serial port in a separate thread.
 Like any other program, this thread has to wait for a core, for 4 to 10 ms at a time. So while this program itself wakes
@@ -26,7 +26,7 @@ class Silence:
     """Counts the missing replies of each joint.
 
     interval: time between two exchanges [s]. patience: how long an exchange waits for replies [s].
-    heard_at: for an arm that is being lowered, the time at which all servos were last heard before that [s].
+    heard_at: for an arm that is being lowered, the time at which all servos were last heard before lowering began [s].
     """
 
     def __init__(self, config: Config, interval: float, patience: float = 0.0, heard_at: float | None = None) -> None:
@@ -59,7 +59,7 @@ class Silence:
             self._busy_until = now + BUSY_S
 
     def ask(self, now: float) -> None:
-        """Begin an exchange at `now` [s], unless all joints reply to it (`all_heard`)."""
+        """Record that an exchange began at `now` [s]. If all joints reply to it, call `all_heard` instead."""
         since = 0.0 if self._asked_at is None else now - self._asked_at
         self._turn = since if since < self._longest_turn else self._longest_turn
         self._asked_at = now

@@ -28,19 +28,19 @@ _CLOCK_DRIFT = 0.01
 _LEARNT_READINGS = 3
 _STALE_READINGS = 2
 _GOALS_MISSED = 2
-"""Consecutive mismatches before a goal counts as lost, because a single packet may be lost."""
+"""Number of consecutive mismatches before goals count as lost, because a single packet may be lost."""
 
 _REMEMBERED = 256
 """Number of latest goals that are kept."""
 
 _HELD_BEFORE = 4
-"""Number of goals before a matching status that a servo may hold if its writes are lost."""
+"""If writes are lost, a servo may also hold one of this many goals that were sent before the latest matching status."""
 
 
 class StatusCheck:
     """Compares reported values with the commanded ones. `look` returns the fault, or None.
 
-    bears_errors: whether a hardware error that leaves the servo its torque is accepted.
+    bears_errors: whether to tolerate a hardware error as long as the servo keeps its torque.
     """
 
     def __init__(self, config: Config, *, bears_errors: bool = False) -> None:
@@ -65,8 +65,8 @@ class StatusCheck:
 
     @property
     def is_in_doubt(self) -> bool:
-        """Whether one lost packet could explain what was wrong with the latest status, which should then be read again
-        at once.
+        """Whether a single lost packet could explain the fault in the latest status. The status should then be read
+        again at once.
         """
         return any(self._missed) or any(stale for *_, stale in self._clock)
 

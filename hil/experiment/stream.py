@@ -51,11 +51,11 @@ _BY_OTHER_GOALS = {
     *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
-"""Causes of a stop that another program's goals may have."""
+"""Causes of a stop that goals sent by another program may explain."""
 
 _BRAKING_WATCHDOG_S = 0.04
-"""Bus Watchdog while the arm is braked [s]: should the cable be unplugged meanwhile, the current of a brake must not
-flow for as long as that of an experiment might, whose next command may be late.
+"""Timeout of the Bus Watchdog while the arm is braked [s]. It is shorter than during the experiment, which must allow
+for late commands: if the cable is unplugged during braking, the current must not continue for long.
 """
 
 
@@ -237,7 +237,7 @@ class Stream:
             differences.append(difference)
             if difference <= self._plan.settle_within:
                 self._note(
-                    f"{segment.role}: period {period} has settled, {difference:.2%} different from the previous one"
+                    f"{segment.role}: period {period} has settled; it differs from the one before by {difference:.2%}"
                 )
                 for further in range(1, self._plan.periods):
                     self._play_period(segment, period + further)

@@ -15,14 +15,14 @@ import numpy as np
 __all__ = ["MEMORY", "TOLERANCE_RAD", "begin", "look"]
 
 TOLERANCE_RAD = 0.04
-"""A joint's sign is considered wrong if the work that its motor has taken out of the arm, divided by the joint's
-largest planned torque, exceeds this [rad].
+"""A motor is considered reversed if the work that it has taken out of the arm, divided by the joint's largest planned
+torque, exceeds this [rad].
 
 Because of delays, even a healthy motor takes some work out of the arm: up to 0.02 rad with a heavy arm at 20 Hz.
 """
 
 _OF_OTHERS = 0.5
-"""Share of the work put in by the other joints' motors that may come out at this joint."""
+"""Fraction of the work done by the other joints' motors that this joint's motor may take out of the arm."""
 
 MEMORY = np.dtype([("scale", "f8"), ("least", "f8"), ("done", "f8"), ("held", "f8")])
 """Constants and state of the check of one joint.

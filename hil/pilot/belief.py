@@ -32,21 +32,23 @@ _LINEAR = ("offset", "zero")
 """Parameters of either sign, which are not represented by their logarithm."""
 
 _TIMES = 160
-"""Number of instants of a motion that are compared, per joint."""
+"""Number of instants at which the measured and the simulated motion of a joint are compared."""
 _LINEAR_RANGE = 0.02  # rad, below which displacements are compared linearly, and above it by their logarithms
 _ERROR = 0.08
-"""Relative model error of a compared displacement."""
+"""Assumed model error of a simulated displacement, relative to that displacement."""
 _LEAST_ERROR_STEPS = 1.5
 MOVED_STEPS = 26
 """Smallest range of motion of a joint that counts as having moved [encoder steps]."""
 _STILL = 0.02  # rad, allowed range of a simulated joint whose real counterpart stood still
 _MOST_RAISES, _RAISE = 12, (0.05, 0.25)
-"""If a simulated joint moves although the real one stood still, its log friction is increased at random: at most this
-many times, each time within this range.
+"""If a simulated joint moves although the real one stood still, the logarithm of its friction is increased: at most
+this many times, each time by a random amount from this range.
 """
 
 _INFLATIONS = (12.0, 6.0, 4.0, 2.0)
-"""Error inflation of each update; the reciprocals add up to 1, so that the data count once."""
+"""Factors by which successive updates multiply the variance of the measurement errors. Their reciprocals add up to 1,
+so that the data count once.
+"""
 _LONGEST_MOVE = 1.0  # largest change of a parameter per update, in e-folds or prior standard deviations
 _HOPELESS = 3.0  # multiple of the median misfit above which an arm is replaced
 _LEAST_SPREAD = 0.01  # relative model error, per doubling of the range of motion
@@ -195,8 +197,8 @@ def prior_belief(config: Config, arms: int, seed: int = 0) -> Belief:
 def earlier_belief(config: Config, result: Result, arms: int, seed: int = 0) -> Belief:
     """Draw the belief from the result of an earlier run on the same arm. Raises ConfigError.
 
-    Terms that the result's model lacks are absent. Friction is drawn with a wider spread than its error bars, since it
-    varies with temperature.
+    Terms that the result's model lacks are left out. Friction is drawn with a wider spread than its error bars, since
+    it varies with temperature.
     """
     prior = prior_belief(config, arms, seed)
     random = np.random.default_rng((seed, 10))

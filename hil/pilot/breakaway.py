@@ -1,10 +1,10 @@
 """Breakaway of joints that friction holds: torque rises from run to run, and a run ends soon after a joint moves.
 
 A joint that stood still reveals little more than that its friction is larger than the torque. Just above that friction,
-motion grows quickly: on many of the plausible arms even a few percent more torque makes a joint exceed a limit. A
-torque that is safe for a whole run can therefore hardly be raised. Instead, the guard is given narrow limits for such
-joints. The torque can then grow by a constant ratio up to the current limit. The arm is braked and the run ends once
-the joint has moved and thus shown its friction.
+motion grows quickly: on many of the plausible arms even a few percent more torque makes a joint exceed a limit. If
+every run had to be safe over its whole duration, the torque could therefore hardly be raised. Instead, the guard is
+given narrow limits for such joints, and the torque is raised by a constant ratio from run to run, up to the current
+limit. As soon as the joint moves and so reveals its friction, the arm is braked and the run ends.
 """
 
 import numpy as np
@@ -19,9 +19,9 @@ Mask = NDArray[np.bool_]
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
-    """Return `torque` (joints,) [N m], but `ratio` times the `former` torque for joints that stood `still`.
+    """Return `torque` (joints,) [N m], in which joints that stood `still` get `ratio` times their `former` torque.
 
-    most: largest torque that the current limits allow (joints,) [N m].
+    most: upper limit for those joints: the largest torque that the current limits allow (joints,) [N m].
     """
     return np.asarray(np.where(still, np.minimum(ratio * former, most), torque))
 

@@ -38,7 +38,9 @@ _HALVINGS = 6
 _LIGHTER = 0.25
 """Smallest plausible inertia of a joint, relative to that of the lightest arm of the prior."""
 _LIGHTER_THAN_MEAN = 0.5
-"""Smallest plausible inertia relative to that of the arm with the fitted parameters, if that arm is lighter still."""
+"""Smallest plausible inertia of a joint, relative to that of the arm with the fitted parameters; the smaller of the two
+values is used.
+"""
 
 SIMULATED = 100
 """Largest number of arms that are simulated."""
@@ -46,7 +48,7 @@ SIMULATED = 100
 
 @dataclass(frozen=True)
 class ChainBelief:
-    """An ensemble of arms; only the first ones are simulated.
+    """An ensemble of arms, of which at most the first SIMULATED are simulated.
 
     lightest: smallest inertia of each joint with the others free, over all arms of the prior (joints,) [kg m^2].
     """
@@ -82,8 +84,8 @@ class ChainBelief:
         return given.model_copy(update={"stabiliser": gains})
 
     def stiffness_share(self, given: Config) -> Array:
-        """Stiffness of each joint's stabiliser at this rate, relative to its stiffness at a high rate (joints,); 1 if
-        the configuration sets the gains.
+        """Stiffness of each joint's stabiliser at the configured sample rate, relative to its stiffness at a high rate
+        (joints,); 1 if the configuration sets the gains.
         """
         if given.stabiliser is not None:
             return np.ones(len(given.joints))

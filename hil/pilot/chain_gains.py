@@ -2,8 +2,8 @@
 
 Both act on a state that is `DELAY_SAMPLES` old. The damper must be weak enough for the lightest joint not to oscillate.
 A delayed spring drives the motion like a negative damper, so at a low rate damping limits the stiffness. The stiffness
-is reduced no further than this requires, since a softer spring lets friction and unknown weights carry the arm away
-from its path.
+is reduced no further than this requires, since with a softer spring, friction and unknown gravity torques cause
+larger deviations from the path.
 """
 
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ from hil.plan.stabiliser import DELAY_SAMPLES
 Array = NDArray[np.float64]
 
 FREQUENCY, DAMPING_RATIO = 3.0, 0.7
-"""Natural frequency [Hz] and damping ratio of each joint on the stabiliser's spring, unless the rate is too low."""
+"""Natural frequency [Hz] and damping ratio that the stabiliser gives each joint, unless the sample rate is too low."""
 
 
 @dataclass(frozen=True)
 class ChainGains:
     """Limits on the gains of each joint (joints,).
 
-    stiffness, damping: gains at a high rate [N m/rad, N m s/rad]. friction: least viscous friction [N m s/rad].
-    lightest: smallest inertia with the other joints free [kg m^2].
+    stiffness, damping: gains at a high rate [N m/rad, N m s/rad]. friction: smallest viscous friction of the ensemble
+    [N m s/rad]. lightest: smallest inertia with the other joints free [kg m^2].
     """
 
     stiffness: Array

@@ -28,11 +28,11 @@ _WAY_POSES = 40
 
 @dataclass(frozen=True)
 class Reserve:
-    """What a path leaves unused, to allow for errors of the assumed model.
+    """Margins that a path keeps from the limits and from obstacles, to allow for errors of the assumed model.
 
     position: fraction of a joint's range that stays free at each limit. speed, torque: fractions of the limits that
-    the path may use. clearance: distance in addition to the margin [m], which transitions from and to the rest pose
-    need not keep.
+    the path may use. clearance: distance from obstacles in addition to the configured margin [m]; transitions from and
+    to the rest pose need not keep this additional distance.
     """
 
     position: float = POSITION_RESERVE
@@ -48,7 +48,7 @@ class Reserve:
 
 MORE = 1.4
 MOST_POSITION = 0.3
-"""Largest reserve of position: at one half, none of a joint's range would be left."""
+"""Largest value of Reserve.position: at 0.5, none of a joint's range would be left."""
 RESERVE = Reserve()
 
 
@@ -56,8 +56,8 @@ RESERVE = Reserve()
 class Paths:
     """The designed paths.
 
-    identify: optimised path. held_out: wide path around the same centre, with random phases. reserve: what both paths
-    leave unused.
+    identify: optimised path. held_out: wide path around the same centre, with random phases. reserve: margins
+    that both paths keep.
     """
 
     config: Config
@@ -70,7 +70,7 @@ class Paths:
     def of(cls, config: Config, thought: ChainTorque, reserve: Reserve = RESERVE, tell: Tell | None = None) -> "Paths":
         """Design the paths. Raises NoSafeTorque if no path is safe, ConfigError, or ArmFileError.
 
-        tell: called with the number of steps done and their total.
+        thought: assumed model of the arm. tell: called with the number of steps done and their total.
         """
         check_rest_pose(config)
         known, space = known_chain(config), Space.of(config)
@@ -116,7 +116,7 @@ class Paths:
         return max(float((_peaks(mine.path) / _peaks(its.path)).max()) for mine, its in pairs)
 
     def plan(self, config: Config, thought: ChainTorque, share: float) -> Plan:
-        """Plan both paths at this fraction of their amplitude."""
+        """Plan both paths at the fraction `share` of their amplitude. thought: assumed model of the arm."""
 
         def path(_: Config, role: str, __: int) -> Path:
             return self.designer.scaled(self.held_out if role == HELD_OUT else self.identify, share)

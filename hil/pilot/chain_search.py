@@ -35,10 +35,10 @@ from hil.setup.servo_session import servo_session
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7
 RAISED = 1.3
-"""Another step precedes the full run if the safe share of the amplitude is at least this multiple of the last run's."""
+"""Another step precedes the full run if the amplitude that is safe now is at least this multiple of the last run's."""
 
 MOST_RAISE = 2.5
-"""Largest ratio of a step's share of the amplitude to that of the previous run."""
+"""Largest ratio of the amplitudes of successive runs."""
 
 SILENT_S = 30.0
 """Longest time without a message while searching for a safe motion [s]."""
@@ -112,7 +112,11 @@ class ChainSearch(SafeShares):
         )
 
     def step(self, name: str, folder: str, shares: tuple[float, ...]) -> Found:
-        """Play one step, compare it with the prediction, and update the belief."""
+        """Play one step, compare it with the prediction, and update the belief.
+
+        name: name of the step for messages. folder: name of its run folder. shares: fractions of the paths' amplitude
+        to try, in this order. Returns the one that was played, with its prediction.
+        """
         config = step_config(self.config)
         found = self.safe(config, shares, shares[0] if self.steps else np.inf)
         below = self.run.below(folder, config)
@@ -123,12 +127,14 @@ class ChainSearch(SafeShares):
         return found
 
     def limit_after(self, error: ExperimentError, found: Found) -> None:
-        """Reduce the largest allowed amplitude after a run that exceeded a limit, but not if friction held a joint."""
+        """Reduce the largest allowed amplitude after a run that was stopped, unless it did not settle or a joint did
+        not move.
+        """
         if not isinstance(error, NotSettled | DidNotMove):
             self.cap = min(self.cap, AFTER_LIMIT * found.share)
 
     def play(self, config: Config, folder: RunFolder, name: str, found: Found) -> ExperimentError | None:
-        """Play a run and set `last` to its share; return the error that ended it early, or None.
+        """Play a run and set `last` to its share of the amplitude; return the error that ended it early, or None.
 
         Only errors that are informative about the arm are returned; all others are raised.
         """
@@ -185,7 +191,7 @@ def identify_chain_in_steps(
     """Identify a spatial arm from its description, limits and rest pose. Returns a sentence about the torque state, and
     the result.
 
-    Raises whatever a run raises, and NoSafeTorque.
+    Raises the same errors as a run, and NoSafeTorque.
     """
     with StopRequest(), servo_session(config, run.path, say) as bus:
         if from_where_it_lies(config, bus.read_positions()) is not config and (moving := wait_for_rest(bus)):

@@ -27,7 +27,7 @@ from hil.plan.plan import Plan
 Array = NDArray[np.float64]
 
 SEARCH_ARMS, ARMS = 24, 72
-"""Number of arms simulated while searching for a share, and to confirm the one found."""
+"""Numbers of arms that are simulated in the search for a safe share of the amplitude, and for its confirmation."""
 
 PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
 SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4, 0.28, 0.18)
@@ -47,7 +47,7 @@ processor time with six joints.
 """
 
 STOPPED_SHARE = 0.5
-"""Effort of simulating a stop, relative to the effort of simulating one arm on a path and its transitions."""
+"""Computing time for the simulation of a stop, relative to that for one arm on a path and its transitions."""
 
 RAISED_RATE = 1.6
 """The first higher rate that is tried in order to advise the user, relative to the configured rate."""
@@ -57,7 +57,7 @@ ROOM = 1.2
 
 SATURATED = 0.98
 LEAST_SPREAD_SHARE = 0.1
-"""A smaller spread of the masses is advised only if it is at least this fraction of the present one."""
+"""A smaller [arm.prior] spread is advised only if it is at least this fraction of the configured one."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +73,11 @@ class Found:
 class SafeShares:
     """The current belief about the arm, and the paths designed for it.
 
-    last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are shares of `paths`,
-    and are converted when these are replaced. tell: called with the progress of each simulation of the arms. designing:
-    called with the progress of each path's design. trying: called with a description of each path and amplitude before
-    it is simulated. simulated: motion simulated so far [s]. passed: whether each joint was beyond its rest pose in a
-    run, as in `resting_stops`.
+    last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are fractions of the
+    amplitude of `paths`, and are converted when these paths are replaced. tell: called with the progress of each
+    simulation of the arms. designing: called with the progress of each path's design. trying: called with a description
+    of each path and amplitude before it is simulated. simulated: motion simulated so far [s]. passed: on which sides of
+    its rest angle each joint has been in a run, as in `resting_stops`.
     """
 
     given: Config
@@ -106,10 +106,11 @@ class SafeShares:
     def safe(self, config: Config, shares: tuple[float, ...], most: float = np.inf) -> Found:
         """Find the first of the `shares` of the designed path that is safe for all simulated arms.
 
-        most: largest share, to which `shares` are scaled; on other paths, the share that gives the same amplitude.
+        most: largest allowed share; if `shares` begin with a larger one, all of them are scaled down in proportion. On
+        other paths, the share that gives the same amplitude is used instead.
 
-        If that share is small, other paths with more reserve are designed; of all safe ones, the most informative is
-        kept. If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.
+        If the safe share is small, other paths with more reserve are designed; of all safe ones, the most informative
+        is kept. If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.
         """
         self._path = 0
         found, why = self._safe_of_these(config, shares, most)
@@ -142,8 +143,8 @@ class SafeShares:
         if not self.is_exhausted:
             return ""
         return (
-            f" The search ended early, after {self.simulated / 3600.0:.0f} h of simulated motion: a different "
-            "experiment.seed starts from other paths."
+            f" The search ended early, after {self.simulated / 3600.0:.0f} h of simulated motion: try a different "
+            "experiment.seed, which gives other paths."
         )
 
     def _helped_by_rate(self, config: Config, shares: tuple[float, ...]) -> str:
@@ -291,8 +292,8 @@ def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
 def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
     """Return the changes by which a user may make a path safe that was rejected as `unsafe`."""
     if not foreseen.is_clear:
-        helps = "A rest_pose farther from obstacles, or more room in [clearance] (floor, boxes, margin)"
-        return f"{helps}, if the arm allows it, helps. {_better_known(config)}"
+        helps = "A rest_pose farther from obstacles, or less restrictive [clearance] settings (floor, boxes, margin)"
+        return f"{helps}, if the arm allows it, can help. {_better_known(config)}"
     return limit_remedy(config, foreseen.peaks, stiffness)
 
 

@@ -31,7 +31,7 @@ def identify_in_steps(
 
     Returns the sentence about the torque state and the result.
 
-    Raises whatever a run raises, and ExperimentError if a joint does not move at its current limit.
+    Raises the same errors as a run, and ExperimentError if a joint does not move at its current limit.
     """
     given, config = config, within_supply(config)
     for sentence in lowered(given, config):

@@ -18,7 +18,9 @@ class PilotOptions:
     max_pilots: int = 40
     """Maximum number of pilots; a joint that does not move reaches its current limit in far fewer."""
     certain_share: float = 0.85
-    """Fraction of a limit that a typical arm should reach; below it, uncertainty wastes too much of the range."""
+    """Fraction of a limit that a typical arm should reach. If it reaches less, the pilot is still so uncertain about
+    the arm that too much of the range would remain unused.
+    """
     certain_share_known: float = 0.68
     """Fraction of a limit that a typical arm should reach if the belief comes from an earlier result, whose uncertainty
     another run would hardly reduce.
@@ -53,16 +55,16 @@ class PilotOptions:
     friction.
     """
     worthwhile_raise: float = 1.15
-    """Minimum ratio of torques that justifies another run if little of the range is unused."""
+    """Minimum ratio of the new torque to the last run's that justifies another run if little of the range is unused."""
     worthwhile_raise_far: float = 1.03
-    """Minimum ratio of torques that justifies another run if more of the range is unused."""
+    """Minimum ratio of the new torque to the last run's that justifies another run if more of the range is unused."""
     fair_share: float = 0.7
     """If a typical arm reaches more than this fraction of a limit, little of the range counts as unused."""
 
     wide_range: float = 0.74
     """Other waves are tried if a joint uses less than this fraction of its position range."""
     other_waves: int = 7
-    """Maximum number of other waves, which differ in the sign of each joint and in the direction of time."""
+    """Maximum number of other waves to try; they differ in the sign of each joint and in the direction of time."""
 
     falling_raise: float = 1.35
     """Maximum ratio of the torques of successive runs of an arm that falls over when it is stopped."""
@@ -75,7 +77,9 @@ class PilotOptions:
     """Torque that is always allowed for an arm that falls over, as a fraction of what the current limit allows.
     """
     start_inside: float = 0.95
-    """An arm that a stopped run left beyond its limits is assumed to start within this fraction of them."""
+    """An arm that a stopped run left beyond its position limits is assumed to start within this fraction of its range,
+    measured from the middle.
+    """
 
     max_full_runs: int = 6
     """Maximum number of full runs if one exceeds a limit or does not settle; each has less torque than the last."""

@@ -1,4 +1,4 @@
-"""A run that is stopped because this computer was late reveals nothing about the arm: it is repeated."""
+"""Repetition of runs that were stopped because this computer was late, since they reveal nothing about the arm."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ MOST_REPEATS = 3
 def punctual(play: Callable[[], str], config: Config, folder: RunFolder, name: str, say: Callable[[str], None]) -> str:
     """Return what `play` returns; repeat it if deadlines were missed, at most MOST_REPEATS times.
 
-    The recording of a stopped run is set aside in `folder`. Raises whatever `play` raises.
+    The recording of a stopped run is set aside in `folder`. Raises the same errors as `play`.
     """
     for number in range(1, MOST_REPEATS + 1):
         try:

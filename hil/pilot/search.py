@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 DEFAULTS = PilotOptions()
 
 _LINES_FOR_DETECTION = 4
-"""Number of lines of the band per joint at which experiment.detection still excites enough of them."""
+"""Minimum number of spectral lines in the band per joint if experiment.detection leaves some of them unexcited."""
 
 
 @dataclass
@@ -53,10 +53,10 @@ class Search:
     """Largest range of motion of each joint so far (joints,) [rad]."""
 
     springs: NDArray[np.bool_] | None = None
-    """Joints that a stabiliser held (joints,)."""
+    """Whether each joint was held in the last run with a stabiliser (joints,); None if there was none."""
     options: PilotOptions = DEFAULTS
     from_earlier: bool = False
-    """Whether the belief comes from an earlier run that no run so far has contradicted."""
+    """Whether the belief comes from the result of an earlier run, and no run so far has contradicted it."""
     earlier_swing: Array | None = None
     """Range of motion of each joint in the earlier run from which the belief comes (joints,) [rad], if known."""
 
@@ -102,7 +102,7 @@ class Search:
     def find(self) -> tuple[Config, Amplitude]:
         """Find the configuration and the amplitude of the full run.
 
-        Raises whatever a run raises, and ExperimentError if a joint does not move at its current limit.
+        Raises the same errors as a run, and ExperimentError if a joint does not move at its current limit.
         """
         self._pilot()
         return self._raise_to_limits()
@@ -150,7 +150,7 @@ class Search:
         return np.asarray(swing > MOVED_STEPS * step)
 
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
-        """The largest amplitude that is safe for all plausible arms.
+        """The largest amplitude that is safe for all plausible arms; share: fraction of each limit that they may use.
 
         If there is none, the amplitude of the last run is used, provided that the real arm has shown it to be safe, and
         otherwise a smaller one. Raises NoSafeTorque if there has been no run yet.

@@ -1,4 +1,4 @@
-"""What a run reveals about the arm: commands and motion from the first ramp on, however the run ended."""
+"""Commands and motion of a run from the first ramp on, from which the pilot learns, however the run ended."""
 
 from dataclasses import dataclass
 

@@ -79,8 +79,8 @@ class Played:
     """The outcome of a run.
 
     step: comparison with the prediction. seen: commands and motion; None if too few samples were recorded. torque:
-    sentence about the final torque state. error: what ended the run early, or None; only errors that are informative
-    about the arm, not those of servos, bus or user.
+    sentence about the final torque state. error: error that ended the run early, or None; only errors that are
+    informative about the arm, not those of servos, bus or user.
     """
 
     step: Step
@@ -120,9 +120,9 @@ class Player:
     def play(self, config: Config, folder: RunFolder, name: str, found: Amplitude, arms: Ensemble) -> Played:
         """Play one run on an arm that could be any of `arms`, compare it with the prediction, and report.
 
-        A run that is stopped because this computer was late is repeated. Raises whatever a run raises, except errors
-        that are informative about the arm: limit exceeded, no motion, no steady motion, a period that differs from the
-        one before.
+        A run that is stopped because this computer was late is repeated. Raises the same errors as a run, except
+        those that are informative about the arm: limit exceeded, no motion, no steady motion, a period that differs
+        from the one before.
         """
         torque, error = "", None
         try:

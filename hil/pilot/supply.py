@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 _DRIVEN = (Phase.RAMP_IN, Phase.WARM_UP, Phase.PERIODIC, Phase.RAMP_OUT)
 _LAST_S = 0.25
-"""Time before a stop in which the sample is sought that caused it [s]."""
+"""The sample that caused a stop is searched for within this time before the stop [s]."""
 
 
 def delivered_speed(config: Config, samples: NDArray[np.void]) -> Array:

@@ -1,1 +1,1 @@
-"""What the experiment commands: excitation, software spring and damper, brake."""
+"""Commands of the experiment: excitation, software spring and damper, brake."""

@@ -37,7 +37,7 @@ Some increase is normal: gravity and the other joint's brake act on the joint.
 """
 
 NOTICED_AFTER = 2
-"""Number of samples for which a brake of the wrong sign acts before this is noticed: one, plus the one in progress."""
+"""Number of samples for which a brake with the wrong sign acts before it is detected: one, plus the one in progress."""
 
 
 def may_brake(config: Config, error: BaseException) -> bool:

@@ -21,7 +21,7 @@ SLOW = 0.1  # rad/s: width of the transition of the assumed dry friction around 
 
 @dataclass(frozen=True)
 class KnownChain:
-    """What is known about a spatial arm from its configuration, before anything is identified."""
+    """Prior knowledge of a spatial arm from its configuration, before anything is identified."""
 
     base: BaseParameters
     prior: Prior

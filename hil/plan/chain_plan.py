@@ -85,7 +85,9 @@ def make_chain_plan(config: Config) -> Plan:
 
 
 def path_plan(config: Config, thought: ChainTorque, path: Callable[[Config, str, int], Path]) -> Plan:
-    """Plan the paths that `path` returns for each role and seed. Raises ConfigError if one needs too much torque."""
+    """Plan the paths that `path` returns for each role and seed, with the assumed model `thought`. Raises ConfigError
+    if a path needs too much torque.
+    """
 
     def segment(config: Config, role: str, seed: int) -> PathSegment:
         return path_segment(config, thought, role, path(config, role, seed))
@@ -101,7 +103,9 @@ def lowering_samples(config: Config) -> int:
 
 
 def path_segment(config: Config, thought: ChainTorque, role: str, path: Path) -> PathSegment:
-    """Plan one path with its transitions. Raises ConfigError if it needs too much torque."""
+    """Plan one path with its transitions from and to the rest pose. thought: assumed model of the arm. Raises
+    ConfigError if the path needs too much torque.
+    """
     experiment = config.experiment
     assert experiment.band is not None  # checked with the configuration
     torque = path_torque(config, thought, path)
@@ -132,7 +136,7 @@ def path_torque(config: Config, thought: ChainTorque, path: Path, share: Array |
     """Torque to command for a path (joints, samples) [N m], which compensates the stabiliser's pull towards the rest
     pose.
 
-    share: factor applied to the feed-forward.
+    thought: assumed model of the arm. share: factor applied to the feed-forward.
     """
     assert config.stabiliser is not None
     stiffness, damping = (np.array(each)[:, None] for each in (config.stabiliser.stiffness, config.stabiliser.damping))

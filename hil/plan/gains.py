@@ -1,4 +1,4 @@
-"""How stiff and how damped a joint may be held at a sample rate, without oscillating."""
+"""Largest stiffness and damping with which a joint can be held at a sample rate without oscillating."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ more, a single joint would oscillate.
 """
 
 MOST_DRIVING = 0.3
-"""Largest fraction of a joint's damping that its spring's delay may undo."""
+"""Largest fraction of a joint's damping that the delay of its spring may cancel."""
 
 
 def most_damping(rate: float, lightest: Array) -> Array:
@@ -22,7 +22,7 @@ def most_damping(rate: float, lightest: Array) -> Array:
 
 
 def most_stiffness(rate: float, damping: Array, friction: Array) -> Array:
-    """Largest stiffness of each joint [N m/rad] at a rate [Hz]. damping, friction: of the damper, and of the joint
-    itself (joints,) [N m s/rad].
+    """Largest stiffness of each joint [N m/rad] at a rate [Hz]. damping: gain of the damper; friction: viscous friction
+    of the joint itself; each (joints,) [N m s/rad].
     """
     return MOST_DRIVING * rate / DELAY_SAMPLES * (damping + friction)

@@ -1,4 +1,4 @@
-"""Whether each joint obeys its motor while an arm is lowered: a reversed motor must not brake.
+"""Detection of reversed motors while an arm is lowered: such a motor speeds its joint up instead of braking it.
 
 As long as the torque does not change, a reversed motor and something that pushes the joint look alike: the arm moves as
 if an additional torque acted on the joint. So the goal of such a joint is removed for a moment, while the others are
@@ -18,14 +18,14 @@ is smaller just after the motor has become reversed, and larger if the commanded
 """
 
 ENOUGH = 0.45
-"""Remainder of the torque, relative to that at the beginning, at which a test is decided."""
+"""A test is decided when the filtered torque has fallen to this fraction of its value at the beginning of the test."""
 
 LONGEST_TEST_S = 0.06
 
 TURNED, PUSHED = 1.1, 0.7
 """By how much the unexplained torque must fall, relative to the joint's own torque, when its goal is removed: 2 for a
-reversed motor, less right after the reversal, 1 for one without torque, 0 for a push. Between the two limits, the joint
-is tested again.
+reversed motor, less right after the reversal, 1 for a motor without torque, 0 for a push. Between the two limits, the
+joint is tested again.
 """
 
 MOVES_RAD_S = 0.1
@@ -33,9 +33,10 @@ PAUSE_S = 0.01
 
 
 class Residual(NamedTuple):
-    """What the model does not explain, by joint (joints,).
+    """Torque that the model does not explain, by joint (joints,).
 
-    lacking: commanded torque minus that which explains the motion [N m]. torque: commanded [N m], both filtered alike.
+    lacking: commanded torque minus the torque that explains the motion [N m]. torque: commanded torque [N m], filtered
+    in the same way.
     suspected: whether `lacking` is larger than its uncertainty.
     """
 
@@ -55,7 +56,7 @@ class _Test:
 
 
 class Obedience:
-    """Tests joints that move as if their motors were reversed. joints: their number."""
+    """Tests joints that move as if their motors were reversed. joints: number of joints of the arm."""
 
     def __init__(self, joints: int) -> None:
         self._tests: list[_Test | None] = [None] * joints

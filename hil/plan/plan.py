@@ -29,8 +29,8 @@ class Segment:
 
     @property
     def ramp_in(self) -> NDArray[np.float64]:
-        """Goal currents before the first period: the end of a period, faded in, so that the first period starts at full
-        amplitude.
+        """Goal currents before the first period (samples, joints) [A]: the end of a period, faded in, so that the first
+        period starts at full amplitude.
         """
         count = self.ramp_samples
         fade = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
@@ -38,7 +38,7 @@ class Segment:
 
     @property
     def ramp_out(self) -> NDArray[np.float64]:
-        """Goal currents after the last period: the beginning of a period, faded out."""
+        """Goal currents after the last period (samples, joints) [A]: the beginning of a period, faded out."""
         count = self.ramp_samples
         fade = 0.5 + 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / max(count, 1))
         index = np.arange(count) % len(self.period_current)
@@ -86,7 +86,7 @@ class Plan:
 
     @property
     def capacity(self) -> int:
-        """Largest possible number of samples."""
+        """Largest number of samples that the plan may take."""
         longest = self.max_settling_periods + self.periods
         played = sum(longest * len(s.period_current) + 2 * s.ramp_samples for s in self.segments)
         still = self.rest_samples + 3 * self.end_samples

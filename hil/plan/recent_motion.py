@@ -4,7 +4,7 @@ alone.
 A servo can report a false velocity in an intact reply. A brake that trusted it would drive the joint. Therefore the
 velocity to brake against is the reported one, confined to the range that the change of position allows over two spans
 of time: a short one, which soon shows a reversal, and a long one, in which a slow motion is visible despite the
-encoder's steps. Each range includes zero and never the direction opposite to a visible motion.
+encoder's steps. Each range includes zero, but excludes the direction opposite to a visible motion.
 """
 
 from collections import deque
@@ -23,7 +23,9 @@ SHORT_S, LONG_S = 0.004, 0.02
 
 _OLDEST_S = 0.05
 _LONGER = 1.5
-"""Largest age of a position that is used [s], or as a multiple of the time between two exchanges."""
+"""Largest age of a position that is used: in seconds, or as a multiple of the time between two exchanges, whichever is
+longer.
+"""
 
 _STEPS = 2.0
 """Uncertainty of a change of position, in encoder steps."""
@@ -65,7 +67,7 @@ class RecentMotion:
             self._states.append(state)
 
     def until(self, state: State) -> "RecentMotion":
-        """What was known at the time of an earlier exchange."""
+        """Return the motion up to `state`, an earlier exchange."""
         then = copy(self)
         at = state.time_before_write
         then._states = deque((each for each in self._states if each.time_before_write <= at), self._states.maxlen)

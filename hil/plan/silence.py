@@ -42,7 +42,7 @@ def bridged_limit(config: Config) -> Limit:
 
 
 def late_limit(config: Config) -> Limit:
-    """How long deadlines may be missed."""
+    """How long deadlines may be missed in succession."""
     safety = config.safety
     if safety.max_late is not None:
         chosen = Limit((safety.max_late + 0.5) / config.experiment.rate, f"safety.max_late = {safety.max_late}")

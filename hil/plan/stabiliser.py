@@ -15,13 +15,17 @@ from hil.estimator.simulation.closed_loop import Feedback
 from hil.results.parts import StabiliserShare
 
 DELAY_SAMPLES = 1.5
-"""Mean age of the state that a torque is based on: it is one sample old when sent, and is held for one more."""
+"""Mean age of the state on which a torque is based [samples]: the state is one sample old when the torque is sent, and
+the torque is held for another sample.
+"""
 
 INTEGRAL_TIME_S = 1.0
-"""Time after which the integral of a constant deviation adds as much current as the spring."""
+"""Time after which the integral of a constant deviation adds as much current as the spring [s]."""
 
 BALANCED_RAD = 0.02
-"""Deviation from the rest pose below which the integral stops growing: friction holds an arm this close to balance."""
+"""Deviation from the rest pose below which the integral stops growing [rad]: friction holds an arm this close to
+balance.
+"""
 
 
 def must_balance(config: Config) -> bool:
@@ -116,7 +120,7 @@ def feedback_of(config: Config) -> Feedback:
 
 
 def stabiliser_share(config: Config, samples: NDArray[np.void]) -> StabiliserShare:
-    """The stabiliser's share of the torque in consecutive rows of one multisine (hil.runs.recording)."""
+    """The stabiliser's share of the torque in consecutive samples of one multisine, rows of a recording."""
     torque = feedback_torque(config, samples)
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     commanded = samples["goal_current"][1:] * constants

@@ -56,7 +56,7 @@ class WayHome:
         return self._space
 
     def poses(self, pose: Array) -> Array:
-        """Corners (joints, corners) of the path from a pose (joints,) to the rest pose."""
+        """Corners (joints, corners) [rad] of the path from a pose (joints,) [rad] to the rest pose."""
         least = min(0.0, float(self._space.room(pose[:, None], on_the_way=True)[0])) - _ALLOWED_M
         best, best_room = 0, -np.inf
         for station in range(self._stations.shape[1]):
@@ -68,7 +68,7 @@ class WayHome:
         return np.column_stack((pose, self._stations[:, best::-1], self._rest))
 
     def path(self, pose: Array, velocity: Array) -> Path:
-        """The whole path, sampled at the stream's rate: braking from `velocity`, then home."""
+        """The whole path, sampled at the stream's rate: braking from `velocity`, then moving to the rest pose."""
         slowing = np.clip(np.abs(velocity).max() / BRAKING, SHORTEST_BRAKE_S, LONGEST_BRAKE_S)
         count = max(2, round(slowing * self._rate))
         time = np.arange(count) / self._rate

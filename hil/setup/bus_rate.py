@@ -1,8 +1,8 @@
 """The sample rate that a bus can sustain, measured with torque off for every exchange mode.
 
-The rate is a property of servos, wire and adapter. A computer that other programs keep busy delays occasional
-exchanges, which an experiment tolerates (`hil.experiment.deadlines`): such outliers are reported, but do not limit the
-rate.
+The sustainable rate depends on servos, cables and adapter. A computer that other programs keep busy delays single
+exchanges. An experiment tolerates this (`hil.experiment.deadlines`), so such outliers are reported, but do not limit
+the rate.
 """
 
 from collections.abc import Sequence
@@ -19,23 +19,27 @@ from hil.setup.realtime import on_time
 CYCLES = 200
 SLOW_EVERY = 10
 USUAL = 0.9
-"""Fraction of the exchanges that must be fast enough for a reported rate; an experiment needs four fifths on time."""
+"""Fraction of the exchanges that must be fast enough for the reported rate; an experiment needs 80 % of them on
+time.
+"""
 PATIENCE_S = 0.05
 """Time after which a reply counts as lost [s]; on a busy computer the kernel may deliver a reply 10 to 20 ms late."""
 AGAIN_AFTER_S = 0.5
-"""If the wanted rate seems too high for the bus, the bus is measured again after this time [s]."""
+"""If the configured rate seems too high for the bus, the bus is measured again after this time [s]."""
 SHARE = 0.9
 """Fraction of a period that the exchange may take; the rest is for the computer."""
 RATE_MARGIN = 1.2
-"""Factor by which a bus must be faster than a newly chosen rate, so that the next measurement confirms that rate."""
+"""Minimum ratio of the measured rate to the rate that is chosen from it, so that a later measurement confirms the
+choice.
+"""
 
 
 @dataclass(frozen=True)
 class ExchangeMode:
     """Measured timing of one exchange mode.
 
-    median_s, longest_s: round trips [s]. usual_s: time within which 90 % of the exchanges with the slowest kind of read
-    complete [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
+    median_s, longest_s: round trips [s]. usual_s: time that 90 % of the exchanges with the slowest kind of read do
+    not exceed [s]. lost: number of replies in CYCLES exchanges that were lost, not just late.
     """
 
     one_write: bool
@@ -69,7 +73,7 @@ class RateReport:
     """Measurements of all exchange modes.
 
     found: what the configured mode can sustain, as text. fix: what to change; empty if the rate is sustainable.
-    delayed: what delays occasional exchanges by more than a period, and what to do; empty if nothing does.
+    delayed: why some exchanges took longer than a sample period, and what to do about it; empty if none did.
     """
 
     modes: tuple[ExchangeMode, ...]
@@ -79,7 +83,7 @@ class RateReport:
 
 
 def check_rate(bus: ServoBus, wanted: float) -> RateReport:
-    """Measure every exchange mode and compare the configured one with the wanted rate [Hz]; see `measure_modes`."""
+    """Measure every exchange mode, and check whether the configured one sustains `wanted` [Hz]; see `measure_modes`."""
     modes = measure_modes(bus)
     if _configured(bus, modes).rate < wanted:
         # A busy computer delays exchanges for a while, a slow bus always.
@@ -133,10 +137,11 @@ def goal_register(joint: Joint) -> str:
 
 
 def goals_taken(bus: ServoBus) -> list[Joint]:
-    """The servos (as single-servo joints) that accept goals from a Sync Write. To be called only with torque off.
-    Raises DriverError.
+    """Return the servos (as single-servo joints) that accept goals from a Sync Write. Torque must be off. Raises
+    DriverError.
 
-    Each is sent a goal that differs from its present one. The goal is read back, then the previous one is restored.
+    Each servo is sent a goal that differs from its present one. The goal is read back, then the previous one is
+    restored.
     """
     before = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
     other = [goal - 1 if goal > 0 else goal + 1 for goal in before]

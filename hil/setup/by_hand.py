@@ -1,7 +1,7 @@
-"""The pose read from the bus, compared with the arm's description: each joint in turn is moved by hand, torque off.
+"""Compare the arm with its description: each joint in turn is moved by hand, with torque off, and its angle is read.
 
-An identification cannot detect wrong IDs, directions, zeros or axes: they only make the parameters of a spatial arm
-wrong. A person who moves the joints notices such errors at once.
+An identification cannot detect wrong IDs, directions, zeros or axes: it merely finds wrong parameters for a spatial
+arm. A person who moves the joints notices such errors at once.
 """
 
 from collections.abc import Callable, Iterator
@@ -45,18 +45,19 @@ class Moved:
 
     joint: str
     asked: str
-    """What the user was asked to do with this joint."""
+    """Request that was shown to the user."""
     angles: tuple[float, ...]
     """Angles by which all joints moved [rad]."""
     well: bool
     found: str
-    """Finding in words, including what to change if it differs from the description."""
+    """Finding in words; if the motion differs from the description, it also says what to change."""
 
 
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
-    """The pose at these angles [rad].
+    """Return the pose of the arm at these joint angles [rad].
 
-    Whole turns, which a servo does not count while it is off, are removed if a joint's position limits reveal them.
+    An angle may be wrong by whole turns, since a servo does not count turns while it is off. They are removed where the
+    position limits show that there are any.
     """
     limits = [joint.position_limit for joint in config.joints]
     angles = tuple(within_limits(*each) for each in zip(angles, limits, strict=True))
@@ -83,7 +84,7 @@ def guided(
 def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Array) -> Moved:
     """Compare a motion `change` (joints,) [rad] with the requested one.
 
-    drives: motion of the requested joint according to each of its servos [rad], the first servo's first.
+    drives: motion of the requested joint according to each of its servos [rad], in the order of the servos.
     """
     joint = config.joints[asked_for]
     most = int(np.argmax(np.abs(change)))

@@ -1,4 +1,4 @@
-"""Settings that another program changed during a run: they explain motion that looks like a fault of the servo."""
+"""Detect settings that another program changed during a run: the change may explain what looks like a servo fault."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -37,16 +37,16 @@ _MOVED = frozenset(
         Cause.EARLY_MOTION,
     }
 )
-"""Causes of a stop that a change of the other settings can explain."""
+"""Causes of a stop that a change of settings other than Return Delay Time can explain."""
 
 EXPLAINED = _MOVED | _LATE
 
 _AT_A_LIMIT = frozenset({Cause.POSITION, Cause.VELOCITY})
-"""Causes of a stop that need no other explanation than too much torque."""
+"""Causes of a stop that too much torque alone can explain."""
 
 _MODES_SEEN_S = 0.06
-"""If at most this much time passed from a read-back of the modes to a stop, a mode may also have changed after the stop
-[s].
+"""If the operating modes were read back less than this time [s] before a stop, a changed mode may have been changed
+after the stop.
 """
 
 Settings = Mapping[tuple[Joint, str], int]
@@ -69,7 +69,7 @@ def settings_now(bus: ServoBus) -> Settings:
 
 
 def changed_settings(before: Settings, after: Settings, cause: Cause | None = None) -> str:
-    """One sentence about the settings that differ; "" if there are none.
+    """Return a message that names the settings that differ; "" if none do.
 
     cause: the cause of a stop; settings that cannot explain it are left out.
     """
@@ -104,15 +104,16 @@ def _by_joint(settings: Settings) -> dict[Joint, dict[str, int]]:
 
 
 def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago: float) -> str:
-    """A sentence to add to the message of a stop at a limit if the only change may have been made after the stop; "" if
-    the change explains the stop.
+    """Return a note for the message of a stop at a limit: the operating mode may have been changed after the stop.
+
+    Returns "" if other settings changed too, or if the change may have caused the stop.
 
     modes_seen_ago: time from the latest correct read-back of the operating modes to the stop [s].
     """
     changed = {each[1] for each, value in before.items() if after.get(each, value) != value}
     if changed != {_MODE} or cause not in _AT_A_LIMIT or modes_seen_ago > _MODES_SEEN_S:
         return ""
-    last = f"{1e3 * modes_seen_ago:.0f} ms before it, every mode was still the one that had been set"
+    last = f"{1e3 * modes_seen_ago:.0f} ms before the stop, all operating modes were still as this program had set them"
     return f"{changed_settings(before, after)} This may have happened after the stop: {last}."
 
 

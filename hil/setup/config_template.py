@@ -14,7 +14,9 @@ _FASTEST = 10.0  # rad/s, initial limit of servos that could turn faster
 _USUAL_STALL = 4.1  # N m, stall torque of an XM430
 _CYCLE_BYTES = 39  # on the wire per servo: goal, request and reply
 RATES = (400, 300, 250, 200, 160, 125, 100, 80, 64, 50, 40, 32, 25, 20)
-"""Sample rates [Hz] that a new file may have, spaced so closely that at most a quarter of a bus's capacity is lost."""
+"""Sample rates [Hz] for a new file, so close together that rounding down costs at most a quarter of the possible
+rate.
+"""
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class JointAnswers:
     """Answers about one joint.
 
     rest: angle at rest [rad]. swing: allowed deviation from it to either side [rad]. length: distance from this joint
-    to the next one, or to the tip [m]. voltage: its supply [V]; None if it was not read.
+    to the next one, or to the tip [m]. voltage: supply voltage of its servo [V]; None if it was not read.
     """
 
     name: str
@@ -43,10 +45,10 @@ class JointAnswers:
 
 @dataclass(frozen=True)
 class MeasuredBus:
-    """What was measured on the bus.
+    """Result of measuring the bus.
 
-    rate: sample rate to use [Hz]. sustained: the rate that the bus can sustain [Hz]. one_write, fast: how data are
-    exchanged at that rate.
+    rate: sample rate to use [Hz]. sustained: the rate that the bus can sustain [Hz]. one_write, fast: values of
+    port.one_write and port.fast_sync_read with which it was measured.
     """
 
     rate: float
@@ -59,8 +61,8 @@ class MeasuredBus:
 class ArmAnswers:
     """Answers about one arm.
 
-    gravity: gravity in the plane of the arm [m/s^2]. head: comment at the top of the file. measured: None if the bus
-    was not measured; the sample rate then follows from the baud rate.
+    gravity: component of gravity in the plane of the arm [m/s^2]. head: comment at the top of the file. measured: None
+    if the bus was not measured; the sample rate then follows from the baud rate.
     """
 
     url: str
@@ -94,8 +96,11 @@ def arm_toml(arm: ArmAnswers) -> str:
         "[experiment]",
         _line(f"rate = {rate:.1f}", _rate_meaning(arm)),
         _line("period = 10.0", "s"),
-        _line(f"band = [0.1, {min(5.0, rate / 20):.1f}]", "Hz: its lines are assigned to the joints in turn"),
-        _line("pilot = true", "find the torque: start small, then raise it to the limits"),
+        _line(
+            f"band = [0.1, {min(5.0, rate / 20):.1f}]",
+            "Hz: excitation band; its spectral lines are assigned to the joints in turn",
+        ),
+        _line("pilot = true", "finds the torque: starts with a small one and raises it up to the limits"),
         _line("ramp = 1.0", "s, torque ramp at start and end"),
         "seed = 1",
     ]
@@ -105,7 +110,7 @@ def arm_toml(arm: ArmAnswers) -> str:
         _line('drive = "lag"', '"delay": a pure delay instead of a current loop'),
     ]
     if len(arm.joints) == 2:
-        model.append(_line("torque_scale = true", "estimate the second torque constant relative to the first"))
+        model.append(_line("torque_scale = true", "estimates the second torque constant relative to the first"))
     safety = ["[safety]", _line("watchdog = 0.08", "s without packets after which a servo stops by itself")]
     tables = [head, port, *(_joint(joint) for joint in arm.joints), mechanism, experiment, model, safety]
     return "\n\n".join("\n".join(table) for table in tables) + "\n"
@@ -133,7 +138,7 @@ def _joint(answers: JointAnswers) -> list[str]:
         _line(f"{constant} = {published.value:.3g}", f"N m/{unit} at the output shaft; published: {figures}"),
         _line(
             f"{constant}_std = {_spread(published):.2g}",
-            "all values of the joint scale with it",
+            "all identified values of the joint scale with this constant",
         ),
         _line(f"position_limit = {_list(ends, 2)}", "rad"),
         _line(f"velocity_limit = {_velocity_limit(answers):g}", "rad/s"),

@@ -1,7 +1,7 @@
-"""Settings that a killed program left on the servos: what can be restored, and what another program has changed.
+"""Settings that a killed program left on the servos: some can be restored, others have been changed by another program.
 
-A register that holds neither the value that the killed program set nor the one that it found was changed by something
-else. It is not restored, since a person may have wanted the change, but reported with its earlier value.
+If a register holds neither the value that the killed program set nor the value before that, another program has changed
+it. It is not restored, since a person may have wanted the change, but it is reported together with its earlier value.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ def left_behind(port: str, joint: Joint) -> Kept | None:
 
 @dataclass(frozen=True)
 class Left:
-    """What a killed program left on one servo.
+    """Settings that a killed program left on one servo.
 
     kept: the settings before that program. changed: the registers that another program has changed since then, each
     with its present value. wanted: the settings to restore; the changed registers keep their present values.
@@ -38,7 +38,9 @@ class Left:
     is_to_restore: bool
 
     def told(self, title: str) -> str:
-        """What is restored and what is not, for the user."""
+        """Return a message that says what is restored and what is not; it begins with `title`, the name of the
+        servo.
+        """
         others = self.others if self.changed else ""
         if not self.is_to_restore:
             return f"{title}: {others}" if others else ""
@@ -60,14 +62,15 @@ class Left:
         )
 
     def is_refused(self, needed: Mapping[str, int]) -> bool:
-        """Whether another program has lowered the Current Limit below what a run with these values needs, so that it
-        cannot start.
+        """Whether a run cannot start because another program has lowered the Current Limit too far.
+
+        needed: the registers that the run sets, with their values.
         """
         return self.changed.get(_CURRENT_LIMIT, 0) < needed.get(_CURRENT_LIMIT, 0) and _CURRENT_LIMIT in self.changed
 
 
 def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
-    """Compare the settings before a killed program with the present ones. Raises the same errors as `Servo.read`.
+    """Compare the settings from before a killed program with the present ones. Raises the same errors as `Servo.read`.
 
     If another program changed the Operating Mode, the present goals and gains belong to the new mode and are left as
     they are.
@@ -85,7 +88,7 @@ def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
 
 @dataclass(frozen=True)
 class Restored:
-    """What `recover` wrote, as text, and a sentence about what another program changed; "" if nothing."""
+    """The settings that `recover` wrote, and a sentence about changes by another program, both as text; "" if none."""
 
     written: list[str] = field(default_factory=list)
     others: str = ""

@@ -1,6 +1,7 @@
 """The pose in which a spatial arm lies before a run. The motion starts and ends there, not exactly at arm.rest_pose.
 
-Otherwise the stabiliser would pull the arm to arm.rest_pose as soon as torque comes on, perhaps against an end stop.
+If the motion started at arm.rest_pose, the stabiliser would pull the arm there as soon as torque is switched on,
+perhaps against an end stop.
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,8 @@ from hil.rest_pose_hint import within_limits
 from hil.setup.servo_session import has_moved
 
 AFTER_A_RUN = 2.0
-"""Factor applied to the tolerance after a run: friction may hold the arm farther from its rest pose than before."""
+"""Factor applied to arm.rest_tolerance after a run: friction may hold the arm farther from its rest pose than before.
+"""
 
 NEAR_RAD = 0.02
 """Deviation up to which arm.rest_pose is used although the arm lies elsewhere [rad]."""
@@ -28,7 +30,9 @@ SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
 _LONGEST_SAG_S = 3.0  # wait for an arm that moves after torque off
 
 _LONGEST_REST_S, _REST_EVERY_S, _REST_WITHIN_RAD = 15.0, 0.5, 0.004
-"""Longest wait for an arm to come to rest, interval between checks, and largest change in between [rad]."""
+"""Longest wait for an arm to come to rest [s], interval between checks [s], and smallest change between two checks that
+counts as motion [rad].
+"""
 
 
 def tolerance_now(config: Config) -> float:
@@ -59,8 +63,10 @@ def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
 
 
 def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float]) -> str:
-    """Say how far a spatial arm that was in its rest pose (joints,) [rad] has moved since torque was cut, and which
-    rest pose to configure; "" if it stayed there, had not been there, or its servos do not answer. Raises BusShared if
+    """Return a message about a spatial arm that has moved out of its rest pose since torque was cut.
+
+    The message says how far each joint has moved and which rest pose to configure. It is "" if the arm has not moved,
+    was not in its rest pose, or does not answer. before: pose when torque was cut (joints,) [rad]. Raises BusShared if
     another program switches torque on meanwhile.
     """
     at, rest = np.array(before), np.array(config.arm.rest_pose)
@@ -87,8 +93,8 @@ def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float])
 def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
     """The configuration with the measured pose (joints,) [rad], clipped to position_limit, as rest pose.
 
-    It is returned unchanged if the poses hardly differ, or if the arm is so far from its rest pose that the run is
-    refused.
+    The configuration is returned unchanged if the two poses hardly differ, or if they differ so much that the run will
+    be refused.
     """
     limits = [joint.position_limit for joint in config.joints]
     low, high = np.array(limits).T
@@ -101,7 +107,7 @@ def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
 
 
 def said_of_the_rest(config: Config, lies: Config) -> str:
-    """Message saying that the arm does not lie in its rest pose, and where it lies."""
+    """Return a message that the arm does not lie in its rest pose, with the angles at which it lies."""
     each = zip(config.joints, lies.arm.rest_pose, config.arm.rest_pose, strict=True)
     away = [
         f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})"

@@ -1,4 +1,4 @@
-"""The sample rate of a new arm's file, measured on its bus with torque off."""
+"""Sample rate for the file of a new arm, measured on its bus with torque off."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ def measured_bus(arm: ArmAnswers, path: Path) -> tuple[MeasuredBus | None, str]:
     """Measure the bus of an arm that has been described; path: path of the file to be written, for messages.
 
     Returns:
-        What was measured, or None if that was impossible; and a sentence about it.
+        The measurement, or None if it failed; and a message for the user about it.
     """
     config = parse_config(arm_toml(arm), path)
     fakes.register_for(config.url)

@@ -175,7 +175,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
     try:
         number = servo.ping()
     except NoReply:
-        fix = f"Check supply and cable. `hil scan {config.port.url}` finds it at another ID or baud rate."
+        fix = f"Check supply and cable. `hil scan {config.port.url}` shows whether it has another ID or baud rate."
         yield Finding(Level.STOP, where, "answers", f"nothing at {config.port.baud} baud", fix)
         return
     except DriverError as error:
@@ -318,7 +318,8 @@ def _baud(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo
     value = servo.read("Baud Rate")
     found = str(BAUD_RATES[value]) if value < len(BAUD_RATES) else f"unknown value {value}"
     fix = (
-        f"Slow. Type: hil setup {_port(config)} --id {joint_config.id} --new-baud 1000000; then set port.baud = 1000000"
+        f"This baud rate is slow. Type: hil setup {_port(config)} --id {joint_config.id} --new-baud 1000000; then set "
+        f"port.baud = 1000000"
     )
     return _graded(config.port.baud >= 1_000_000, "baud", found, fix, Level.WARNING)
 
@@ -392,9 +393,7 @@ def _pose(config: Config, _joint_config: JointConfig, joint: Joint, servo: Servo
     ticks = servo.read("Present Position")
     index = [joint.id in each.ids for each in config.joints].index(True)
     if joint.id != config.joints[index].id:
-        found = (
-            f"determined by the first servo (ID {config.joints[index].id}); only motion shows this servo's direction"
-        )
+        found = f"read from the first servo (ID {config.joints[index].id}); only motion shows this servo's direction"
         return Level.OK, "pose", found, ""
     angle = within_limits(joint.within_turn(ticks).angle(ticks), config.joints[index].position_limit)
     rest = config.arm.rest_pose[index]
@@ -437,7 +436,7 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
         tripped = servo.read("Bus Watchdog") == WATCHDOG_TRIPPED
         if tripped:
             yield Finding(
-                Level.OK, str(joint), "goals", "refused until its tripped Bus Watchdog is cleared, which a run does"
+                Level.OK, str(joint), "goals", "refused because its Bus Watchdog has tripped; a run clears it"
             )
             continue
         fix = (

@@ -52,7 +52,7 @@ def real_time() -> Iterator[list[Granted]]:
 
 @contextmanager
 def on_time(clock: Clock) -> Iterator[list[Granted]]:
-    """`real_time` for exchanges on the wall clock; on a virtual clock nothing can be late, and nothing is requested."""
+    """Like `real_time` on the wall clock. On a virtual clock nothing can be late: no setting is requested."""
     if isinstance(clock, WallClock):
         with real_time() as granted:
             yield granted

@@ -40,10 +40,10 @@ class Found(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """The replies at one baud rate. Over TCP, this is the rate that the servos are set to; if none answered, the
-    port's.
+    """The replies at one baud rate.
 
-    trouble: description of a problem on the whole bus; empty if there is none.
+    baud: over TCP, the baud rate that the servos report, or the port's if none answered. trouble: description of a
+    problem on the whole bus; empty if there is none.
     """
 
     baud: int
@@ -66,7 +66,7 @@ Watch = Callable[[Asking], None]
 
 
 def serial_ports() -> list[tuple[str, str]]:
-    """Device and description of every serial port of this machine that has hardware behind it."""
+    """Device and description of every serial port of this machine to which hardware is connected."""
     return [(port.device, port.description) for port in list_ports.comports() if port.hwid != "n/a"]
 
 

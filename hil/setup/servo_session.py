@@ -2,8 +2,8 @@
 
 A session holds the port. A session inside another one for the same arm shares the port, so that the steps of a pilot
 write each EEPROM register only once. Each register is also restored only once, when the outermost block is left for
-whatever reason. If a killed program left saved settings behind, these count as the servos' own and are restored at the
-end (`killed_run`).
+whatever reason. If a killed program left saved settings behind, these are taken as the servos' original settings and
+restored at the end (`killed_run`).
 """
 
 import re
@@ -54,20 +54,20 @@ SETTINGS_NAME = "servo_settings.json"
 
 
 _MOST_CUTS = 5
-"""How often torque is cut again at the end if another program switches it on."""
+"""Largest number of times that torque is cut again at the end if another program switches it on."""
 
 REBOOT_S = 0.6
 """A servo that does not answer at the end may be booting; it is tried again after this time [s]."""
 
 
 _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
-"""Said if every servo has answered in the end and nothing else is wrong."""
+"""Message if every servo has answered in the end and nothing else is wrong."""
 
 _TELLS_OF_TORQUE = re.compile("torque (off )?is", re.IGNORECASE)
-"""Found in each sentence that says whether torque is off (`TorqueOff`)."""
+"""Matches every sentence that says whether torque is off (see `TorqueOff`)."""
 
 COUNT_DOWN_S = 5.0
-"""Time between the warning that an arm will move again after a stopped run and switching torque on [s].
+"""After a stopped run: time from the warning that the arm will move again until torque is switched on [s].
 """
 
 
@@ -91,23 +91,26 @@ class ServoSession:
     lay: Lies = field(default_factory=dict)
     """Positions of the servos at the beginning."""
     _wanted: dict[Joint, dict[str, int]] = field(default_factory=dict)
-    """Settings to restore: those saved, except for what another program changed since an earlier run was killed."""
+    """Settings to restore: the saved ones, except for registers that another program has changed since a run was
+    killed.
+    """
     _left: dict[Joint, Kept] = field(default_factory=dict)
-    """Settings that an earlier run left changed; restoring a goal that a lowered limit cuts is retried only once."""
+    """Saved settings of the servos that an earlier run did not restore."""
     _refused: set[Joint] = field(default_factory=set)
-    """Servos whose Current Limit another program has left too low for this run: its former value stays on file."""
+    """Servos whose Current Limit another program has left too low for this run; the file keeps its former value."""
     _is_ours: bool = False
     """Whether the servos are the arm's and no other program holds them, so that they may be written to."""
     _cut: dict[Joint, dict[str, int]] = field(default_factory=dict)
-    """Goals that could only be restored as far as a lowered limit allows, with their values."""
+    """Goals that could only be restored as far as a lowered limit allows, with the restored values."""
     _on_again: dict[Joint, int] = field(default_factory=dict)
-    """Servos whose torque another program has switched on since it was cut, with how often it was cut again."""
+    """Servos whose torque another program has switched on since it was cut, and the number of times it was cut again.
+    """
     _torque: dict[Joint, bool | None] = field(default_factory=dict)
-    """What was read last about each servo's torque (`ServoBus.torque_now`)."""
+    """Whether each servo's torque was on at the latest reading; None if unknown (`ServoBus.torque_now`)."""
     shared: int = 0
-    """Number of inner blocks that have used the bus."""
+    """Number of inner sessions that have used the bus."""
     was_stopped: bool = False
-    """Whether the last inner block ended with an exception: the arm went limp earlier than planned."""
+    """Whether the last inner session ended with an exception: the arm went limp earlier than planned."""
 
     def begin(self, config: Config, folder: Path | None) -> None:
         """Check that the servos answer and that no other program holds the arm, then save their settings.

@@ -59,8 +59,8 @@ def set_up(
     The port is left at the baud rate at which the servo was last heard. A status packet lost while ID or baud rate
     changes is not a failure: the servo is searched for at both the old and the new value.
 
-    Raises ServoRefused if a register does not read back as written, WrongSetting if the new ID is taken, and what
-    `Servo.read` raises.
+    Raises ServoRefused if a register does not read back as written, WrongSetting if the new ID is taken, and the
+    errors of `Servo.read`.
     """
     changes = []
     if return_delay_us is not None:

@@ -1,8 +1,7 @@
 """Check that, until torque is switched on, the arm stays in the pose in which it was first read.
 
-Without torque, only a hand or gravity can move it. Any other change means that its readings are no longer correct: a
-horn has slipped, another servo answers, or another program has changed Homing Offset. From then on every angle would be
-wrong.
+Without torque, only a hand or gravity can move the arm. Any other change of its reported angles means that they are no
+longer correct: a horn has slipped, another servo answers, or another program has changed Homing Offset.
 """
 
 import math
@@ -40,10 +39,10 @@ def refuse_moved(before: Lies, now: Lies) -> None:
         turned = _turned(drive, before, now)
         if abs(turned) > MOST_RAD:
             raise ExperimentError(
-                f"{drive.title} has turned by {turned:+.3f} rad since this command first read it, before torque was "
-                f"switched on; at most {MOST_RAD} is allowed. Let the arm come to rest, then start again. Check "
-                "whether a hand or a cable is pushing or holding it, whether its horn slips, and whether another "
-                "program is changing its settings."
+                f"{drive.title} has turned by {turned:+.3f} rad since this command first read its angle, before "
+                f"torque was switched on; at most {MOST_RAD} is allowed. Let the arm come to rest, then start "
+                "again. Check whether a hand or a cable is pushing or holding it, whether its horn slips, and "
+                "whether another program is changing its settings."
             )
 
 

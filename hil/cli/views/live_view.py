@@ -19,8 +19,8 @@ _VALUE, _LIMITS, _HEALTH = 7, 12, 14  # columns of a value, of a gauge's two lim
 
 @dataclass(frozen=True)
 class Layout:
-    """What fits into the terminal. gauge: width of a gauge in columns; gauges: how many of the two quantities, position
-    and goal, have a gauge.
+    """The parts of the display that fit into the terminal. gauge: width of a gauge in columns; gauges: how many of the
+    two quantities, position and goal, have a gauge.
     """
 
     gauge: int
@@ -41,9 +41,9 @@ def layout_for(columns: int, name: int) -> Layout:
 
 
 class LiveView:
-    """Draws progress reports; keeps the latest values of what a sample may lack: positions, temperatures and voltages.
+    """Draws progress reports. If a sample lacks a position, temperature or voltage, the latest known value is shown.
 
-    The timing statistics start afresh with each run of a pilot.
+    The timing statistics are reset at the start of each run of a pilot.
     """
 
     def __init__(self, config: Config, columns: int) -> None:

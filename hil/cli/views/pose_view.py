@@ -1,4 +1,4 @@
-"""What `hil pose` prints: where the arm is, joint by joint, and the outcome of moving it by hand."""
+"""Output of `hil pose`: the arm's pose, joint by joint, and the outcome of moving each joint by hand."""
 
 from typing import Any
 

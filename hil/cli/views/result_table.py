@@ -21,10 +21,10 @@ _NOTHING = 0.01
 """A true value below this fraction of a standard error is practically 0; its relative error would be meaningless."""
 
 _MOST_NAMED = 3
-"""Largest number of tried models that are all listed by name."""
+"""If more models than this were tried, the output gives their number instead of their names."""
 
 _ALIKE = 0.05
-"""Relative difference up to which two errors count as the same."""
+"""Two errors whose relative difference is smaller than this count as equal."""
 
 
 def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:

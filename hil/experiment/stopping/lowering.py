@@ -1,8 +1,8 @@
 """Stop of an arm that cannot hang freely: brake, then lower it to its rest pose while its servos accept commands.
 
 The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the path
-home; if a joint stays off the path, an additional torque towards the path grows. Lowering is monitored like the
-experiment. It is aborted and torque is cut if a servo loses its torque, if a current does not follow its goal, if a
+to the rest pose; if a joint stays off the path, an additional torque towards the path grows. Lowering is monitored like
+the experiment. It is aborted and torque is cut if a servo loses its torque, if a current does not follow its goal, if a
 joint leaves the path, or if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities
 that agree with the positions.
 
@@ -32,14 +32,14 @@ from hil.plan.recent_motion import RecentMotion
 from hil.plan.way_home import PULL_PER_S, PULL_SHARE, WayHome
 
 LEAVES_RAD = 0.35
-"""Largest accepted tracking error: a joint with a larger one does not follow its path home."""
+"""Largest accepted tracking error [rad]: a joint with a larger one does not follow its path to the rest pose."""
 
 LYING_RAD = 0.06
-"""An arm within this angle of its rest pose in every joint is already at rest."""
+"""If every joint is within this angle of the rest pose [rad], the arm counts as lying in it."""
 
 RUNS_AWAY = 0.25
-"""Excess of a joint's velocity over that of the path home, relative to the velocity limit. A joint that exceeds this
-and still speeds up although its torque opposes the motion counts as not obeying its motor.
+"""Excess of a joint's velocity over the velocity of its path to the rest pose, relative to the velocity limit. A joint
+that exceeds this and still speeds up although its torque opposes the motion counts as not obeying its motor.
 """
 
 _GROWS_S = 0.015
@@ -57,7 +57,8 @@ def may_lower(config: Config, error: BaseException) -> bool:
 
 
 class Lowering:
-    """Computes the goals on the path home. Created before torque is switched on; call `begin` when a stop occurs.
+    """Computes the goals on the path to the rest pose. Created before torque is switched on; call `begin` when a stop
+    occurs.
 
     interval: time between two exchanges [s]; by default, that between two samples.
     """
@@ -88,7 +89,7 @@ class Lowering:
         self._thought.of(self._way.path(self._rest, np.zeros_like(self._rest)))  # compile in advance
 
     def slow_down(self, every: int) -> None:
-        """From now on, goals are computed for every `every`-th sample only: spring and damper must be softer."""
+        """From now on, compute goals only for every `every`-th sample, with a softer spring and damper."""
         rate = self._rate / every
         stiffness, damping = self._gains
         self._damping = np.minimum(damping, most_damping(rate, self._lightest))
@@ -117,8 +118,8 @@ class Lowering:
         """Start lowering from this sample, the latest that all servos answered; return the number of samples that
         lowering takes.
 
-        goal: latest goals [A or V]. recent: the latest exchanges. watch: the model's check, which has seen the motion
-        so far; without one, motors that turn against their goals are detected only once their joints run away.
+        goal: latest goals [A or V]. recent: the latest exchanges. watch: the check against the model, which has seen
+        the motion so far. Without it, a motor that turns against its goal is detected only when its joint runs away.
         """
         self._recent, self._watch = recent, watch
         position, velocity = np.array(state.position), np.array(recent.until(state).believed(state))
@@ -162,7 +163,7 @@ class Lowering:
         return self._guard.clamp((torque / self._constants).tolist())
 
     def look(self, index: int, state: State, gap: float, *, between: bool = False) -> None:
-        """Process an exchange. Raises SafetyStop if the arm leaves its path home or a servo is faulty."""
+        """Process an exchange. Raises SafetyStop if the arm leaves its path to the rest pose or a servo is faulty."""
         self._guard.look(state, gap, between=between)
         away = np.abs(self._position[index] - np.array(state.position))
         if np.nanmax(away, initial=0.0) > LEAVES_RAD:

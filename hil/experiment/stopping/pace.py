@@ -1,4 +1,4 @@
-"""How often a lowered arm is commanded, and how long its replies are awaited: as slowly as late replies require.
+"""How often a lowered arm is commanded, and how long its replies are awaited; both are adapted to late replies.
 
 Servos hold their latest goal, so an arm can be lowered with fewer exchanges than the experiment needs. If replies come
 too late for one exchange per sample, only every second or third sample is exchanged from then on, until the end.
@@ -7,13 +7,13 @@ too late for one exchange per sample, only every second or third sample is excha
 from math import ceil
 
 LONGER_S = 0.008
-"""How much longer replies are awaited than they took so far while the arm was lowered, or at first, than during the
-experiment [s].
+"""Margin of the reply timeout [s]. It is added to the longest time that replies have taken since lowering began or, at
+first, to the timeout used during the experiment.
 """
 
 LONGEST_S = 0.022
-"""How long replies are awaited once some have been late [s]: longer than an adapter's latency timer of 16 ms. Where
-replies are lost, asking again soon is better.
+"""Reply timeout after some replies have been late [s]: longer than an adapter's latency timer of 16 ms. If
+replies are lost instead of late, it is better to ask again soon.
 """
 
 LAST_S = 0.075
@@ -24,7 +24,10 @@ MARGIN_S = 0.002
 
 
 class Pace:
-    """interval: time between two samples [s]. patience: how long replies were awaited during the experiment [s]."""
+    """Adapts the interval between exchanges and the reply timeout to late replies.
+
+    interval: time between two samples [s]. patience: reply timeout during the experiment [s].
+    """
 
     def __init__(self, interval: float, patience: float) -> None:
         self._interval = interval

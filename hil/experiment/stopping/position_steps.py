@@ -1,8 +1,8 @@
-"""Rides over steps of a position reading while an arm is lowered: a joint cannot jump, but its reading can.
+"""Correction of steps in a position reading while an arm is lowered: a joint cannot jump, but its reading can.
 
-A position that is far from where the joint's former position and its velocities predict it is taken for a false
-reading: from then on the difference is subtracted. When a later reading steps back, the subtraction ends. A joint whose
-readings step again and again is not corrected any more.
+A reading that is far from the position predicted from the previous position and the velocities counts as false: from
+then on, the difference is subtracted. When a later reading steps back, the subtraction ends. A joint whose readings
+step again and again is no longer corrected.
 """
 
 from typing import NamedTuple
@@ -15,10 +15,10 @@ STEP_RAD = 0.04
 """Smallest step [rad]; smaller ones are left to the feedback."""
 
 BENDS_RAD_S2 = 200.0
-"""Acceleration that no joint of a lowered arm exceeds [rad/s^2]; it makes predictions uncertain."""
+"""Largest acceleration assumed for a joint of a lowered arm [rad/s^2]; it determines the uncertainty of predictions."""
 
 MOST_STEPS = 6
-"""Number of steps of one joint that are ridden over; a single false reading makes two."""
+"""Largest number of steps of one joint that are corrected; a single false reading causes two."""
 
 
 class _Seen(NamedTuple):

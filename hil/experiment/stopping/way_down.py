@@ -26,14 +26,14 @@ from hil.plan.silence import BRIDGED_S
 from hil.runs.recording import Phase, Recorder, missed
 
 _RECENT_S = 0.1
-"""How long a late reply lets further ones be expected [s]."""
+"""Time after a late reply during which further late replies are expected [s]."""
 
 
 class Stopped(NamedTuple):
     """Where a stream was stopped.
 
     latest, whole: the latest state, and the latest one with replies of all servos; None if there is none. goal: latest
-    goals [A, or V under PWM]. sent_at: when they were sent [s]. segment: number of the multisine.
+    goals [A, or V under PWM]. sent_at: when they were sent [s]. segment: index of the multisine that was playing.
     """
 
     latest: State | None
@@ -86,7 +86,7 @@ class WayDown:
     def lower(self, error: ExperimentError | BusOverheard, stopped: Stopped) -> None:
         """Brake and lower the arm until it is at rest, a check fails, or a second signal arrives. Never raises.
 
-        error: the stop, which is told how this ended.
+        error: the exception that stopped the stream; a note that says how lowering ended is added to it.
         """
         state = stopped.whole
         if state is None or stopped.latest is None or self._lowering.lies(state):
