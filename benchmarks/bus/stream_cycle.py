@@ -1,8 +1,8 @@
 """Benchmark of the stream's own cycle against other clients' cycles, at a fixed rate, each on a fake bus of its own.
 
-    python benchmarks/stream_cycle.py                          tables and ratios, 2 servos
-    python benchmarks/stream_cycle.py --config six.toml        another planar arm with [fake]
-    python benchmarks/stream_cycle.py --json                   one JSON object on standard output and nothing else
+    python benchmarks/bus/stream_cycle.py                          tables and ratios, 2 servos
+    python benchmarks/bus/stream_cycle.py --config six.toml        another planar arm with [fake]
+    python benchmarks/bus/stream_cycle.py --json                   one JSON object on standard output and nothing else
 
 `benchmarks/bus_cycle.py` measures one exchange without a pace. Here `hil.experiment.stream` runs as in an experiment:
 it waits for its deadlines (`Pace`), reads goals back before each sample, exchanges, checks and records. Each fake is
@@ -27,7 +27,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks.bus_cycle import Cycle, ours, sdk
 from benchmarks.machine import machine
@@ -41,7 +41,7 @@ from hil.plan.plan import make_plan
 from hil.runs.recording import Phase, Recorder
 from hil.setup.realtime import real_time
 
-CONFIG = Path(__file__).parents[1] / "configs" / "fake_two_link.toml"
+CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link.toml"
 REST_S = 1.5
 """Time after a round of the stream in which the arm comes to rest [s]."""
 
