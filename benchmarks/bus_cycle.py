@@ -67,7 +67,7 @@ def ours(name: str, servos: int, *, fast: bool = False) -> Iterator[Cycle]:
     port = open_port(name, BAUD)
     port.latency = PATIENCE_S
     exchange = make_exchange(port, servos, fast=fast)
-    goals = [100] * servos
+    goals = (100,) * servos  # a tuple, as `Converter.ticks` returns
 
     def cycle() -> None:
         assert None not in exchange.cycle(goals).servos

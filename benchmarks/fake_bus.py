@@ -51,7 +51,7 @@ def streams(config_path: Path, runs: int) -> dict[str, float]:
         arm_seconds: list[float] = []
         with tempfile.TemporaryDirectory() as folder:
             run = RunFolder.create(Path(folder) / "run", config)
-            undo = _timed(Stream, "run", spent, "stream", arm_seconds)
+            undo = _timed_stream(spent, arm_seconds)
             run_experiment(config, run, config.path, lambda _: None)
             undo()
         cycles = arm_seconds[0] * config.experiment.rate
@@ -70,7 +70,7 @@ def _shares(config_path: Path) -> dict[str, float]:
     spent = {"stream": 0.0, "write": 0.0, "read": 0.0, "plant": 0.0}
     arm_seconds: list[float] = []
     undo = [
-        _timed(Stream, "run", spent, "stream", arm_seconds),
+        _timed_stream(spent, arm_seconds),
         _timed(FakeBus, "write", spent, "write"),
         _timed(FakeBus, "read", spent, "read"),
         _timed(TwoLink, "advance", spent, "plant"),
@@ -86,24 +86,39 @@ def _shares(config_path: Path) -> dict[str, float]:
     }
 
 
-def _timed(
-    cls: type, name: str, spent: dict[str, float], key: str, arm_seconds: list[float] | None = None
-) -> Callable[[], None]:
+def _timed(cls: type, name: str, spent: dict[str, float], key: str) -> Callable[[], None]:
+    """Add the time that a method takes to `spent[key]`; return a function that undoes this."""
     original = getattr(cls, name)
 
     def timed(self: Any, *args: Any) -> Any:
-        arm_started = self._clock.now() if arm_seconds is not None else 0.0
-        clock = time.process_time if arm_seconds is not None else time.perf_counter
-        started = clock()
+        started = time.perf_counter()
         try:
             return original(self, *args)
         finally:
-            spent[key] += clock() - started
-            if arm_seconds is not None:
-                arm_seconds.append(self._clock.now() - arm_started)
+            spent[key] += time.perf_counter() - started
 
     setattr(cls, name, timed)
     return lambda: setattr(cls, name, original)
+
+
+def _timed_stream(spent: dict[str, float], arm_seconds: list[float]) -> Callable[[], None]:
+    """Add the CPU time of `Stream.run` to `spent["stream"]` and append the arm's time; return the undoing function."""
+    original = Stream.run
+
+    def run(self: Stream) -> None:
+        clock = self._bus.port.clock
+        arm_started, started = clock.now(), time.process_time()
+        try:
+            original(self)
+        finally:
+            spent["stream"] += time.process_time() - started
+            arm_seconds.append(clock.now() - arm_started)
+
+    def undo() -> None:
+        Stream.run = original  # type: ignore[method-assign]
+
+    Stream.run = run  # type: ignore[method-assign]
+    return undo
 
 
 class Free:

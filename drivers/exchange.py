@@ -15,7 +15,7 @@ loop needs.
 import math
 import struct
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -26,7 +26,7 @@ from hil.drivers.control_table import Register
 from hil.drivers.others.heard import Heard
 from hil.drivers.others.read_back import REMEMBERED, TRY_AGAIN_S, Overruled, ReadBack
 from hil.drivers.packet import BROADCAST_ID, HEADER, Instruction
-from hil.drivers.port import Port
+from hil.drivers.port import Port, ReplyTime
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
 
 HOST_S = 0.75e-3
@@ -108,6 +108,8 @@ class Exchange:
         self.ids = tuple(ids)
         self.fast = fast
         self.one_write = one_write
+        self._is_plain = one_write and not self._echoes
+        """Whether goals and request leave in one write, and nothing but the reply comes back."""
         self._writes = [
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
@@ -118,14 +120,14 @@ class Exchange:
         every += _of_other_lengths(every, len(self.ids))
         reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
         self.heard = Heard(self.ids, reads)
-        self._slow_spans = len(spans) - 1
         least = max(patience, min(PATIENCE_SHARE * interval, MOST_PATIENCE_S))
         self._wire_s = {read: port.wire_time(self._bytes(read)) for read in reads}
         self._plans = [
             _Plan(
                 read,
                 span if span < self._kinds else 0,
-                max(self._timeout(read, return_delay), least),
+                port.reply_time(max(self._timeout(read, return_delay), least), self._sent_bytes(read)),
+                struct.Struct(f"<H{len(read.request)}s").pack,
                 self._wire_s[read],
                 0.5 * self._wire_s[read],
                 span >= self._kinds,
@@ -133,11 +135,9 @@ class Exchange:
             for span, read in enumerate(reads)
         ]
         self._doubts = _DOUBTS
-        self._status_every = _NEVER if status is None else status_every
-        self._until_status = self._status_every
-        self._slow_every = slow_every
-        self._until_slow = slow_every
-        self._slow = 0
+        self._turns = _Turns(len(spans) - 1, slow_every, _NEVER if status is None else status_every)
+        self._usual_left = self._turns.plan()
+        """Number of cycles that still read the usual span before another one may be due."""
         self._late_possible = False
         self._after_loss = 0
         self._cut_off = b""
@@ -166,14 +166,17 @@ class Exchange:
     @property
     def patience(self) -> float:
         """Longest time that a cycle waits for replies [s]."""
-        return max(plan.timeout for plan in self._plans)
+        return max(plan.reply_time.timeout for plan in self._plans)
 
     def wait_longer(self, seconds: float) -> None:
         """Wait this much longer [s] for missing replies from now on: they may merely be late."""
         is_usual = self._latest_plan is self._usual
-        self._plans = [replace(plan, timeout=plan.timeout + seconds) for plan in self._plans]
+        self._plans = [replace(plan, reply_time=self._longer(plan, seconds)) for plan in self._plans]
         self._usual = self._plans[0]
         self._latest_plan = self._usual if is_usual else self._latest_plan
+
+    def _longer(self, plan: "_Plan", seconds: float) -> ReplyTime:
+        return self._port.reply_time(plan.reply_time.timeout + seconds, self._sent_bytes(plan.read))
 
     def accept_any_order(self) -> None:
         """From now on, accept answers in any order. Use this only where the replies to one request have all arrived, or
@@ -185,8 +188,9 @@ class Exchange:
 
     def read_status_next(self) -> None:
         """Read the status in the next cycle instead of when it is due."""
-        if self._status_every < _NEVER:
-            self._until_status = min(self._until_status, 1)
+        self._turns.count(self._usual_left)
+        self._turns.read_status_next()
+        self._usual_left = self._turns.plan()
 
     def add_read_back(
         self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[Sequence[int]]
@@ -260,11 +264,12 @@ class Exchange:
         if before + takes > due:  # woken up late
             self.read_back_at = before + TRY_AGAIN_S
             return None
+        expected = port.reply_time(due - before, len(read.request))
         if self._echoes:
-            received = port.ask(read.request, len(read.request) + read.reply_size, due - before, before)
+            received = port.ask(read.request, len(read.request) + read.reply_size, expected, before)
             received = received.removeprefix(read.request)
         else:
-            received = port.ask(read.request, read.reply_size, due - before, before)
+            received = port.ask(read.request, read.reply_size, expected, before)
         if port.overheard:
             self._overhear()
         servos = read.unpack(received)
@@ -275,7 +280,7 @@ class Exchange:
         now = self._now()
         self.read_back_at = now
         if None in servos:
-            self._late_possible = True
+            self._expect_late()
             if not self.is_in_doubt:
                 self.read_back_at = now + TRY_AGAIN_S  # a late reply costs the next cycle time
         else:
@@ -294,46 +299,55 @@ class Exchange:
         Raises PortLost; ValueError for the wrong number of goals or a goal that does not fit into two bytes.
         """
         port = self._port
-        if not between:
-            self._until_slow -= 1
-        self._until_status -= 1
-        if self._until_status > 0 and (self._until_slow > 0 or between) and not self._late_possible:
-            plan = self._usual
-        else:
-            plan = self._plans[self._other_span(between)]
-        read, timeout = plan.read, plan.timeout
-        write = self._write
+        if between:
+            self._turns.between += 1
+        left = self._usual_left = self._usual_left - 1
+        plan = self._usual if left >= 0 else self._plans[self._any_span(between)]
+        read, write = plan.read, self._write
         try:
             if write is None:
-                goals = self._pack_each(goal_ticks)
-            else:  # as `_GoalWrite.pack`, without its frame
+                sent = self._pack_each(goal_ticks) + read.request
+            else:  # as `_GoalWrite.pack`, without its frame and with the request behind its CRC
                 fields = write.fields
                 fields[2::2] = goal_ticks
-                goals = write.pack_fields(*fields)
-                goals += _pack_crc(_crc(goals))
+                sent = write.pack_fields(*fields)
+                sent += plan.pack_behind(_crc(sent), read.request)
         except struct.error:
             raise ValueError(f"goals {list(goal_ticks)}: each must be a whole number from -32768 to 32767") from None
         self._sent.append(tuple(goal_ticks))
         before = self._now()
-        if self.one_write and not self._echoes:
-            received = port.ask(goals + read.request, read.reply_size, timeout, before)
+        if self._is_plain:
+            received = port.ask(sent, read.reply_size, plan.reply_time, before)
         else:
-            received = self._ask_otherwise(goals, read, timeout, before)
+            received = self._ask_otherwise(sent, plan, before)
         if port.overheard:
             self._overhear()
         servos = read.unpack(received)
         after = self._now()
-        if servos is None:
-            servos = self._search(read, received, before + timeout)
+        took = after - before
+        if servos is None or (took < plan.soonest and self._doubts):
+            servos = self._look_again(plan, received, servos, before)
             after = self._now()
-            if None in servos:
-                self._late_possible = True
-        elif after - before < plan.soonest and self._doubts:
-            servos = self._latest(read, servos, before + timeout)
-            after = self._now()
-        self._took = after - before
+            took = after - before
+        self._took = took
         self._latest_plan = plan
         return _reply((before, after, plan.span, servos))
+
+    def _look_again(self, plan: "_Plan", received: bytes, servos: list[Answer] | None, before: float) -> list[Answer]:
+        """Return the answers if the reply is irregular (no `servos`), or if it came too soon."""
+        deadline = before + plan.reply_time.timeout
+        if servos is not None:
+            return self._latest(plan.read, servos, deadline)
+        servos = self._search(plan.read, received, deadline)
+        if None in servos:
+            self._expect_late()
+        return servos
+
+    def _expect_late(self) -> None:
+        """Let the next cycle prepare for replies that are still on their way."""
+        self._late_possible = True
+        self._turns.count(self._usual_left)
+        self._usual_left = self._turns.usual = 0
 
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
         """Handle replies that arrive sooner than the wire allows: they may belong to an earlier request.
@@ -348,10 +362,9 @@ class Exchange:
             return servos
         return read.unpack(received) or self._search(read, received, deadline)
 
-    def _other_span(self, between: bool) -> int:
-        """Choose the span for a cycle that does not read the usual one: one of another length after a lost reply,
-        otherwise a slow one or the status.
-        """
+    def _any_span(self, between: bool) -> int:
+        """Choose the span for a cycle: one of another length after a lost reply, otherwise the one that is due."""
+        self._turns.count(self._usual_left)
         if self._late_possible:
             self._late_possible = False
             if self._port.has_input():
@@ -360,19 +373,11 @@ class Exchange:
             # identifies the request it belongs to, but its length differs if another span was requested. Where several
             # replies in a row are late, each request needs a length of its own.
             self._after_loss = self._after_loss % AFTER_LOSS + 1
-            return self._kinds - 1 + self._after_loss
-        if self._until_slow <= 0 and not between:
-            self._until_slow = self._slow_every
-            # If a status is due as well, it waits for the next cycle, so that the two long reads never coincide.
-            return self._next_slow()
-        self._until_status = self._status_every
-        return 1 + self._slow_spans
-
-    def _next_slow(self) -> int:
-        if not self._slow_spans:
-            return 0
-        self._slow = self._slow % self._slow_spans + 1
-        return self._slow
+            span = self._kinds - 1 + self._after_loss
+        else:
+            span = self._turns.due(between)
+        self._usual_left = self._turns.plan()
+        return span
 
     def _search(self, read: GroupRead, received: bytes, deadline: float) -> list[Answer]:
         """Extract the answers if some are stuffed, damaged or missing; read on until all have arrived or time is up."""
@@ -397,19 +402,21 @@ class Exchange:
             self._cut_off = (self._cut_off + self._port.overheard)[-_LONGEST_REPLY:]
         self._port.overheard = b""
 
-    def _ask_otherwise(self, goals: bytes, read: GroupRead, timeout: float, start: float) -> bytes:
+    def _ask_otherwise(self, sent: bytes, plan: "_Plan", start: float) -> bytes:
         """Return the reply if it takes two writes, or if the adapter echoes what is sent; the echo is removed."""
-        port, sent = self._port, goals + read.request
-        expected = read.reply_size + (len(sent) if self._echoes else 0)
+        port, read = self._port, plan.read
+        count = read.reply_size + (len(sent) if self._echoes else 0)
         if self.one_write:
-            received = port.ask(sent, expected, timeout, start)
+            received = port.ask(sent, count, plan.reply_time, start)
         else:
-            port.write(goals)
-            received = port.ask(read.request, expected, timeout, start)
+            port.write(sent.removesuffix(read.request))
+            expected = port.reply_time(plan.reply_time.timeout, len(read.request))
+            received = port.ask(read.request, count, expected, start)
         if not self._echoes:
             return received
         if len(received) == read.reply_size and read.unpack(received) is not None:
             self._echoes = False  # an adapter that no longer echoes: waiting for it would make every cycle late
+            self._is_plain = self.one_write
         return received.removeprefix(sent)
 
     def _pack_each(self, goal_ticks: Sequence[int]) -> bytes:
@@ -423,25 +430,84 @@ class Exchange:
         wire = self._port.wire_time(self._bytes(read) + 2 * len(self.ids))
         return wire + return_delay * len(self.ids) + self._port.latency + HOST_S
 
+    def _sent_bytes(self, read: GroupRead) -> int:
+        return sum(write.size for write in self._writes) + len(read.request)
+
     def _bytes(self, read: GroupRead) -> int:
-        return sum(write.size for write in self._writes) + len(read.request) + read.reply_size
+        return self._sent_bytes(read) + read.reply_size
 
 
 @dataclass(frozen=True)
 class _Plan:
     """One of the group reads of an exchange.
 
-    span: the span that a Reply reports. timeout: how long to wait for the replies [s]. wire_s: wire time of goals,
-    request and replies [s]. soonest: time after the start of a cycle before which a complete reply may belong to an
-    earlier request [s]. is_after_loss: whether a late reply may be on the wire, and destroy the goals, when it is sent.
+    span: the span that a Reply reports. reply_time: how long to wait for the replies. pack_behind: packs the goals' CRC
+    and the request. wire_s: wire time of goals, request and replies [s]. soonest: time after the start of a cycle
+    before which a complete reply may belong to an earlier request [s]. is_after_loss: whether a late reply may be on
+    the wire, and destroy the goals, when it is sent.
     """
 
     read: GroupRead
     span: int
-    timeout: float
+    reply_time: ReplyTime
+    pack_behind: Callable[[int, bytes], bytes]
     wire_s: float
     soonest: float
     is_after_loss: bool
+
+
+class _Turns:
+    """When spans other than the usual one are due.
+
+    A cycle only decrements one counter, the number of usual cycles that `plan` has promised. `count` derives from it
+    what has passed.
+
+    slow_spans: number of slow spans. slow_every: samples between two of them. status_every: cycles between two status
+    reads.
+    """
+
+    def __init__(self, slow_spans: int, slow_every: int, status_every: int) -> None:
+        self._slow_spans = slow_spans
+        self._slow_every = self._until_slow = slow_every
+        self._status_every = self._until_status = status_every
+        self._slow = 0
+        self.usual = 0
+        """Number of usual cycles that were planned, less those that have been counted."""
+        self.between = 0
+        """Number of cycles between two samples that have not been counted yet."""
+
+    def count(self, left: int) -> None:
+        """Count the cycles so far; `left` of the planned ones have not taken place (-1: one more than planned has)."""
+        passed = self.usual - left
+        self._until_status -= passed
+        self._until_slow -= passed - self.between
+        self.usual, self.between = left, 0
+
+    def due(self, between: bool) -> int:
+        """Return the span to read now, once all cycles including this one are counted; 0 is the usual one."""
+        if self._until_slow <= 0 and not between:
+            self._until_slow = self._slow_every
+            # If a status is due as well, it waits for the next cycle, so that the two long reads never coincide.
+            return self._next_slow()
+        if self._until_status > 0:
+            return 0
+        self._until_status = self._status_every
+        return 1 + self._slow_spans
+
+    def _next_slow(self) -> int:
+        if not self._slow_spans:
+            return 0
+        self._slow = self._slow % self._slow_spans + 1
+        return self._slow
+
+    def read_status_next(self) -> None:
+        if self._status_every < _NEVER:
+            self._until_status = min(self._until_status, 1)
+
+    def plan(self) -> int:
+        """Return how many cycles will read the usual span; if all of them lie between samples, there will be more."""
+        self.usual = max(0, min(self._until_slow, self._until_status) - 1)
+        return self.usual
 
 
 class _GoalWrite:

@@ -9,7 +9,7 @@ import os
 import select
 import termios
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import serial
 
@@ -63,6 +63,18 @@ def open_port(url: str, baud: int) -> "Port":
     return (DescriptorPort if type(opened) is serial.Serial else Port)(url, baud, opened)
 
 
+class ReplyTime(NamedTuple):
+    """When the reply to a request may arrive, counted from the start of the request; made by `Port.reply_time`.
+
+    timeout: when it counts as lost [s]. whole_ms: the whole milliseconds of that. earliest: when the request can have
+    been transmitted at the earliest [s].
+    """
+
+    timeout: float
+    whole_ms: int
+    earliest: float
+
+
 class Port:
     """An open serial port. Every method but `close` raises PortLost when the device fails.
 
@@ -96,6 +108,10 @@ class Port:
         """Return the wire time [s] of `count` bytes (8 data bits, one start and one stop bit each)."""
         return count * 10 / self.baud
 
+    def reply_time(self, timeout: float, sent: int) -> ReplyTime:
+        """Return what `ask` needs for a request of `sent` bytes whose reply counts as lost after `timeout` [s]."""
+        return ReplyTime(timeout, int(timeout * 1e3), _EARLY_BITS * sent / self.baud)
+
     def write(self, data: bytes) -> None:
         """Send bytes; returns when the device has accepted them, not when they have been transmitted."""
         try:
@@ -125,8 +141,8 @@ class Port:
             raise self._lost(error) from error
         return received
 
-    def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
-        """Write, then read until `timeout` [s] after `start` [s, on the port's clock], as the control cycle does.
+    def ask(self, data: bytes, count: int, expected: ReplyTime, start: float) -> bytes:
+        """Write at `start` [s, on the port's clock], then read until the timeout, as the control cycle does.
 
         Pending input is set aside first: otherwise a duplicated or late reply would be taken for this one, and every
         later reply would be one cycle late.
@@ -134,7 +150,7 @@ class Port:
         if self.has_input():
             self.put_aside()
         self.write(data)
-        return self.read(count, timeout)
+        return self.read(count, expected.timeout)
 
     def put_aside(self) -> None:
         """Move bytes that were received but not read to `overheard`."""
@@ -219,9 +235,10 @@ class DescriptorPort(Port):
         except (OSError, ValueError) as error:  # ValueError: closed
             raise self._lost(error) from error
 
-    def ask(self, data: bytes, count: int, timeout: float, start: float) -> bytes:
+    def ask(self, data: bytes, count: int, expected: ReplyTime, start: float) -> bytes:
         # One Python frame for the whole transaction, and three system calls in the normal case: after a wait of a
         # millisecond the caches are cold, and every further call costs several microseconds.
+        timeout, whole_ms, earliest = expected
         try:
             looks = self._looks
             if looks and self._wait_ms(0):
@@ -230,12 +247,10 @@ class DescriptorPort(Port):
             written = os.write(self._descriptor, data)
             if written < len(data):
                 self._write_rest(data[written:])
-            received = b""
-            if self._wait_ms(int(timeout * 1e3)):
-                early_until = start + _EARLY_BITS * len(data) / self.baud
-                if _now() < early_until:
+            if self._wait_ms(whole_ms):
+                if _now() - start < earliest:
                     if not looks:
-                        return self._ask_behind_pending(count, early_until, start + timeout)
+                        return self._ask_behind_pending(count, start + earliest, start + timeout)
                     if looks <= _LOOKS:
                         looks = _ALWAYS
                 received = os.read(self._descriptor, count)
@@ -244,6 +259,8 @@ class DescriptorPort(Port):
                         self._looks = looks - 1
                     return received
                 self._check_alive(received)
+            else:
+                received = b""
             return self._ask_on(received, count, start + timeout, looks)
         except BlockingIOError:
             self._write_rest(data)

@@ -159,13 +159,13 @@ class Converter:
         ]
         self._none_missing = (False,) * len(self._joints)
 
-    def ticks(self, goals: Sequence[float]) -> list[int]:
+    def ticks(self, goals: Sequence[float]) -> tuple[int, ...]:
         """Return the goals rounded to the nearest ticks; raises ValueError for a goal that is not a finite number."""
         units = self._drive_units
         if len(goals) != len(units):
             raise self._wrong(goals)
         try:
-            return list(map(round, map(operator.truediv, goals, units)))
+            return tuple(map(round, map(operator.truediv, goals, units)))
         except (ValueError, OverflowError):
             raise self._wrong(goals) from None
 

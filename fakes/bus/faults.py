@@ -69,9 +69,7 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
     FaultKind.CORRUPTED_REPLY: FaultFacts("bits of a status packet are flipped", "bits", 1),
     FaultKind.TRUNCATED_REPLY: FaultFacts("a status packet ends early"),
     FaultKind.DUPLICATED_REPLY: FaultFacts("a status packet arrives twice"),
-    FaultKind.LATE_REPLY: FaultFacts(
-        "the adapter delays a status packet, and with it those that directly follow", "seconds", 0.02
-    ),
+    FaultKind.LATE_REPLY: FaultFacts("the adapter delays a status packet and with it all later bytes", "seconds", 0.02),
     FaultKind.NOISE: FaultFacts("random bytes precede a status packet", "bytes", 8),
     FaultKind.LOST_INSTRUCTION: FaultFacts("an instruction packet is lost on its way to one servo, or to all servos"),
     FaultKind.CORRUPTED_INSTRUCTION: FaultFacts(

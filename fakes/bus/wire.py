@@ -11,9 +11,6 @@ BITS_PER_BYTE = 10
 ROUNDING_S = 1e-9
 """Two transmissions that overlap by less than this count as consecutive [s]."""
 
-_SAME_BUFFER_S = 0.6e-3
-"""Longest pause between the replies to one group read [s]: a servo's Return Delay Time is at most 0.508 ms."""
-
 
 class Arriving(NamedTuple):
     """Bytes on their way to the host.
@@ -82,8 +79,8 @@ class Wire:
     def put(self, data: bytes, start: float, late_s: float = 0.0) -> float:
         """Transmit a servo's data from time `start`; return the time at which the transmission ends.
 
-        late_s: additional delay in the adapter [s]. It also holds back the bytes that directly follow on the wire,
-        because they are in the same buffer. If another reply is being transmitted, both are lost.
+        late_s: additional delay in the adapter [s], which also holds back what follows on the wire: an adapter hands
+        bytes over in the order in which they were received. If another reply is being transmitted, both are lost.
         """
         byte_s = self.byte_s
         end = start + len(data) * byte_s
@@ -92,8 +89,9 @@ class Wire:
             return end
         arriving = self._arriving
         first = start + byte_s + self._latency_s + late_s
-        if late_s or 0.0 <= start - self._held[0] < _SAME_BUFFER_S:
-            first = max(first, self._held[1])
+        sent_before, free_at = self._held
+        if start >= sent_before and (late_s or first < free_at):
+            first = max(first, free_at)
             self._held = end, first + len(data) * byte_s
         arriving.append(_arriving((data, first, byte_s)))
         if len(arriving) > 1 and arriving[-2].first > first:  # ahead of an earlier reply

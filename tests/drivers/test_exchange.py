@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hil.drivers.control_table import load_control_table
 from hil.drivers.errors import PortLost
-from hil.drivers.exchange import HOST_S, Exchange
+from hil.drivers.exchange import HOST_S, Exchange, _Turns
 from hil.drivers.others.read_back import LOST_OF, TRY_AGAIN_S
 from hil.drivers.packet import HEADER, Framer, Instruction, crc, encode, encode_status
 from hil.drivers.port import Port
@@ -485,14 +485,15 @@ def test_after_a_lost_reply_the_next_read_back_waits_unless_another_master_is_su
 def test_a_goal_that_was_not_taken_asks_for_the_status(held: int, is_due: bool) -> None:
     wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])
     cycles = read_back_of(wire)
-    cycles._status_every = cycles._until_status = 20
+    cycles._turns = _Turns(slow_spans=2, slow_every=100, status_every=20)
+    cycles._usual_left = cycles._turns.plan()
     cycles.cycle([0, 0])
     assert cycles._read_back is not None
     for is_of_modes in (True, False):
         data = bytes(cycles._read_back.read.reply_size // 2 - 13) + struct.pack("<h", 0 if is_of_modes else held)
         wire.answers = [b"".join(encode_status(servo, 0, data) for servo in (1, 2))]
         assert cycles.overruled(wire.now() + ONE_READ_BACK_S) is None
-    assert cycles._until_status == (1 if is_due else 19)
+    assert cycles._usual_left == (0 if is_due else 18)
 
 
 @pytest.mark.parametrize(("front", "count"), [(8, 1), (12, 1), (7, 0), (4, 0)])

@@ -1,8 +1,10 @@
 """Which cycles read the slow registers, how long a second reply is awaited, and what counts as a stranger's."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from hil.drivers.exchange import Exchange
+from hil.drivers.exchange import Exchange, _Turns
 from hil.drivers.others.read_back import TRY_AGAIN_S
 from hil.drivers.packet import encode_status
 from hil.drivers.servo_model import Mode
@@ -85,3 +87,41 @@ def test_the_longest_exchange_is_all_that_is_sent_and_received(ids: tuple[int, .
     cycles = Exchange(wire, ids, [XM430["Goal Current"], *[XM430["Goal PWM"]] * (len(ids) - 1)], usual, 0.0)
     cycles.cycle([0] * len(ids))
     assert cycles.longest == pytest.approx(wire.wire_time(len(wire.written[0]) + 21 * len(ids)))
+
+
+@given(
+    slow_every=st.integers(1, 9),
+    status_every=st.integers(1, 9),
+    cycles=st.lists(st.sampled_from(["sample", "between", "lost", "asked"]), max_size=60),
+)
+def test_spans_are_due_as_if_every_cycle_counted_down_to_each_of_them(
+    slow_every: int, status_every: int, cycles: list[str]
+) -> None:
+    turns, until_slow, until_status, slow = _Turns(2, slow_every, status_every), slow_every, status_every, 0
+    left = turns.plan()
+    for cycle in cycles:
+        if cycle == "asked":
+            turns.count(left)
+            turns.read_status_next()
+            left, until_status = turns.plan(), min(until_status, 1)
+        if cycle == "lost":
+            turns.count(left)
+            left = turns.usual = 0
+        between = cycle == "between"
+        turns.between += between
+        left -= 1
+        if left < 0:
+            turns.count(left)
+            read = turns.due(between)
+            left = turns.plan()
+        else:
+            read = 0
+        until_slow, until_status = until_slow - (not between), until_status - 1
+        if until_slow <= 0 and not between:
+            until_slow, slow = slow_every, slow % 2 + 1
+            assert read == slow
+        elif until_status <= 0:
+            until_status = status_every
+            assert read == 3
+        else:
+            assert read == 0

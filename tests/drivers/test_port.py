@@ -132,7 +132,7 @@ class Line:
         os.write(self._far, data)
 
     def ask(self, letter: bytes) -> bytes:
-        return self.port.ask(letter * 30, 7, 0.05, self.now)
+        return self.port.ask(letter * 30, 7, self.port.reply_time(0.05, 30), self.now)
 
     def settle(self, count: int = 150) -> None:
         for _ in range(count):

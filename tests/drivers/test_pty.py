@@ -13,7 +13,7 @@ import pytest
 
 from hil.drivers.bus import BusConfig, ServoBus
 from hil.drivers.errors import PortLost, PortNotOpened, TorqueNotOff
-from hil.drivers.port import DescriptorPort, open_port
+from hil.drivers.port import DescriptorPort, ReplyTime, open_port
 
 from .conftest import JOINTS, ServedPty
 
@@ -100,10 +100,10 @@ def test_after_a_pulled_cable_the_bus_says_that_torque_is_not_confirmed(served_p
             pty.pull()
         else:
 
-            def ask(data: bytes, count: int, timeout: float, start: float) -> bytes:
+            def ask(data: bytes, count: int, expected: ReplyTime, start: float) -> bytes:
                 bus.port.write(data)
                 pty.pull()
-                return bus.port.read(count, timeout)
+                return bus.port.read(count, expected.timeout)
 
             bus.port.ask = ask  # type: ignore[method-assign]
         bus.exchange([0.1, 0.1])
@@ -152,7 +152,7 @@ def test_a_big_write_is_finished_as_the_device_makes_room(way: str) -> None:
         port.write(sent)
         received = port.read(9, 5.0)
     else:
-        received = port.ask(sent, 9, 5.0, port.clock.now())
+        received = port.ask(sent, 9, port.reply_time(5.0, len(sent)), port.clock.now())
     receiver.join(5.0)
     assert received == b"all of it" and bytes(arrived) == sent
     port.close()
