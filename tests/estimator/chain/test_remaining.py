@@ -140,7 +140,7 @@ def test_a_bound_counts_whatever_misfit_it_causes(misfit: float) -> None:
     assert stage2._at_bound(cast("ChainProblem", problem), minimum, slopes, std) == ("viscous_1",)
 
 
-@pytest.mark.parametrize("taken", [1.02, 1.2])
+@pytest.mark.parametrize("taken", [1.02, pytest.param(1.2, marks=pytest.mark.slow)])
 def test_friction_that_would_have_to_be_negative_is_at_its_bound(setup: bench.Setup, taken: float) -> None:
     period = bench.record(bench.BENCHES[4], setup, bench.path_of(bench.BENCHES[4], setup, 101))
     velocity = np.gradient(period.position[0], 1.0 / period.rate)

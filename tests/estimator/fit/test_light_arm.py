@@ -20,6 +20,8 @@ from hil.estimator.selection.given import fit_given
 from hil.fakes.plants.arm import Arm, base_parameters
 from tests.support import recorded_arm
 
+pytestmark = pytest.mark.slow  # its one fit takes a quarter of a minute
+
 PEAK = 0.05  # N m, three times the weight and twice the friction
 LINK = {"length": 0.08, "mass": 0.03, "centre": 0.05, "inertia": 2e-5}
 DRIVE = {"mass": 0.018, "rotor_inertia": 1.2e-9, "gear_ratio": 288.35, "torque_constant": 0.354, "current_lag": 1e-3}

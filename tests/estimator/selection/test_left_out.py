@@ -78,6 +78,7 @@ def test_error_bars_hold_what_is_left_out_and_cannot_be_ruled_out(
     assert (error / wider).max() < 3.0
 
 
+@pytest.mark.slow
 def test_encoders_that_are_not_linear_are_found_out(ideal_arm: Arm, ideal_period: SettledPeriod) -> None:
     choice = choose([wrong_encoders(ideal_period, 5.7, 2.0)], None, "delay")
     found = choice.estimate

@@ -58,7 +58,7 @@ def test_a_link_made_by_somebody_else_while_the_cable_was_out_stays(arm_file: Ar
     assert link.read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["[/red]", "[bold]x", "<b>&\"'", "--", "]]>", "é中"])
+@pytest.mark.parametrize("name", ["[/red]", "<b>&\"'", "--", "]]>", "é中"])
 def test_a_name_that_is_markup_is_a_name(
     arm_file: ArmFile, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

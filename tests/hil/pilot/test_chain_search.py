@@ -201,7 +201,10 @@ def heavier(belief: ChainBelief, times: float) -> ChainBelief:
     return replace(belief, arms=replace(belief.arms, rigid=times * belief.arms.rigid))
 
 
-@pytest.mark.parametrize("safe_at_first", [0.0, 0.18, 0.4])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("safe_at_first", [pytest.param(0.0, marks=SLOW), 0.18, pytest.param(0.4, marks=SLOW)])
 def test_where_little_of_a_path_is_safe_another_one_with_more_reserve_is_tried(
     monkeypatch: pytest.MonkeyPatch, safe_at_first: float
 ) -> None:

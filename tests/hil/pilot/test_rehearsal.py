@@ -58,8 +58,12 @@ def _without_stopping_distance(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "joints"),
-    [(HANGING, 1), (FLAT, 2), (UPRIGHT, 1), (UPRIGHT, 2)],
-    ids=["hanging", "flat-2", "upright", "upright-2"],
+    [
+        pytest.param(HANGING, 1, id="hanging"),
+        pytest.param(FLAT, 2, id="flat-2", marks=pytest.mark.slow),
+        pytest.param(UPRIGHT, 1, id="upright", marks=pytest.mark.slow),
+        pytest.param(UPRIGHT, 2, id="upright-2"),
+    ],
 )
 def test_every_arm_that_init_writes_can_be_rehearsed(tmp_path: Path, kind: tuple[float, float], joints: int) -> None:
     path = written(tmp_path, kind, joints)

@@ -137,6 +137,7 @@ def test_an_inverted_arm_is_identified_with_a_stabiliser(tmp_path: Path) -> None
     assert "uses the total commanded torque" in page
 
 
+@pytest.mark.slow
 def test_a_second_run_starts_from_the_first_and_needs_fewer_steps(in_steps: Any, tmp_path: Path) -> None:
     first, _, _ = in_steps
     config = load_config(CONFIGS / "first_time.toml")

@@ -173,7 +173,7 @@ def test_a_scheduler_that_dies_is_told_and_the_study_resumed(
     tmp_path: Path, scheduler: tuple[str, "subprocess.Popen[bytes]"]
 ) -> None:
     address, process = scheduler
-    made, out = study(tmp_path, EMPTY.format(runs=3000)), tmp_path / "out"
+    made, out = study(tmp_path, EMPTY.format(runs=1000)), tmp_path / "out"
 
     def kill(progress: StudyProgress) -> None:
         if progress.done == 100:
@@ -182,9 +182,9 @@ def test_a_scheduler_that_dies_is_told_and_the_study_resumed(
     with pytest.raises(SchedulerLost, match="--resume"):
         run_study(made, out, scheduler=address, watch=kill)
     kept = Dataset(out / "rows").done()
-    assert 100 <= len(kept) < 3000
+    assert 100 <= len(kept) < 1000
     dataset = run_study(made, out, resume=True, worker_count=1)
-    assert dataset.table().column("run").to_pylist() == list(range(3000))
+    assert dataset.table().column("run").to_pylist() == list(range(1000))
 
 
 @pytest.fixture
