@@ -159,7 +159,8 @@ class TorqueSwitch:
 
     def repeat_torque_off(self) -> None:
         """Send torque off to all servos once more without waiting for an answer, in case a silent servo receives it."""
-        tell_torque_off(self.port, self._servos)
+        with suppress(DriverError):
+            tell_torque_off(self.port, self._servos)
 
     def torque_now(self) -> dict[Joint, bool | None]:
         """Read whether torque is on at each servo that is not reported as unconfirmed; None where that is unknown."""

@@ -202,6 +202,10 @@ class Lowering:
                 Cause.WRONG_SIGN,
             )
 
+    def others_answer(self) -> None:
+        """Record that of the servos that are not heard, some do answer: a silent one hides their replies."""
+        self._guard.others_answer()
+
     def late(self, seconds: float) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
         self._guard.late(seconds)
