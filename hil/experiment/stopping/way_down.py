@@ -138,8 +138,12 @@ class WayDown:
         self._steps = PositionSteps(state)
         count = lowering.begin(state, self._goal, self._guard.recent, self._watch)
         # The first goals are sent at once: until then those that led to the stop drive the arm.
-        start = self._clock.now() - first * self._interval
+        begun = start = self._clock.now() - first * self._interval
         while index < count:
+            if lowering.needs_another_path:
+                index, first, start = 0, 0, self._clock.now()
+                count = lowering.begin_again(state, self._goal)
+                lowering.check_time(start - begun + count * self._interval)
             self._deadline = start + index * self._interval
             if index > first:
                 self._look_for_another_master(self._deadline)

@@ -29,6 +29,7 @@ class Lowers(Checks):
     samples = 3
 
     every = 1
+    needs_another_path = False
 
     def slow_down(self, every: int) -> None:
         self.every = every
