@@ -108,15 +108,17 @@ class Silence:
         together = self._blind if self.is_busy else self._limit
         allowed = self._alone if alone or self.others_answer else together
         if is_missing_too_long(count, listened, allowed):
-            return f"{_ms(elapsed)} ago{_delayed(elapsed - listened)}; {allowed.said} allows {_ms(allowed.seconds)}"
+            delayed = self._delayed(elapsed - listened)
+            return f"{_ms(elapsed)} ago{delayed}; {allowed.said} allows {_ms(allowed.seconds)}"
         if is_missing_too_long(count, elapsed, self._blind):
-            delayed = _delayed(elapsed - listened)
+            delayed = self._delayed(elapsed - listened)
             return f"{_ms(elapsed)} ago{delayed}; {self._blind.said} allows {_ms(self._blind.seconds)}"
         return None
 
-
-def _delayed(seconds: float) -> str:
-    return f", {_ms(seconds)} of it because this computer was busy" if seconds >= LATE_WAKE_UP_S else ""
+    def _delayed(self, seconds: float) -> str:
+        """How much of a silence was this computer's fault [s]; during a lowering, only if it is known to be busy."""
+        is_told = seconds >= LATE_WAKE_UP_S and (self.is_busy or not self._already)
+        return f", {_ms(seconds)} of it because this computer was busy" if is_told else ""
 
 
 def _ms(seconds: float) -> str:
