@@ -22,7 +22,7 @@ from hil.drivers.preparation.prepare import (
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
 from hil.drivers.state import NAN, SETTINGS, Converter, State, fold, read_back_spans, spans
-from hil.drivers.sync_read import Answer
+from hil.drivers.sync_read import Answer, Span, SyncRead
 from hil.drivers.torque.held import let_sink, refuse_held
 from hil.drivers.torque.switch import TorqueSwitch
 
@@ -304,6 +304,18 @@ class ServoBus(TorqueSwitch):
         if exchange.heard.mixed_up > MOST_MIXED_UP:
             raise WrongReply(exchange.heard.mixed_up_advice(self.port.url))
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
+
+    def first_hides_others(self, patience: float) -> bool:
+        """Whether the first servo is silent and only hides the replies of the others, which answer. Raises PortLost.
+
+        In a group read, a servo that does not answer hides the replies of those after it. So the last servo and the
+        first one are asked in this order. patience: how long to wait for their replies [s].
+        """
+        drives = (self._drives[-1], self._drives[0])
+        read = SyncRead([each.id for each in drives], Span.of([self._servos[each].table for each in drives], ["ID"]))
+        received = self.port.ask(read.request, read.reply_size, patience, self.port.clock.now())
+        (last, first), _ = read.search(received)
+        return last is not None and first is None
 
     def check_not_overruled(self, due: float) -> None:
         """Check that the servos hold this program's goals and modes, if there is time before `due` [s].

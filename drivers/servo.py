@@ -105,12 +105,22 @@ class Servo:
         """
         self._write_and_read_back(register, value, attempts, despite_error=False)
 
-    def write_despite_error(self, register: str, value: int, attempts: int | None = None) -> None:
+    def write_despite_error(self, register: str, value: int) -> None:
         """Write a register as `write` does, but ignore errors that replies report if the value reads back as written.
 
         Writes that make an arm safe or restore it must not fail because of a servo that reports errors but obeys.
         """
-        self._write_and_read_back(register, value, attempts, despite_error=True)
+        self._write_and_read_back(register, value, None, despite_error=True)
+
+    def write_once(self, register: str, value: int) -> None:
+        """Write a register as `write_despite_error` does, but try once only; raise NoReply if the write itself is not
+        answered, without sending anything more.
+        """
+        with suppress(ServoRefused):
+            self.write_only(register, value, attempts=1)
+        actual = self.read_entry(self.table[register], attempts=1, despite_error=True)
+        if actual != value:
+            raise _not_held(self.title, register, value, actual)
 
     def _write_and_read_back(self, register: str, value: int, attempts: int | None, *, despite_error: bool) -> None:
         attempts = _ATTEMPTS if attempts is None else attempts

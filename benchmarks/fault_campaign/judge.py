@@ -39,6 +39,11 @@ LIE_RAD, LIE_RAD_S, LIE_SHARE = 0.1, 0.5, 0.1
 UNSURE_MS = 20
 """How much earlier than an attack its effect may appear in the record [ms], which is written once the bus is used."""
 
+SHORTEST_WATCHDOG_S = 0.04
+"""Shortest Bus Watchdog that a program can run an arm with [s]: it counts in steps of 20 ms, and one step is less than
+the stall of a busy computer after which an arm can still be lowered.
+"""
+
 OBEYED = 0.1
 """Tolerance for a servo's goal, relative to the largest goal of the run."""
 
@@ -253,7 +258,32 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
     for fault in drawn.faults:
         if fault.kind == FaultKind.CABLE_PULLED and fault.at < story.ended:
             found.append(("the cable was unplugged", fault.at))
-    return [reason for reason in found if reason is not None]
+    fed_since, fed_until = fed_by_another(drawn, story.ended)
+    return [
+        (what, fed_until if what.endswith("was not heard") and fed_since <= when < fed_until else when)
+        for what, when in (reason for reason in found if reason is not None)
+    ]
+
+
+def fed_by_another(drawn: Drawn, ended: float) -> tuple[float, float]:
+    """From when to when nobody could stop the servos [s]; (inf, -inf) if never.
+
+    A killed program does nothing more, and any packet on the bus feeds the watchdogs, so while another program sends
+    packets more often than the shortest watchdog waits, nothing is left that could end the current. It must end in
+    time after the last of those packets. Packets that are farther apart are held against the program, since a shorter
+    watchdog would have helped.
+    """
+    since = min((each.start for each in drawn.attacks if each.kind == Kind.KILLED), default=np.inf)
+    fed = [
+        min(each.end, ended)
+        for each in drawn.faults
+        if each.kind == FaultKind.OTHER_MASTER
+        and each.probability == 1.0
+        and each.size < SHORTEST_WATCHDOG_S
+        and each.at <= since < each.end
+    ]
+    # What was heard last may be a cycle older than the kill.
+    return since - 1e-3 * UNSURE_MS, max(fed, default=-np.inf)
 
 
 def overruled_ms(config: Config, story: Story, told: "Told") -> float:

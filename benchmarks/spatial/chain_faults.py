@@ -15,8 +15,10 @@ unsafe          judged by what the program can do: servos that obey may be drive
                 not commanded for more than 100 ms (the watchdog's time where a servo hears nothing), also while the
                 arm was lowered; current for longer than that after a servo was silent or the cable unplugged; after
                 any other reason, current for longer than the lowering takes. Links that, while motors drove them, came
-                closer to each other than in the undisturbed run, and touched. A joint that overshot its limits further
-                than a lowering may
+                closer to each other than in the undisturbed run, and touched; an arm that lies touches what it lies on,
+                also if a joint that something holds by force is all that is away from the rest pose, since nothing
+                could bring that joint home. A joint that overshot its limits further than a lowering may. After a kill
+                while another program feeds the watchdogs, nobody can end the current (`judge.fed_by_another`)
 lying           of the runs that were stopped although they could command: the arm ended in its rest pose, and
                 current was only switched off there
 """
@@ -201,7 +203,7 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
         bound,
         lower_ms,
         cut_ms,
-        _clearance(config, record) - min(0.0, _clearance(config, ready.undisturbed.record)) + SAME_M,
+        _clearance(config, record, drawn) - min(0.0, _clearance(config, ready.undisturbed.record)) + SAME_M,
         float(np.maximum(low - moved.min(axis=0), moved.max(axis=0) - high).max()),
         overruled_ms(config, story, told),
         stopped,
@@ -249,15 +251,30 @@ def _leaves_command(drawn: Drawn, ended: float) -> bool:
     return set(drawn.kinds) <= COMMANDABLE and not forced and asked <= 1
 
 
-def _clearance(config: Config, record: NDArray[Any]) -> float:
+def _clearance(config: Config, record: NDArray[Any], drawn: Drawn | None = None) -> float:
     """Least distance [m] while motors drove the arm and it was away from its rest pose."""
     driven = np.asarray(record["driven"].any(axis=1))
     position = record["position"][driven][::LOOKED_AT_MS].T
+    time = record["time"][driven, 0][::LOOKED_AT_MS]
     space = Space.of(config)
-    position = position[:, ~space.lies(position)]
+    position = position[:, ~space.lies(_without_held(config, position, time, drawn))]
     if not position.shape[1]:
         return 1.0
     return float(min(space.nearest(position, on_the_way=True).distance, 1.0))
+
+
+def _without_held(
+    config: Config, position: NDArray[np.float64], time: NDArray[np.float64], drawn: Drawn | None
+) -> NDArray[np.float64]:
+    """The poses (joints, times) [rad], with joints that something holds by force at their rest angles meanwhile."""
+    free = position.copy()
+    for attack in drawn.attacks if drawn else ():
+        if attack.kind in _BY_FORCE and abs(attack.amount) > WEAKER:
+            held = (time >= attack.start) & (time <= attack.end)
+            for index, joint in enumerate(config.joints):
+                if attack.concerns(joint.id):
+                    free[index, held] = config.arm.rest_pose[index]
+    return free
 
 
 def _lies(config: Config, position: NDArray[np.float64]) -> bool:

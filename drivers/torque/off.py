@@ -1,11 +1,11 @@
 """Cutting torque: torque off is sent to every servo and read back, regardless of failures and interrupts.
 
-The order matters. Torque off is sent to all servos at once, which takes 0.3 ms. Then each servo is polled once; one
-that does not reply costs about 40 ms, so torque off is sent to all again afterwards: a servo may receive without being
-able to reply, and a packet may have been lost. If a servo still cannot be confirmed, the bus stays silent for as long
-as its Bus Watchdog waits: every packet feeds the watchdog of a servo that receives but does not obey, because it
-refuses instructions or its ID has changed. For the same reason, servos that did not answer the last exchange are not
-polled before this pause. Then the remaining servos are tried again, several times.
+The order matters. Every packet feeds the Bus Watchdog of every servo that receives it, whatever its ID. For a servo
+that receives but does not obey, because it refuses instructions or its ID has changed, that watchdog is the only thing
+that ends its current. So torque off is first sent to all servos at once, which takes 0.3 ms; then each servo is polled,
+until one does not reply. From then on, the bus stays silent for as long as the Bus Watchdogs wait. If a servo was
+silent before torque is cut, torque off is sent three times, since a packet may have been lost, and the silence begins
+at once. After it, all servos that are not confirmed yet are polled again, several times.
 
 Ctrl-C raises KeyboardInterrupt at any point of the program, even between two servos while torque is being cut. A
 program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from types import FrameType
 
-from hil.drivers.errors import DriverError, PortLost
+from hil.drivers.errors import DriverError, NoReply, PortLost
 from hil.drivers.joint import Joint
 from hil.drivers.packet import BROADCAST_ID, Instruction, encode
 from hil.drivers.port import Port
@@ -157,33 +157,42 @@ def cut_torque(
     left = dict(servos)
     why: dict[Joint, Exception] = {}
 
-    def confirm(asked: Mapping[Joint, Servo], attempts: int | None) -> None:
-        _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
-        for joint, servo in asked.items():
-            failed = _confirm(servo, attempts, interrupts)
-            if failed is None:
-                del left[joint]
-            else:
-                why[joint] = failed
-                _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
-
     def wait(seconds: float) -> None:
         _uninterrupted(lambda: port.clock.wait_until(port.clock.now() + seconds), interrupts)
 
-    confirm({joint: servo for joint, servo in servos.items() if joint not in silent}, attempts=1)
-    if any(isinstance(error, PortLost) for error in why.values()):
-        confirm({joint: servo for joint, servo in left.items() if joint not in why}, attempts=1)
-    elif left:
-        for _ in range(_REPEATS):
-            wait(_REPEAT_S)
-            _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
+    def tell() -> Exception | None:
+        return _uninterrupted(lambda: tell_torque_off(port, servos), interrupts)
+
+    def confirm(joint: Joint, *, at_once: bool) -> Exception | None:
+        failed = _confirm(servos[joint], interrupts, at_once=at_once)
+        if failed is None:
+            del left[joint]
+        else:
+            why[joint] = failed
+        return failed
+
+    lost = isinstance(tell(), PortLost)
+    for _ in range(_REPEATS if silent and not lost else 0):
+        wait(_REPEAT_S)
+        tell()
+    for joint in () if silent and not lost else servos:
+        failed = confirm(joint, at_once=True)
+        lost = lost or isinstance(failed, PortLost)
+        if failed is not None and not lost:
+            if isinstance(failed, NoReply):
+                break
+            tell()  # a damaged reply shows that it receives, so its watchdog is not what stops it
+    if left and not lost:
         wait(watchdog + TRIP_S)
-        confirm(dict(left), attempts=None)
+        tell()
+        for joint in tuple(left):
+            if confirm(joint, at_once=False) is not None:
+                tell()
     return tuple(joint for joint in servos if joint not in left), tuple((joint, _text(why[joint])) for joint in left)
 
 
 def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
-    """Send torque off to all servos in one packet; a failure is detected when they are read back.
+    """Send torque off to all servos in one packet. Raises PortLost.
 
     The packet is a Sync Write to these servos only, since others on the bus may be in use. It is sent twice, since a
     packet may be lost.
@@ -193,19 +202,19 @@ def tell_torque_off(port: Port, servos: Mapping[Joint, Servo]) -> None:
 
 def tell_watchdogs(port: Port, servos: Mapping[Joint, Servo], seconds: float) -> None:
     """Set the Bus Watchdogs of all servos to `seconds` [s] in one packet; a failure leaves them as they are."""
-    _tell(port, servos, "Bus Watchdog", max(1, round(seconds / WATCHDOG_UNIT)))
+    with suppress(DriverError):
+        _tell(port, servos, "Bus Watchdog", max(1, round(seconds / WATCHDOG_UNIT)))
 
 
 def _tell(port: Port, servos: Mapping[Joint, Servo], register: str, value: int, times: int = 1) -> None:
-    """Write a register of one byte on all servos, without waiting for an answer."""
+    """Write a register of one byte on all servos, without waiting for an answer. Raises PortLost."""
     every = list(servos.values())
     if not every:
         return
     entry = every[0].table[register]
     body = entry.address.to_bytes(2, "little") + entry.size.to_bytes(2, "little")
     body += b"".join(bytes((servo.id, value)) for servo in every)
-    with suppress(DriverError):
-        port.write(times * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
+    port.write(times * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
 
 
 def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> None:
@@ -256,9 +265,13 @@ def was_rebooted(servo: Servo) -> bool:
     return False
 
 
-def _confirm(servo: Servo, attempts: int | None, interrupts: list[BaseException]) -> Exception | None:
-    """Write torque off and read it back; return None, or the failure."""
-    return _uninterrupted(lambda: servo.write_despite_error("Torque Enable", 0, attempts), interrupts)
+def _confirm(servo: Servo, interrupts: list[BaseException], *, at_once: bool) -> Exception | None:
+    """Write torque off and read it back; return None, or the failure.
+
+    at_once: try once only, and do not send anything after a missing reply.
+    """
+    write = servo.write_once if at_once else servo.write_despite_error
+    return _uninterrupted(lambda: write("Torque Enable", 0), interrupts)
 
 
 def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) -> Exception | None:

@@ -159,7 +159,8 @@ class TorqueSwitch:
 
     def repeat_torque_off(self) -> None:
         """Send torque off to all servos once more without waiting for an answer, in case a silent servo receives it."""
-        tell_torque_off(self.port, self._servos)
+        with suppress(DriverError):
+            tell_torque_off(self.port, self._servos)
 
     def torque_now(self) -> dict[Joint, bool | None]:
         """Read whether each servo's torque is on, except for those reported as unconfirmed; None if it is unknown."""

@@ -142,6 +142,10 @@ class Guard:
         """Record that this program woke up at `now` [s], `late` [s] after the intended time (negative: earlier)."""
         self._silence.woke_up(now, late)
 
+    def others_answer(self) -> None:
+        """Record that of the servos that are not heard, some do answer: a silent one hides their replies."""
+        self._silence.others_answer = True
+
     def late(self, seconds: float = 0.0) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""
         self._deadlines.missed(seconds, waited=any(self._missing))

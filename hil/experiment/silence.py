@@ -13,7 +13,14 @@ some servos are heard and one is not, that servo is silent.
 from math import inf
 
 from hil.config.schema import Config
-from hil.plan.silence import Limit, bridged_limit, is_missing_too_long, late_limit, missing_limit
+from hil.plan.silence import (
+    Limit,
+    bridged_alone_limit,
+    bridged_limit,
+    is_missing_too_long,
+    late_limit,
+    missing_limit,
+)
 
 LATE_WAKE_UP_S = 1e-3
 """Lateness of this program that indicates a busy computer [s]; on an idle one, it stays below a third of this."""
@@ -36,8 +43,9 @@ class Silence:
         self._limit = missing_limit(config) if heard_at is None else bridged_limit(config)
         late = late_limit(config)
         self._blind: Limit = max(late, self._limit, key=lambda limit: limit.seconds)
+        self._alone = self._limit if heard_at is None else bridged_alone_limit(config)
         self._already = heard_at is not None
-        self._asked_at: float | None = None
+        self._asked_at = heard_at
         self._turn = 0.0
         self._last_heard = [-inf if heard_at is None else heard_at] * count
         self._all_heard_at = -inf
@@ -47,6 +55,8 @@ class Silence:
         """Replies missed in a row, by joint."""
         self.any_missed = False
         """Whether any joint has missed the latest reply."""
+        self.others_answer = False
+        """Whether servos whose replies are missing are known to answer, i.e. a silent one hides them."""
 
     @property
     def is_busy(self) -> bool:
@@ -69,6 +79,7 @@ class Silence:
         self.counts[joint] = 0
         self._listened[joint] = 0.0
         self._last_heard[joint] = now
+        self.others_answer = False
         self.any_missed = any(self.counts)
 
     def all_heard(self, now: float) -> None:
@@ -76,8 +87,9 @@ class Silence:
         self._asked_at = self._all_heard_at = now
 
     def missed(self, joint: int, now: float, *, refused: bool = False, alone: bool = True) -> str | None:
-        """Record a missing reply to the exchange that began at `now` [s]; return a description of a silence that is too
-        long, or None.
+        """Record a missing reply to an exchange; return a description of a silence that is too long, or None.
+
+        now: when that exchange began, or when waiting for its replies ended [s].
 
         refused: whether the servo answered with an error instead of its state; one such answer is enough. alone:
         whether only this servo is silent, i.e. another one was heard.
@@ -88,21 +100,25 @@ class Silence:
         self.any_missed = True
         self.counts[joint] += 1
         self._listened[joint] += self._turn
-        listened = max(self._listened[joint], self.counts[joint] * self._interval)
+        waited = 0.0 if self._asked_at is None else now - self._asked_at
+        listened = max(self._listened[joint] + waited, self.counts[joint] * self._interval)
         elapsed = max(now - last, listened)
         count = self.counts[joint] + refused
         count += self._already  # replies may have been missing before the arm was lowered
-        allowed = self._limit if alone or not self.is_busy else self._blind
+        together = self._blind if self.is_busy else self._limit
+        allowed = self._alone if alone or self.others_answer else together
         if is_missing_too_long(count, listened, allowed):
-            return f"{_ms(elapsed)} ago{_delayed(elapsed - listened)}; {allowed.said} allows {_ms(allowed.seconds)}"
+            delayed = self._delayed(elapsed - listened)
+            return f"{_ms(elapsed)} ago{delayed}; {allowed.said} allows {_ms(allowed.seconds)}"
         if is_missing_too_long(count, elapsed, self._blind):
-            delayed = _delayed(elapsed - listened)
+            delayed = self._delayed(elapsed - listened)
             return f"{_ms(elapsed)} ago{delayed}; {self._blind.said} allows {_ms(self._blind.seconds)}"
         return None
 
-
-def _delayed(seconds: float) -> str:
-    return f", {_ms(seconds)} of it because this computer was busy" if seconds >= LATE_WAKE_UP_S else ""
+    def _delayed(self, seconds: float) -> str:
+        """How much of a silence was this computer's fault [s]; during a lowering, only if it is known to be busy."""
+        is_told = seconds >= LATE_WAKE_UP_S and (self.is_busy or not self._already)
+        return f", {_ms(seconds)} of it because this computer was busy" if is_told else ""
 
 
 def _ms(seconds: float) -> str:

@@ -3,11 +3,13 @@
 As long as the torque does not change, a reversed motor and something that pushes the joint look alike: the arm moves as
 if an additional torque acted on the joint. So the goal of such a joint is removed for a moment, while the others are
 held. Unexplained torque that comes from the joint's own motor falls in proportion to its goal; torque from a push does
-not. The test is short: in that time a limp joint gains less speed from gravity than a reversed motor would give it.
+not. It falls along with the motor's own torque, through the same filter: what falls earlier or later is something else,
+such as a push that has just ended, and the joint is tested again. The test is short: in that time a limp joint gains
+less speed from gravity than a reversed motor would give it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 __all__ = ["Obedience", "Residual"]
@@ -28,8 +30,29 @@ reversed motor, less right after the reversal, 1 for a motor without torque, 0 f
 joint is tested again.
 """
 
+MOST_TURNED = 3.0
+"""Ratio of the two falls above which the unexplained torque was not that of the joint's motor alone."""
+
+UNEVEN = 0.3
+"""Deviation from a fall in proportion to the joint's own torque, relative to the whole fall, above which the
+unexplained torque has another cause.
+"""
+
+MOST_UNEVEN = 3
+"""Number of tests in a row in which the unexplained torque fell unevenly, after which it counts as the motor's all the
+same.
+"""
+
 MOVES_RAD_S = 0.1
-PAUSE_S = 0.01
+DOUBT_S = 0.1
+"""How long after an undecided test a joint that speeds up is blamed without another one [s]: its motor may have become
+reversed right before that test.
+"""
+
+PAUSE_S, PUSHED_PAUSE_S = 0.01, 0.25
+"""Time between two tests of a joint, and the time after a test that showed a push [s]. A push may end, and noise may
+look like one, so the joint is tested again.
+"""
 
 
 class Residual(NamedTuple):
@@ -53,6 +76,20 @@ class _Test:
     drives: bool
     lacking: float | None = None
     torque: float = 0.0
+    seen: list[tuple[float, float]] = field(default_factory=list)
+
+    def share(self, lacking: float, torque: float) -> float:
+        """By how much the unexplained torque has fallen, relative to the joint's own."""
+        assert self.lacking is not None
+        return (self.lacking - lacking) / (self.torque - torque) if torque != self.torque else 0.0
+
+    def is_uneven(self, lacking: float, torque: float) -> bool:
+        """Whether the unexplained torque has not fallen along with the joint's own."""
+        assert self.lacking is not None
+        share, most = self.share(lacking, torque), UNEVEN * abs(self.lacking - lacking)
+        return share > MOST_TURNED or any(
+            abs(self.lacking - before - share * (self.torque - own)) > most for before, own in self.seen
+        )
 
 
 class Obedience:
@@ -62,17 +99,34 @@ class Obedience:
         self._tests: list[_Test | None] = [None] * joints
         self._rests_until = [float("-inf")] * joints
         self._pushed = [False] * joints
+        self._uneven = [0] * joints
+        self._doubted_until = [float("-inf")] * joints
 
     def is_limp(self, joint: int) -> bool:
         """Whether this joint must receive no torque now."""
         return self._tests[joint] is not None
+
+    def is_pushed(self, joint: int) -> bool:
+        """Whether a test has shown that something pushes or has pushed this joint."""
+        return self._pushed[joint]
+
+    def question(self, joint: int, now: float) -> bool:
+        """Begin a test of a joint that speeds up although its torque opposes the motion. now: time [s].
+
+        Returns False if one has just been undecided, in which case its motor is to blame.
+        """
+        if now < self._doubted_until[joint]:
+            return False
+        if not self._tests[joint] and now >= self._rests_until[joint]:
+            self._tests[joint] = _Test(now, drives=True)
+        return True
 
     def suspect(self, found: Residual, velocity: Sequence[float], now: float) -> None:
         """Begin the tests that the latest exchange calls for. velocity: believed velocities [rad/s]. now: time of that
         exchange [s].
         """
         for joint, (lacking, torque) in enumerate(zip(found.lacking, found.torque, strict=True)):
-            if self._tests[joint] or self._pushed[joint] or now < self._rests_until[joint]:
+            if self._tests[joint] or now < self._rests_until[joint]:
                 continue
             low, high = SUSPECT[0] * abs(torque), SUSPECT[1] * abs(torque)
             if found.suspected[joint] and lacking * torque > 0.0 and low <= abs(lacking) <= high:
@@ -88,15 +142,26 @@ class Obedience:
                 test.lacking, test.torque = lacking, torque
                 test.drives |= _drives(lacking, velocity[joint])
             elif abs(torque) <= ENOUGH * abs(test.torque) or now - test.since > LONGEST_TEST_S:
-                share = (test.lacking - lacking) / (test.torque - torque) if torque != test.torque else 0.0
                 # What slows a joint down may be an obstacle, whose force also ends with the goal.
-                if test.drives and share > TURNED:
+                if test.drives and self._is_turned(joint, test, lacking, torque):
                     return joint
                 self._tests[joint] = None
-                self._rests_until[joint] = now + PAUSE_S
-                self._pushed[joint] = share <= PUSHED
+                is_pushed = test.share(lacking, torque) <= PUSHED
+                self._pushed[joint] |= is_pushed
+                if test.drives and not is_pushed and not test.is_uneven(lacking, torque):
+                    self._doubted_until[joint] = now + DOUBT_S
+                self._rests_until[joint] = now + (PUSHED_PAUSE_S if is_pushed else PAUSE_S)
+            else:
+                test.seen.append((lacking, torque))
         self.suspect(found, velocity, now)
         return -1
+
+    def _is_turned(self, joint: int, test: _Test, lacking: float, torque: float) -> bool:
+        """Whether a test that ends with these torques shows that the motor is reversed."""
+        if test.share(lacking, torque) <= TURNED:
+            return False
+        self._uneven[joint] += test.is_uneven(lacking, torque)
+        return not test.is_uneven(lacking, torque) or self._uneven[joint] >= MOST_UNEVEN
 
 
 def _drives(lacking: float, velocity: float) -> bool:

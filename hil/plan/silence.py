@@ -18,6 +18,11 @@ BRIDGED_S = 0.06
 along the path that it was following. Torque must be off 100 ms after the last reply; switching it off takes some time.
 """
 
+BRIDGED_ALONE_S = 0.028
+"""The same for servos that do not reply while another does [s]. Such a servo may have changed its ID: then only its Bus
+Watchdog can stop it, which waits from the last packet on the bus, whatever servo that packet is for.
+"""
+
 
 class Limit(NamedTuple):
     """A time limit [s] and the setting it comes from, as text."""
@@ -39,6 +44,11 @@ def missing_limit(config: Config) -> Limit:
 def bridged_limit(config: Config) -> Limit:
     """How long a servo may fail to reply while a spatial arm is lowered."""
     return _bounded(Limit(BRIDGED_S, "lowering the arm"), config.safety.watchdog)
+
+
+def bridged_alone_limit(config: Config) -> Limit:
+    """How long a servo may fail to reply while a spatial arm is lowered and another servo replies."""
+    return _bounded(Limit(BRIDGED_ALONE_S, "lowering the arm while other servos answer"), config.safety.watchdog)
 
 
 def late_limit(config: Config) -> Limit:

@@ -34,6 +34,9 @@ from hil.plan.way_home import PULL_PER_S, PULL_SHARE, WayHome
 LEAVES_RAD = 0.35
 """Largest accepted tracking error [rad]: a joint with a larger one does not follow its path to the rest pose."""
 
+MOST_PATHS = 4
+"""Number of paths home, the first one included, until an arm that is pushed off them is given up."""
+
 LYING_RAD = 0.06
 """If every joint is within this angle of the rest pose [rad], the arm counts as lying in it."""
 
@@ -41,6 +44,9 @@ RUNS_AWAY = 0.25
 """Excess of a joint's velocity over the velocity of its path to the rest pose, relative to the velocity limit. A joint
 that exceeds this and still speeds up although its torque opposes the motion counts as not obeying its motor.
 """
+
+TOO_FAST = 0.6
+"""Velocity of such a joint, relative to its limit, at which it is not tested any more: torque is cut."""
 
 _GROWS_S = 0.015
 _ROOM_RAD = 0.2  # beyond the position limits and the path home
@@ -145,7 +151,25 @@ class Lowering:
             self._obedience.suspect(watch.residual, velocity.tolist(), state.time_before_write)
         self._excess = deque[tuple[float, NDArray[np.float64]]]()
         self._against = np.zeros_like(position)
+        self._paths, self.needs_another_path = 1, False
         return int(count)
+
+    def begin_again(self, state: State, goal: list[float]) -> int:
+        """Plan another path home from this sample; return its number of samples."""
+        obedience, paths = self._obedience, self._paths
+        count = self.begin(state, goal, self._recent, self._watch)
+        self._obedience, self._paths = obedience, paths + 1
+        return count
+
+    def check_time(self, seconds: float) -> None:
+        """Raise SafetyStop if lowering takes `seconds` [s] in all and that is too long."""
+        longest = self._config.safety.lower_time
+        if seconds > longest:
+            raise SafetyStop(
+                f"the arm was pushed off its path, and another path would take the lowering to {seconds:.1f} s; "
+                f"safety.lower_time is {longest:g} s.",
+                Cause.UNEXPECTED,
+            )
 
     def goals(self, index: int, state: State) -> list[float]:
         """Goals [A or V] of one sample, from the previous sample's state. Raises SafetyStop."""
@@ -167,10 +191,18 @@ class Lowering:
         self._guard.look(state, gap, between=between)
         away = np.abs(self._position[index] - np.array(state.position))
         if np.nanmax(away, initial=0.0) > LEAVES_RAD:
-            joint = self._config.joints[int(np.nanargmax(away))].joint
-            raise SafetyStop(f"{joint.title} is {np.nanmax(away):.2f} rad off its lowering path.", Cause.UNEXPECTED)
+            self._look_at_distance(int(np.nanargmax(away)), float(np.nanmax(away)))
         if not any(state.missing):
             self._look_at_obedience(index, state)
+
+    def _look_at_distance(self, joint: int, away: float) -> None:
+        """Decide about a joint that is far off its path [rad]: one that was pushed goes home from where it is now."""
+        pushed = self._obedience.is_pushed(joint)
+        self.needs_another_path = pushed and self._paths < MOST_PATHS
+        if not self.needs_another_path:
+            why = ": something pushes it, and its motor is too weak." if pushed else "."
+            title = self._config.joints[joint].joint.title
+            raise SafetyStop(f"{title} is {away:.2f} rad off its lowering path{why}", Cause.UNEXPECTED)
 
     def _look_at_obedience(self, index: int, state: State) -> None:
         """Raise SafetyStop for a joint whose motor turns against its goals, or that its torque does not slow down."""
@@ -195,13 +227,25 @@ class Lowering:
             return
         runs = (np.abs(excess) > self._fastest) & (np.abs(excess) > np.abs(before)) & (self._against * excess < 0.0)
         if runs.any():
-            joint = int(np.argmax(runs))
-            raise SafetyStop(
-                f"{self._config.joints[joint].joint.title} is speeding up (now {velocity[joint]:+.2f} rad/s) "
-                "although its torque opposes the motion: its motor turns the wrong way or has failed, or something is "
-                "pushing the joint.",
-                Cause.WRONG_SIGN,
-            )
+            self._look_at_runaway(int(np.argmax(runs)), velocity, now)
+
+    def _look_at_runaway(self, joint: int, velocity: NDArray[np.float64], now: float) -> None:
+        """Test a joint that speeds up although its torque opposes the motion. Raises SafetyStop without a model, and if
+        the joint has become so fast that its motor no longer matters.
+        """
+        share = abs(velocity[joint]) / self._config.joints[joint].velocity_limit
+        if self._watch is not None and share < TOO_FAST and self._obedience.question(joint, now):
+            return
+        raise SafetyStop(
+            f"{self._config.joints[joint].joint.title} is speeding up (now {velocity[joint]:+.2f} rad/s) "
+            "although its torque opposes the motion: its motor turns the wrong way or has failed, or something is "
+            "pushing the joint.",
+            Cause.WRONG_SIGN,
+        )
+
+    def others_answer(self) -> None:
+        """Record that of the servos that are not heard, some do answer: a silent one hides their replies."""
+        self._guard.others_answer()
 
     def late(self, seconds: float) -> None:
         """Record a missed deadline, `seconds` after the last command. Raises SafetyStop if the gap is too long."""

@@ -19,10 +19,10 @@ from hil.experiment.guard import Guard
 from hil.experiment.pace import read_back
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stopping.lowering import Lowering
-from hil.experiment.stopping.pace import Pace
+from hil.experiment.stopping.pace import LONGER_S, Pace
 from hil.experiment.stopping.position_steps import PositionSteps
 from hil.plan.plan import Plan
-from hil.plan.silence import BRIDGED_S
+from hil.plan.silence import BRIDGED_ALONE_S, BRIDGED_S
 from hil.runs.recording import Phase, Recorder, missed
 
 _RECENT_S = 0.1
@@ -82,6 +82,7 @@ class WayDown:
         self._alerts: list[bool] = []
         self._goal: list[float] = []
         self._deadline = self._sent_at = self._heard_at = 0.0
+        self._was_silent = False
 
     def lower(self, error: ExperimentError | BusOverheard, stopped: Stopped) -> None:
         """Brake and lower the arm until it is at rest, a check fails, or a second signal arrives. Never raises.
@@ -97,7 +98,7 @@ class WayDown:
         is_alert = isinstance(error, SafetyStop) and error.cause is Cause.ALERT
         if (is_alert or any(self._alerts)) and not self._bus.has_torque():
             return
-        if stopped.is_blind and self._clock.now() - state.time_before_write > BRIDGED_S:
+        if stopped.is_blind and self._is_silent_too_long(stopped.latest, state):
             return
         since = 0.0 if stopped.sent_at is None else self._clock.now() - stopped.sent_at
         if self._bus.is_watched and since >= self._config.safety.watchdog + TRIP_S:
@@ -114,6 +115,16 @@ class WayDown:
         done = f"was lowered, but not to its rest pose: {elsewhere}" if elsewhere else "was lowered to its rest pose"
         self._told(error, f"The arm {done}.")
 
+    def _is_silent_too_long(self, latest: State, whole: State) -> bool:
+        """Whether the replies that are missing now have been missing for longer than a lowering may bridge.
+
+        At most one packet is sent to find out, since each one feeds the watchdog of a servo that has another ID now.
+        """
+        since = self._clock.now() - whole.time_before_write
+        if since <= BRIDGED_ALONE_S or since > BRIDGED_S:
+            return since > BRIDGED_S
+        return not all(latest.missing) or (len(latest.missing) > 1 and self._bus.first_hides_others(LONGER_S))
+
     def _follow(self, state: State, stopped: Stopped) -> State:
         """Follow the path home; return the last state. Raises SafetyStop, StopRequested, DriverError."""
         lowering, asked = self._lowering, max(1, self._stop.count)
@@ -127,8 +138,12 @@ class WayDown:
         self._steps = PositionSteps(state)
         count = lowering.begin(state, self._goal, self._guard.recent, self._watch)
         # The first goals are sent at once: until then those that led to the stop drive the arm.
-        start = self._clock.now() - first * self._interval
+        begun = start = self._clock.now() - first * self._interval
         while index < count:
+            if lowering.needs_another_path:
+                index, first, start = 0, 0, self._clock.now()
+                count = lowering.begin_again(state, self._goal)
+                lowering.check_time(start - begun + count * self._interval)
             self._deadline = start + index * self._interval
             if index > first:
                 self._look_for_another_master(self._deadline)
@@ -165,9 +180,17 @@ class WayDown:
         self._takes = max(self._takes, took)
         self._heard_at = self._heard_at if is_missed else state.time_before_write
         pace.took(took, missed=is_missed)
+        self._look_behind_silence(state)
         if pace.every != former:
             self._lowering.slow_down(pace.every)
         return state
+
+    def _look_behind_silence(self, state: State) -> None:
+        """When no servo is heard any more, find out once whether only one is silent and hides all others."""
+        is_silent = all(state.missing) and len(state.missing) > 1
+        if is_silent and not self._was_silent and self._bus.first_hides_others(LONGER_S):
+            self._lowering.others_answer()
+        self._was_silent = is_silent
 
     def _between_samples(self) -> Iterator[State]:
         """Exchange the same goals until the next sample is due; yield each state.

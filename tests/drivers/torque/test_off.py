@@ -2,13 +2,14 @@
 
 import signal
 import threading
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from hil.drivers.control_table import load_control_table
-from hil.drivers.errors import DriverError, NoReply, PortLost
+from hil.drivers.errors import DriverError, NoReply, PortLost, WrongReply
 from hil.drivers.joint import Joint
 from hil.drivers.packet import BROADCAST_ID, Instruction, encode
 from hil.drivers.servo_model import Mode, servo_model
@@ -56,7 +57,12 @@ class Bench:
             if failures:
                 raise failures.pop(0)
 
-        return SimpleNamespace(id=number, table=load_control_table("XM430-W350"), write_despite_error=write)
+        return SimpleNamespace(
+            id=number,
+            table=load_control_table("XM430-W350"),
+            write_despite_error=write,
+            write_once=partial(write, attempts=1),
+        )
 
     def cut(self, *silent: Joint) -> Any:
         self.interrupts: list[BaseException] = []
@@ -70,24 +76,28 @@ def test_all_are_told_twice_at_once_and_each_is_polled_once() -> None:
     assert bench.attempts == [1, 1]
 
 
-def test_a_servo_that_does_not_answer_is_told_again_left_to_its_watchdog_and_polled_longer() -> None:
+QUIET_S = WATCHDOG_S + 0.025
+"""How long nothing is sent: the watchdog counts in steps of 20 ms."""
+
+
+def test_after_a_missing_reply_nothing_feeds_any_watchdog_until_it_has_acted() -> None:
     bench = Bench(first=[NoReply("nothing")])
     assert bench.cut() == (tuple(JOINTS), ())
-    quiet = 0.002 + WATCHDOG_S + 0.025  # the watchdog counts in steps of 20 ms
-    assert bench.sent == [
-        *((who, 0.0) for who in (ALL, FIRST, ALL, SECOND)),
-        (ALL, 0.001),
-        (ALL, 0.002),
-        (ALL, quiet),
-        (FIRST, quiet),
-    ]
-    assert bench.attempts == [1, 1, None]
+    assert bench.sent == [(ALL, 0.0), (FIRST, 0.0), (ALL, QUIET_S), (FIRST, QUIET_S), (SECOND, QUIET_S)]
+    assert bench.attempts == [1, None, None]
 
 
-def test_a_servo_that_was_silent_before_is_not_polled_until_its_watchdog_has_acted() -> None:
+def test_after_a_damaged_reply_all_are_told_again_and_the_others_polled_at_once() -> None:
+    bench = Bench(first=[WrongReply("noise")])
+    assert bench.cut() == (tuple(JOINTS), ())
+    assert bench.sent == [*((who, 0.0) for who in (ALL, FIRST, ALL, SECOND)), (ALL, QUIET_S), (FIRST, QUIET_S)]
+
+
+def test_with_a_servo_that_was_silent_before_all_are_told_and_none_is_polled_until_its_watchdog_has_acted() -> None:
     bench = Bench()
     assert bench.cut(JOINTS[1]) == (tuple(JOINTS), ())
-    assert [who for who, _ in bench.sent] == [ALL, FIRST, ALL, ALL, ALL, SECOND]
+    quiet = 0.002 + QUIET_S
+    assert bench.sent == [(ALL, 0.0), (ALL, 0.001), (ALL, 0.002), (ALL, quiet), (FIRST, quiet), (SECOND, quiet)]
 
 
 def test_one_that_is_never_confirmed_is_named_with_the_last_reason() -> None:
@@ -95,12 +105,19 @@ def test_one_that_is_never_confirmed_is_named_with_the_last_reason() -> None:
     assert bench.cut() == ((JOINTS[0],), ((JOINTS[1], "DriverError"),))
 
 
-def test_on_a_lost_port_nothing_waits_and_the_silent_ones_are_tried_once() -> None:
+def test_on_a_lost_port_nothing_waits_and_all_are_tried_once() -> None:
     bench = Bench(first=[PortLost("gone")])
-    confirmed, unconfirmed = bench.cut(JOINTS[1])
+
+    def lose(_: bytes) -> None:
+        raise PortLost("gone")
+
+    confirmed, unconfirmed = bench.cut()
     assert confirmed == (JOINTS[1],) and unconfirmed == ((JOINTS[0], "gone"),)
-    assert bench.sent == [(who, 0.0) for who in (ALL, FIRST, ALL, ALL, SECOND)]
-    assert bench.attempts == [1, 1]
+    assert bench.sent == [(who, 0.0) for who in (ALL, FIRST, SECOND)]
+    bench.port.write = lose
+    bench.sent.clear()
+    bench.cut(JOINTS[1])
+    assert bench.sent == [(FIRST, 0.0), (SECOND, 0.0)], "those that were silent, too"
 
 
 @pytest.mark.parametrize(("count", "confirmed"), [(4, True), (5, False)])

@@ -46,3 +46,44 @@ def test_a_push_and_a_weak_motor_are_not_turned_motors(interval: float) -> None:
 def test_a_joint_that_is_slowed_down_keeps_its_motor() -> None:
     """It may have struck something, whose force ends with the torque that presses the joint against it."""
     assert found_after(-1.0, 0.0, 1.0, 0.005) == (-1, True)
+
+
+def falling(lacking: list[float], torque: list[float]) -> tuple[int, Obedience]:
+    """The joint that is found in a test of one that speeds up, after these torques at intervals of 5 ms [N m]."""
+    obedience, found = Obedience(1), -1
+    assert obedience.question(0, 0.0)
+    for number, values in enumerate(zip(lacking, torque, strict=True), 1):
+        found = obedience.look(Residual(*([each] for each in values), [False]), [-1.0], 5e-3 * number)
+    return found, obedience
+
+
+OWN = [0.4, 0.32, 0.25, 0.2, 0.16]
+
+
+def test_what_falls_otherwise_than_the_motors_own_torque_is_something_else() -> None:
+    found, obedience = falling([2.0 * each for each in OWN], OWN)
+    assert found == 0, "a reversed motor"
+    found, obedience = falling([0.6, 0.6, 0.6, 0.3, 0.15], OWN)
+    assert found == -1 and not obedience.is_limp(0) and obedience.question(0, 0.03), "a push that has just ended"
+    assert falling([5.0 * each for each in OWN], OWN)[0] == -1, "a motor cannot do more than turn round"
+    found, obedience = falling([0.6] * 5, OWN)
+    assert found == -1 and obedience.is_pushed(0) and obedience.question(0, 0.03) and not obedience.is_limp(0)
+
+
+def test_a_joint_that_runs_away_after_an_undecided_test_is_blamed() -> None:
+    """Its motor may have become reversed right before the test."""
+    found, obedience = falling(OWN, OWN)
+    assert found == -1 and not obedience.question(0, 0.03)
+    assert obedience.question(0, 0.2)
+
+
+def test_what_falls_unevenly_again_and_again_is_the_motors_own() -> None:
+    obedience, found, now = Obedience(1), -1, 0.0
+    for _ in range(3):
+        assert found == -1
+        obedience.question(0, now)
+        for values in zip([0.6, 0.6, 0.6, 0.3, 0.1], OWN, strict=True):
+            now += 5e-3
+            found = obedience.look(Residual(*([each] for each in values), [False]), [-1.0], now)
+        now += 0.02
+    assert found == 0

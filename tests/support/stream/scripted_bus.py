@@ -38,6 +38,7 @@ class Bus:
         self.wobble = 0.0
         """Difference of two successive positions [rad]."""
         self.keeps_torque = True
+        self.first_hides = False
         self.heard = SimpleNamespace(late_at=-math.inf)
         self.error = (0,) * JOINTS
         self.slow: Slow | None = None
@@ -55,6 +56,9 @@ class Bus:
     def has_torque(self) -> bool:
         self.calls.append(("torque",))
         return self.keeps_torque
+
+    def first_hides_others(self, _patience: float) -> bool:
+        return self.first_hides
 
     def exchange(self, goals: list[float], *, between: bool = False) -> State:
         now = self.clock.now()

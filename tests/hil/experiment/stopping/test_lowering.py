@@ -297,9 +297,28 @@ def test_an_arm_that_cannot_be_heard_for_a_moment_is_lowered(ready: Any) -> None
     np.testing.assert_allclose(record["position"][-1], ready.config.arm.rest_pose, atol=0.1)
 
 
+def test_an_arm_that_is_pushed_off_its_path_is_lowered_from_where_it_is(ready: Any) -> None:
+    from benchmarks.fault_campaign.attack import Attack, Kind
+
+    text, record, _ = driven(ready, (Attack(Kind.PUSHED, 5.0, 5.15, ready.config.joints[0].id, 1.0, 1.74, "state"),))
+    assert "lowered to its rest pose" in text and "wrong way" not in text
+    np.testing.assert_allclose(record["position"][-1], ready.config.arm.rest_pose, atol=0.1)
+
+
+@pytest.mark.parametrize("number", [0, 2])
+def test_after_one_servo_has_fallen_silent_nothing_feeds_the_watchdogs(ready: Any, number: int) -> None:
+    """With another ID, a servo goes on driving until its Bus Watchdog acts; any packet on the bus feeds it."""
+    from benchmarks.fault_campaign.attack import Attack, Kind
+
+    servo = ready.config.joints[number].id
+    text, _, last = driven(ready, (Attack(Kind.NEW_ID, 5.0, 5.0, servo, 1.0, 0.0, "state"),))
+    assert "does not answer" in text
+    assert last < 5.0 + 0.135, "stopped after at most 55 ms, then 80 ms of watchdog"
+
+
 def test_an_arm_that_cannot_be_heard_any_more_is_cut(ready: Any) -> None:
     text, _, last = driven(ready, faults=lost(5.0, 10.0))
-    assert "missed 2 replies" in text
+    assert "missed 2 replies" in text and "busy" not in text
     assert 5.03 < last < 5.1
 
 
