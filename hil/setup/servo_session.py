@@ -17,9 +17,9 @@ from pathlib import Path
 from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError, TorqueNotOff, WrongModel
+from hil.drivers.errors import DriverError, TorqueNotOff, WrongModel, WrongSetting
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import attainable, put_back, read_settings
+from hil.drivers.preparation.settings import attainable, holds, put_back, read_settings
 from hil.drivers.servo_model import Mode
 from hil.drivers.torque.off import and_list, by_reason, signals_held_back
 from hil.errors import ExperimentError, RunFolderError, StopRequested
@@ -52,6 +52,14 @@ _NEXT = "The next hil identify, record, check or setup on this port restores the
 SETTINGS_NAME = "servo_settings.json"
 """Name of the copy of the saved settings in the run folder."""
 
+
+_MOST_CHECKS = 3
+"""How often the settings of all servos are read again once they have been restored."""
+
+_UNVERIFIED = (
+    "its settings were restored but read back differently afterwards. Its replies belong to earlier requests, IDs have "
+    "been swapped, or another program is changing the settings."
+)
 
 _MOST_CUTS = 5
 """How often torque is cut again at the end if another program switches it on."""
@@ -194,10 +202,35 @@ class ServoSession:
             clock = self.bus.port.clock
             clock.wait_until(clock.now() + REBOOT_S)
             failed = self._put_back(failed)
+        self._verify(failed)
         left = self._what_is_left(failed)
         while self._cut_again(failed):
+            self._verify(failed)
             left = self._what_is_left(failed)
+        self._forget(joint for joint in self._kept if joint not in failed)
         return [*self._switched_on_by_another(), *left]
+
+    def _verify(self, failed: dict[Joint, DriverError]) -> None:
+        """Read the settings of all servos again, now that the last one has been restored, and restore those that differ.
+
+        Replies that belong to earlier requests, or IDs that are swapped meanwhile, make a servo seem restored that was
+        never reached. failed: receives the errors of the servos whose settings still differ.
+        """
+        for attempt in range(_MOST_CHECKS):
+            unlike = [joint for joint in self._kept if joint not in failed and not self._holds(joint)]
+            if not unlike:
+                return
+            if attempt == _MOST_CHECKS - 1:
+                failed |= {joint: WrongSetting(f"{joint.title}: {_UNVERIFIED}") for joint in unlike}
+                return
+            failed |= self._put_back(unlike)
+
+    def _holds(self, joint: Joint) -> bool:
+        """Whether a servo's settings are read as restored; not if they cannot be read."""
+        try:
+            return holds(self.bus.drives[joint], self._wanted[joint])
+        except DriverError:
+            return False
 
     def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
         """Cut torque where it is on and restore these servos' settings; return whether there was anything to do.
@@ -339,10 +372,13 @@ class ServoSession:
                 self._cut[joint] = {name: value for name, value in possible.items() if value != settings[name]}
             except DriverError as error:
                 failed[joint] = error
-            else:
-                if joint not in self._refused and (not self._cut[joint] or joint in self._left):
-                    settings_file.forget(self._kept[joint])
         return failed
+
+    def _forget(self, restored: Iterable[Joint]) -> None:
+        """Remove the files of servos whose settings have been restored; not where a goal or limit has yet to be."""
+        for joint in restored:
+            if joint not in self._refused and (not self._cut[joint] or joint in self._left):
+                settings_file.forget(self._kept[joint])
 
 
 def _where(paths: Sequence[Path]) -> str:
