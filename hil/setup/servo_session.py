@@ -20,6 +20,7 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, TorqueNotOff, WrongModel, WrongSetting
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import attainable, holds, put_back, read_settings
+from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
 from hil.drivers.torque.off import and_list, by_reason, signals_held_back
 from hil.errors import ExperimentError, RunFolderError, StopRequested
@@ -211,7 +212,7 @@ class ServoSession:
         return [*self._switched_on_by_another(), *left]
 
     def _verify(self, failed: dict[Joint, DriverError]) -> None:
-        """Read the settings of all servos again, now that the last one has been restored, and restore those that differ.
+        """Read the settings of all servos again once the last one has been restored, and restore those that differ.
 
         Replies that belong to earlier requests, or IDs that are swapped meanwhile, make a servo seem restored that was
         never reached. failed: receives the errors of the servos whose settings still differ.
@@ -365,14 +366,23 @@ class ServoSession:
             try:
                 self.bus.confirm_later(joint)
                 servo, settings = self.bus.drives[joint], self._wanted[joint]
-                if servo.read_despite_error("Model Number") != servo.table.number:
-                    raise WrongModel(f"{joint.title}: a servo of a different model now answers at this ID.")
+                self._check_model(servo)
                 put_back(servo, settings)
                 possible = attainable(servo, settings)
                 self._cut[joint] = {name: value for name, value in possible.items() if value != settings[name]}
             except DriverError as error:
                 failed[joint] = error
         return failed
+
+    def _check_model(self, servo: Servo) -> None:
+        """Raise WrongModel if a servo of another model answers at this servo's ID."""
+        found = servo.read_despite_error("Model Number")
+        if found == servo.table.number:
+            return
+        said = f"{servo.title}: a servo of a different model now answers at this ID."
+        if found in {other.table.number for other in self.bus.drives.values()}:
+            said += " Another joint has a servo of that model: their IDs may have been swapped."
+        raise WrongModel(said)
 
     def _forget(self, restored: Iterable[Joint]) -> None:
         """Remove the files of servos whose settings have been restored; not where a goal or limit has yet to be."""

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,7 +18,7 @@ import serial
 from hil.cli.errors import message
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import BusShared, DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongSetting
+from hil.drivers.errors import BusShared, DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongModel, WrongSetting
 from hil.drivers.joint import Joint
 from hil.errors import Cause, ExperimentError, HilError, SafetyStop, StopRequested
 from hil.experiment.run import run_experiment
@@ -398,6 +399,14 @@ def test_settings_are_not_restored_to_a_servo_of_another_model(arm: Arm, bench: 
         bench.servos[2].memory.set("Model Number", 1060)
         bench.eeprom[2].clear()
     assert bench.eeprom[2] == []
+
+
+def test_two_servos_of_different_models_that_swapped_their_ids_are_named() -> None:
+    tables = [SimpleNamespace(number=number) for number in (1060, 1020)]
+    bus: Any = SimpleNamespace(drives={table.number: SimpleNamespace(table=table) for table in tables})
+    answers: Any = SimpleNamespace(table=tables[1], title="Joint 'elbow'", read_despite_error=lambda _: 1060)
+    with pytest.raises(WrongModel, match=r"Another joint has a servo of that model: their IDs may have been swapped"):
+        ServoSession(bus, print)._check_model(answers)
 
 
 def test_a_servo_that_swaps_its_id_while_settings_are_restored_is_restored_too(
