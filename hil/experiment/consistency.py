@@ -12,9 +12,10 @@ in this difference. The contributions of a healthy servo are known:
 - a velocity that lags by tau, because the servo filters it: tau times the velocity, minus its mean over the memory. Any
   lag up to `LAG_S` is accepted;
 - a velocity with a scale error: that fraction of the distance covered within the memory, at most `SCALE`;
-- a velocity that is rounded towards zero: in the slow memory at most one step of the register for as long as the joint
-  has moved in one direction longer than in the other. While the register shows zero, motion below one step does not
-  count there;
+- a velocity that is rounded towards zero, or always downwards (which of these a servo does is unknown). In the slow
+  memory: one step of the register for as long as the joint has moved in one direction longer than in the other, or half
+  a step for as long as it has moved. After `BIASED_S` of motion, the mean difference so far counts as the servo's own,
+  up to half a step; then less is allowed. While the register shows zero, motion below one step does not count;
 - the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where
   a fraction `CURVED` of the change of velocity times the interval remains. Where the velocity jumps they do not: in the
   slow memory, which contains many jumps, their sum is a random walk.
@@ -101,6 +102,12 @@ CURVED = 0.35
 samples per period, the fastest that is used, needs 0.27.
 """
 
+BIASED_S = 2.5
+"""Time of motion after which the bias of a servo's velocity is known [s]."""
+
+BIAS_UNSURE_RAD_S = 0.003
+"""Its uncertainty then [rad/s]: 0.0075 rad within that time."""
+
 ROUGH_TIMES = 2.0
 """Allowance of the slow memory for a velocity that jumps between samples, as when teeth change sides: multiple of the
 root of the sum of squares of `CURVED` times the difference between successive changes, times the interval. A jump
@@ -142,7 +149,8 @@ MEMORY = np.dtype(
     [
         *((name, "f8") for name in ("position", "velocity")),
         *((name, "f8") for name in ("seconds", "moved", "difference", "unknown", "most_curved")),
-        *((name, "f8") for name in ("turn", "seen", "headed", "heading", "rough", "roughness")),
+        *((name, "f8") for name in ("turn", "seen", "headed", "heading", "moving", "timed", "bias")),
+        *((name, "f8") for name in ("rough", "roughness")),
         *((name, "f8") for name in ("learnt_for", "lag_squared", "scale_squared", "crossed", "lag_product")),
         *((name, "f8") for name in ("scale_product", "lag", "scale")),
         ("steps", _STEPS),
@@ -184,6 +192,7 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
         _restart(memory.long, velocity)
         _restart(memory.slow, velocity)
         memory.turn = memory.heading = memory.roughness = 0.0
+        memory.moving = memory.timed = 0.0
         _forget_sums(memory)
         _begin_same(memory.same)
         return False
@@ -202,7 +211,7 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
     elif _is_frozen(memory.same, moved, velocity, seconds, unknown, memory.scale):
         return True
     _add(short, SHORT_S, moved, difference, velocity, seconds, curved, unknown)
-    if _is_wrong(short, UNSURE_RAD, velocity, memory.lag, memory.scale):
+    if _is_wrong(short, short.apart, UNSURE_RAD, velocity, memory.lag, memory.scale):
         return True
     # The long memories process several intervals at once, so that those of a fast rate are not lost in rounding.
     memory.moved += moved
@@ -213,6 +222,8 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
     heads = before + velocity
     if heads != 0.0:
         memory.headed += seconds if heads > 0.0 else -seconds
+        memory.moving += seconds
+        memory.timed += seconds
     # A joint that seems to stand still may turn by less than one step of the velocity.
     memory.seen += difference if heads != 0.0 or abs(moved) > RESOLUTION_RAD_S * seconds + STEP_RAD else 0.0
     memory.unknown += unknown
@@ -273,12 +284,18 @@ def _looks_long(memory: Any, velocity: float) -> bool:
     slow.unknown = long.unknown  # a late measurement takes from the next interval what it adds to this one
     fades = min(seconds / SLOW_S, 1.0)
     memory.heading += memory.headed - fades * memory.heading
+    memory.moving -= fades * memory.moving
     memory.roughness += memory.rough - fades * memory.roughness
-    unsure = SLOW_UNSURE_RAD + RESOLUTION_RAD_S * abs(memory.heading) + ROUGH_TIMES * np.sqrt(memory.roughness)
+    if memory.bias == 0.0 and memory.timed > BIASED_S:
+        most = 0.5 * RESOLUTION_RAD_S
+        memory.bias = min(max(slow.apart / memory.moving, -most), most)
+    uncertain = BIAS_UNSURE_RAD_S if memory.bias != 0.0 else 0.5 * RESOLUTION_RAD_S
+    of_rounding = max(RESOLUTION_RAD_S * abs(memory.heading), uncertain * memory.moving)
+    unsure = SLOW_UNSURE_RAD + of_rounding + ROUGH_TIMES * np.sqrt(memory.roughness)
     _forget_sums(memory)
     return bool(
-        _is_wrong(long, LONG_UNSURE_RAD, velocity, memory.lag, memory.scale)
-        or _is_wrong(slow, unsure, velocity, memory.lag, memory.scale)
+        _is_wrong(long, long.apart, LONG_UNSURE_RAD, velocity, memory.lag, memory.scale)
+        or _is_wrong(slow, slow.apart - memory.bias * memory.moving, unsure, velocity, memory.lag, memory.scale)
     )
 
 
@@ -386,14 +403,14 @@ def _add(
     fading.span = fading.highest - fading.lowest
 
 
-def _is_wrong(fading: Any, unsure: float, velocity: float, lag: float, scale: float) -> bool:
+def _is_wrong(fading: Any, apart: float, unsure: float, velocity: float, lag: float, scale: float) -> bool:
     """Whether position and velocity disagree.
 
-    unsure: tolerance of this fading memory [rad]. lag, scale: largest accepted lag [s] and scale error.
+    apart: their difference in this memory, without a known bias [rad]. unsure: tolerance of this memory [rad]. lag,
+    scale: largest accepted lag [s] and scale error.
     """
     of_lag = lag * (velocity - fading.mean)
     allowed = unsure + scale * abs(fading.far) + fading.curved + fading.unknown + _LAG_SHARE * lag * fading.span
-    apart = fading.apart
     if of_lag > 0.0:
         return bool(apart > allowed + of_lag or apart < -allowed)
     return bool(apart > allowed or apart < of_lag - allowed)

@@ -170,19 +170,26 @@ def test_a_position_that_creeps_is_seen_before_it_is_far_off(rate: int, speed: f
 
 
 @pytest.mark.parametrize("rate", [100, 400])
-def test_a_slow_creep_is_seen_before_the_position_is_off_by_a_tenth_of_a_radian(rate: int) -> None:
+def test_a_slow_creep_is_seen_before_the_position_is_far_off(rate: int) -> None:
     """In a long memory of little over a second it would stay below what rounding may cause."""
     when = seen_after(
         rate,
-        lambda now: 0.25 * math.sin(math.tau * now) + 0.02 * max(now - 0.5, 0.0),
+        lambda now: 0.25 * math.sin(math.tau * now) + 0.04 * max(now - 3.0, 0.0),
         lambda now: 0.25 * math.tau * math.cos(math.tau * now),
     )
-    assert 2.0 < when <= 5.5
+    assert 4.0 < when <= 5.5
 
 
 @pytest.mark.parametrize("speed", [0.047, 0.11])
 def test_a_velocity_that_is_rounded_towards_zero_in_a_long_motion_one_way_is_accepted(speed: float) -> None:
     assert seen_after(100, lambda now: speed * now, lambda _: TICK * int(speed / TICK)) == math.inf
+
+
+def test_a_velocity_that_is_rounded_downwards_is_accepted() -> None:
+    look = Consistency()
+    for index in range(3000):
+        velocity = TICK * math.floor(0.25 * math.tau * math.cos(math.tau * 0.01 * index) / TICK)
+        assert not look.look(quantised(0.25 * math.sin(math.tau * 0.01 * index), STEP), velocity, 0.01)
 
 
 def test_a_velocity_that_jumps_between_samples_is_accepted() -> None:
