@@ -57,10 +57,7 @@ SETTINGS_NAME = "servo_settings.json"
 _MOST_CHECKS = 3
 """How often the settings of all servos are read again once they have been restored."""
 
-_UNVERIFIED = (
-    "its settings were restored but read back differently afterwards. Its replies belong to earlier requests, IDs have "
-    "been swapped, or another program is changing the settings."
-)
+_UNVERIFIED = "its registers were written but read differently afterwards: they are unverified."
 
 _MOST_CUTS = 5
 """How often torque is cut again at the end if another program switches it on."""
@@ -218,20 +215,22 @@ class ServoSession:
         never reached. failed: receives the errors of the servos whose settings still differ.
         """
         for attempt in range(_MOST_CHECKS):
-            unlike = [joint for joint in self._kept if joint not in failed and not self._holds(joint)]
+            unlike = {
+                joint: error
+                for joint in self._kept
+                if joint not in failed and (error := self._differs(joint)) is not None
+            }
             if not unlike:
                 return
-            if attempt == _MOST_CHECKS - 1:
-                failed |= {joint: WrongSetting(f"{joint.title}: {_UNVERIFIED}") for joint in unlike}
-                return
-            failed |= self._put_back(unlike)
+            failed |= self._put_back(unlike) if attempt < _MOST_CHECKS - 1 else unlike
 
-    def _holds(self, joint: Joint) -> bool:
-        """Whether a servo's settings are read as restored; not if they cannot be read."""
+    def _differs(self, joint: Joint) -> DriverError | None:
+        """The error for a servo whose settings are not read as restored, or cannot be read; None if they are."""
         try:
-            return holds(self.bus.drives[joint], self._wanted[joint])
-        except DriverError:
-            return False
+            is_held = holds(self.bus.drives[joint], self._wanted[joint])
+        except DriverError as error:
+            return error
+        return None if is_held else WrongSetting(f"{joint.title}: {_UNVERIFIED}")
 
     def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
         """Cut torque where it is on and restore these servos' settings; return whether there was anything to do.

@@ -435,7 +435,7 @@ def test_settings_that_do_not_read_back_as_restored_stay_on_file(
     arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path
 ) -> None:
     monkeypatch.setattr(ServoSession, "_put_back", lambda *_: {})
-    said = r"ID 1.* and .*ID 2.* could not be restored\. .*read back differently.* restores them from 2 files"
+    said = r"ID 1.* and .*ID 2.* could not be restored\. .*they are unverified.* restores them from 2 files"
     with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
         pass
     assert len(list(state_folder.rglob("*.json"))) == 2
