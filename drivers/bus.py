@@ -313,7 +313,8 @@ class ServoBus(TorqueSwitch):
         """
         drives = (self._drives[-1], self._drives[0])
         read = SyncRead([each.id for each in drives], Span.of([self._servos[each].table for each in drives], ["ID"]))
-        received = self.port.ask(read.request, read.reply_size, patience, self.port.clock.now())
+        expected = self.port.reply_time(patience, len(read.request))
+        received = self.port.ask(read.request, read.reply_size, expected, self.port.clock.now())
         (last, first), _ = read.search(received)
         return last is not None and first is None
 

@@ -87,12 +87,14 @@ def overheard(what: str) -> BusOverheard:
 
 def overruled(joint: Joint, found: Overruled) -> BusShared:
     """Return the error for a servo that holds a goal or a setting that this program did not write."""
-    by, before = "is being commanded", f"but {found.written} was written"
+    by, before, check = "is being commanded", f"but {found.written} was written", ""
     if found.register in SETTINGS and found.register != "Operating Mode":
         by, before = "was changed", f"and read {found.written} before the start"
+    if found.register not in SETTINGS:
+        check = " If there is none, goals are being changed on the way: check the adapter and the cable."
     return BusShared(
         f"{joint.title[0].upper()}{joint.title[1:]} {by} by another program: its {found.register} reads "
-        f"{found.value}, {before}. Stop that program, or unplug its controller."
+        f"{found.value}, {before}. Stop that program, or unplug its controller.{check}"
     )
 
 

@@ -111,6 +111,17 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
     return written
 
 
+def holds(servo: Servo, settings: Mapping[str, int]) -> bool:
+    """Return whether the registers that decide how a servo moves are as in `settings`: EEPROM registers and goals.
+
+    They are read in the opposite order to that of `put_back`, so that replies to earlier requests do not agree again.
+    Raises the same errors as `Servo.read`.
+    """
+    wanted = attainable(servo, settings)
+    names = [name for name in (*EEPROM, *_BOUNDS) if name in wanted and name in servo.table]
+    return all(servo.read_despite_error(name) == wanted[name] for name in reversed(names))
+
+
 def arms_itself(servo: Servo) -> bool:
     """Return whether this servo switches torque on by itself at power-up or reboot. Raises the same errors as
     `Servo.read`.

@@ -1,5 +1,10 @@
 """Conversion of exceptions to messages and exit codes."""
 
+import errno
+
+_OF_THE_MACHINE = frozenset({errno.EMFILE, errno.ENFILE})
+"""Errors of the operating system that no input causes: no more files can be opened."""
+
 
 def exit_code(error: Exception) -> int | None:
     """Return the exit code for an expected error; None for any other exception, which is a bug in the program."""
@@ -8,6 +13,8 @@ def exit_code(error: Exception) -> int | None:
     from hil.estimator.errors import EstimationError
     from hil.fakes.plants.errors import PlantError
 
+    if any(isinstance(each, OSError) and each.errno in _OF_THE_MACHINE for each in (error, error.__cause__)):
+        return 1
     if isinstance(error, HilError):
         return error.exit_code
     if isinstance(

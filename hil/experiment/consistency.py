@@ -5,15 +5,20 @@ velocity must equal the change in position. The difference,
 
     apart = position - integral of velocity,
 
-is tracked with two fading memories (leaky integrators): a short one, which reveals a sudden fault at once, and a long
-one, which reveals a gradual one. Rounding and encoder noise do not accumulate in this difference. The contributions of
-a healthy servo are known:
+is tracked with three fading memories (leaky integrators): a short one, which reveals a sudden fault at once, a long
+one, which reveals a gradual one, and a slow one for a creep. Rounding of positions and encoder noise do not accumulate
+in this difference. The contributions of a healthy servo are known:
 
 - a velocity that lags by tau, because the servo filters it: tau times the velocity, minus its mean over the memory. Any
   lag up to `LAG_S` is accepted;
 - a velocity with a scale error: that fraction of the distance covered within the memory, at most `SCALE`;
+- a velocity that is rounded towards zero, or always downwards (which of these a servo does is unknown). In the slow
+  memory: one step of the register for as long as the joint has moved in one direction longer than in the other, or half
+  a step for as long as it has moved. After `BIASED_S` of motion, the mean difference so far counts as the servo's own,
+  up to half a step; then less is allowed. While the register shows zero, motion below one step does not count;
 - the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where
-  a fraction `CURVED` of the change of velocity times the interval remains.
+  a fraction `CURVED` of the change of velocity times the interval remains. Where the velocity jumps they do not: in the
+  slow memory, which contains many jumps, their sum is a random walk.
 
 A reading that jumps back and forth, as with a stuck bit, cancels in those memories. Therefore each single interval is
 also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
@@ -41,16 +46,18 @@ from hil.errors import Cause, SafetyStop
 
 __all__ = ["MEMORY", "begin", "check_standstill", "look", "lost", "moved_at_standstill"]
 
-SHORT_S, LONG_S = 0.3, 1.2
+SHORT_S, LONG_S, SLOW_S = 0.3, 1.2, 20.0
 """Time constants of the memories [s]."""
 
 LONG_EVERY_S = 0.0099
-"""Shortest interval after which the long fading memory is updated [s]: the sample interval at 100 Hz, minus a margin
-for rounding errors.
+"""Shortest interval after which the long and slow memories are updated [s]: the sample interval at 100 Hz, minus a
+margin for rounding errors.
 """
 
-UNSURE_RAD, LONG_UNSURE_RAD = 0.02, 0.045
-"""Tolerances of the two memories [rad]: for rounding, encoder noise, and a velocity that is rounded towards zero."""
+UNSURE_RAD, LONG_UNSURE_RAD, SLOW_UNSURE_RAD = 0.02, 0.045, 0.04
+"""Tolerances of the memories [rad]: for rounding, encoder noise, and, except in the slow one, a velocity that is
+rounded towards zero.
+"""
 
 LAG_S = 0.03
 LEARNT_S = 1.5
@@ -95,6 +102,18 @@ CURVED = 0.35
 samples per period, the fastest that is used, needs 0.27.
 """
 
+BIASED_S = 2.5
+"""Time of motion after which the bias of a servo's velocity is known [s]."""
+
+BIAS_UNSURE_RAD_S = 0.003
+"""Its uncertainty then [rad/s]: 0.0075 rad within that time."""
+
+ROUGH_TIMES = 2.0
+"""Allowance of the slow memory for a velocity that jumps between samples, as when teeth change sides: multiple of the
+root of the sum of squares of `CURVED` times the difference between successive changes, times the interval. A jump
+anywhere within an interval makes an error whose RMS is 0.29 of it, times the interval, and counts twice.
+"""
+
 CURVED_AT_FIRST = 0.3
 """Allowance for the first interval, as a fraction of the motion. Around the peak of a wave with four samples per
 period, two successive samples may have the same velocity, and there is no earlier change to compare with.
@@ -132,21 +151,27 @@ MEMORY = np.dtype(
     [
         *((name, "f8") for name in ("position", "velocity")),
         *((name, "f8") for name in ("seconds", "moved", "difference", "unknown", "most_curved")),
+        *((name, "f8") for name in ("turn", "seen", "headed", "heading", "moving", "timed", "bias")),
+        *((name, "f8") for name in ("rough", "roughness")),
         *((name, "f8") for name in ("learnt_for", "lag_squared", "scale_squared", "crossed", "lag_product")),
         *((name, "f8") for name in ("scale_product", "lag", "scale")),
         ("steps", _STEPS),
         ("same", _SAME),
         ("short", _FADING),
         ("long", _FADING),
+        ("slow", _FADING),
     ]
 )
 """State of the check of one joint.
 
-position, velocity: latest ones [rad, rad/s]; the position is NaN before the first one and after a long gap. seconds,
-moved, difference, unknown, most_curved: sums (for the last one, the maximum) since the long memory was last updated.
-learnt_for: duration of the motion that lag and scale error were estimated from [s]. lag_squared, scale_squared,
-crossed, lag_product, scale_product: elements of the normal equations for lag and scale error. lag, scale: largest
-accepted values [s, 1].
+position, velocity, turn: latest ones, and the latest change of velocity [rad, rad/s]; the position is NaN before the
+first one and after a long gap. seconds, moved, difference, unknown, most_curved: sums (for the last one, the maximum)
+since the long memory was last updated. seen: that difference without motion that the velocity's register cannot show.
+headed: time of motion in positive less in negative direction since then [s]. rough: sum of squares of what jumps of the
+velocity may add in each interval since then [rad^2]. heading, roughness: the same two, in the slow memory. learnt_for:
+duration of the motion that lag and scale error were estimated from [s]. lag_squared, scale_squared, crossed,
+lag_product, scale_product: elements of the normal equations for lag and scale error. lag, scale: largest accepted
+values [s, 1].
 """
 
 
@@ -167,6 +192,9 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
     if np.isnan(former):
         _restart(short, velocity)
         _restart(memory.long, velocity)
+        _restart(memory.slow, velocity)
+        memory.turn = memory.heading = memory.roughness = 0.0
+        memory.moving = memory.timed = 0.0
         _forget_sums(memory)
         _begin_same(memory.same)
         return False
@@ -185,11 +213,21 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
     elif _is_frozen(memory.same, moved, velocity, seconds, unknown, memory.scale):
         return True
     _add(short, SHORT_S, moved, difference, velocity, seconds, curved, unknown)
-    if _is_wrong(short, UNSURE_RAD, velocity, memory.lag, memory.scale):
+    if _is_wrong(short, short.apart, UNSURE_RAD, velocity, memory.lag, memory.scale):
         return True
-    # The long memory processes several intervals at once, so that those of a fast rate are not lost in rounding.
+    # The long memories process several intervals at once, so that those of a fast rate are not lost in rounding.
     memory.moved += moved
     memory.difference += difference
+    jumped = CURVED * seconds * (velocity - before - memory.turn)
+    memory.turn = velocity - before
+    memory.rough += jumped * jumped
+    heads = before + velocity
+    if heads != 0.0:
+        memory.headed += seconds if heads > 0.0 else -seconds
+        memory.moving += seconds
+        memory.timed += seconds
+    # A joint that seems to stand still may turn by less than one step of the velocity.
+    memory.seen += difference if heads != 0.0 or abs(moved) > RESOLUTION_RAD_S * seconds + STEP_RAD else 0.0
     memory.unknown += unknown
     memory.most_curved = max(memory.most_curved, curved)
     memory.seconds += seconds
@@ -240,16 +278,32 @@ def check_standstill(name: str, states: Iterable[State], joint: int, still: floa
 
 
 def _looks_long(memory: Any, velocity: float) -> bool:
-    """Add the intervals since the last call to the long memory; return whether it shows a disagreement."""
-    long = memory.long
+    """Add the intervals since the last call to the long memories; return whether one shows a disagreement."""
+    long, slow, seconds = memory.long, memory.slow, memory.seconds
     moved, difference, unknown = memory.moved, memory.difference, memory.unknown
-    _add(long, LONG_S, moved, difference, velocity, memory.seconds, memory.most_curved, unknown)
+    _add(long, LONG_S, moved, difference, velocity, seconds, memory.most_curved, unknown)
+    _add(slow, SLOW_S, moved, memory.seen, velocity, seconds, memory.most_curved, 0.0)
+    slow.unknown = long.unknown  # a late measurement takes from the next interval what it adds to this one
+    fades = min(seconds / SLOW_S, 1.0)
+    memory.heading += memory.headed - fades * memory.heading
+    memory.moving -= fades * memory.moving
+    memory.roughness += memory.rough - fades * memory.roughness
+    if memory.bias == 0.0 and memory.timed > BIASED_S:
+        most = 0.5 * RESOLUTION_RAD_S
+        memory.bias = min(max(slow.apart / memory.moving, -most), most)
+    uncertain = BIAS_UNSURE_RAD_S if memory.bias != 0.0 else 0.5 * RESOLUTION_RAD_S
+    of_rounding = max(RESOLUTION_RAD_S * abs(memory.heading), uncertain * memory.moving)
+    unsure = SLOW_UNSURE_RAD + of_rounding + ROUGH_TIMES * np.sqrt(memory.roughness)
     _forget_sums(memory)
-    return _is_wrong(long, LONG_UNSURE_RAD, velocity, memory.lag, memory.scale)
+    return bool(
+        _is_wrong(long, long.apart, LONG_UNSURE_RAD, velocity, memory.lag, memory.scale)
+        or _is_wrong(slow, slow.apart - memory.bias * memory.moving, unsure, velocity, memory.lag, memory.scale)
+    )
 
 
 def _forget_sums(memory: Any) -> None:
     memory.seconds = memory.moved = memory.difference = memory.unknown = memory.most_curved = 0.0
+    memory.seen = memory.headed = memory.rough = 0.0
 
 
 def _learn(memory: Any, velocity: float, seconds: float) -> None:
@@ -351,14 +405,14 @@ def _add(
     fading.span = fading.highest - fading.lowest
 
 
-def _is_wrong(fading: Any, unsure: float, velocity: float, lag: float, scale: float) -> bool:
+def _is_wrong(fading: Any, apart: float, unsure: float, velocity: float, lag: float, scale: float) -> bool:
     """Whether position and velocity disagree.
 
-    unsure: tolerance of this fading memory [rad]. lag, scale: largest accepted lag [s] and scale error.
+    apart: their difference in this memory, without a known bias [rad]. unsure: tolerance of this memory [rad]. lag,
+    scale: largest accepted lag [s] and scale error.
     """
     of_lag = lag * (velocity - fading.mean)
     allowed = unsure + scale * abs(fading.far) + fading.curved + fading.unknown + _LAG_SHARE * lag * fading.span
-    apart = fading.apart
     if of_lag > 0.0:
         return bool(apart > allowed + of_lag or apart < -allowed)
     return bool(apart > allowed or apart < of_lag - allowed)

@@ -85,13 +85,14 @@ zero.
 
 _JOLT = np.dtype(
     [(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun")]
-    + [("count", "i8"), ("oldest", "i8")]
+    + [("count", "i8"), ("oldest", "i8"), ("reversed", "i8")]
 )
 """Statistics of a joint's changes of velocity.
 
 square: mean square of ordinary ones [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may still
 turn out to belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s]. begun: its time
-[s]. count, oldest: number of earlier velocities stored, and the row of the oldest.
+[s]. count, oldest: number of earlier velocities stored, and the row of the oldest. reversed: whether the joint turned
+round in the first change of a possible jolt.
 """
 
 
@@ -100,6 +101,9 @@ class Jolts:
 
     No motor can do this on any arm: it would have to accelerate and brake much harder than ever before. The check
     therefore needs no knowledge of the arm. Changes of velocity over `JOLT_S` are compared with ordinary ones.
+
+    Where the joint turns round in both changes, the teeth of a gear with backlash have changed sides at two successive
+    reversals: the motor crosses the gap much faster than it drives the arm, which is no jolt.
 
     count: number of joints. interval: time between two exchanges [s].
     """
@@ -155,11 +159,14 @@ def _jolting_loop(joints: Any, former: Any, velocity: Any, seconds: float, now: 
         most = max(least, JOLT_TIMES * math.sqrt(joint.square))
         is_jolt = not -most <= change <= most
         is_open = now - joint.begun <= JOLT_BACK_S
+        turned_round = velocity[index] * (velocity[index] - change) < 0.0
         if is_jolt and is_open and change * joint.change < 0.0:
-            found = index if found < 0 else found
-            continue
+            if not (turned_round and joint.reversed):
+                found = index if found < 0 else found
+                continue
+            is_open = False
         if is_jolt and not is_open:
-            joint.begun, joint.change, is_open = now, change, True
+            joint.begun, joint.change, joint.reversed, is_open = now, change, turned_round, True
         # A possible beginning of a jolt only counts as ordinary motion once it has turned out not to be one.
         joint.squared += seconds * min(change * change, most * most)
         joint.since += seconds

@@ -17,9 +17,10 @@ from pathlib import Path
 from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError, TorqueNotOff, WrongModel
+from hil.drivers.errors import DriverError, TorqueNotOff, WrongModel, WrongSetting
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import attainable, put_back, read_settings
+from hil.drivers.preparation.settings import attainable, holds, put_back, read_settings
+from hil.drivers.servo import Servo
 from hil.drivers.servo_model import Mode
 from hil.drivers.torque.off import and_list, by_reason, signals_held_back
 from hil.errors import ExperimentError, RunFolderError, StopRequested
@@ -52,6 +53,11 @@ _NEXT = "The next hil identify, record, check or setup on this port restores the
 SETTINGS_NAME = "servo_settings.json"
 """Name of the copy of the saved settings in the run folder."""
 
+
+_MOST_CHECKS = 3
+"""How often the settings of all servos are read again once they have been restored."""
+
+_UNVERIFIED = "its registers were written but read differently afterwards: they are unverified."
 
 _MOST_CUTS = 5
 """Largest number of times that torque is cut again at the end if another program switches it on."""
@@ -197,10 +203,37 @@ class ServoSession:
             clock = self.bus.port.clock
             clock.wait_until(clock.now() + REBOOT_S)
             failed = self._put_back(failed)
+        self._verify(failed)
         left = self._what_is_left(failed)
         while self._cut_again(failed):
+            self._verify(failed)
             left = self._what_is_left(failed)
+        self._forget(joint for joint in self._kept if joint not in failed)
         return [*self._switched_on_by_another(), *left]
+
+    def _verify(self, failed: dict[Joint, DriverError]) -> None:
+        """Read the settings of all servos again once the last one has been restored, and restore those that differ.
+
+        Replies that belong to earlier requests, or IDs that are swapped meanwhile, make a servo seem restored that was
+        never reached. failed: receives the errors of the servos whose settings still differ.
+        """
+        for attempt in range(_MOST_CHECKS):
+            unlike = {
+                joint: error
+                for joint in self._kept
+                if joint not in failed and (error := self._differs(joint)) is not None
+            }
+            if not unlike:
+                return
+            failed |= self._put_back(unlike) if attempt < _MOST_CHECKS - 1 else unlike
+
+    def _differs(self, joint: Joint) -> DriverError | None:
+        """The error for a servo whose settings are not read as restored, or cannot be read; None if they are."""
+        try:
+            is_held = holds(self.bus.drives[joint], self._wanted[joint])
+        except DriverError as error:
+            return error
+        return None if is_held else WrongSetting(f"{joint.title}: {_UNVERIFIED}")
 
     def _cut_again(self, failed: dict[Joint, DriverError]) -> bool:
         """Cut torque where it is on and restore these servos' settings; return whether there was anything to do.
@@ -335,17 +368,29 @@ class ServoSession:
             try:
                 self.bus.confirm_later(joint)
                 servo, settings = self.bus.drives[joint], self._wanted[joint]
-                if servo.read_despite_error("Model Number") != servo.table.number:
-                    raise WrongModel(f"{joint.title}: a servo of a different model now answers at this ID.")
+                self._check_model(servo)
                 put_back(servo, settings)
                 possible = attainable(servo, settings)
                 self._cut[joint] = {name: value for name, value in possible.items() if value != settings[name]}
             except DriverError as error:
                 failed[joint] = error
-            else:
-                if joint not in self._refused and (not self._cut[joint] or joint in self._left):
-                    settings_file.forget(self._kept[joint])
         return failed
+
+    def _check_model(self, servo: Servo) -> None:
+        """Raise WrongModel if a servo of another model answers at this servo's ID."""
+        found = servo.read_despite_error("Model Number")
+        if found == servo.table.number:
+            return
+        said = f"{servo.title}: a servo of a different model now answers at this ID."
+        if found in {other.table.number for other in self.bus.drives.values()}:
+            said += " Another joint has a servo of that model: their IDs may have been swapped."
+        raise WrongModel(said)
+
+    def _forget(self, restored: Iterable[Joint]) -> None:
+        """Remove the files of servos whose settings have been restored; not where a goal or limit has yet to be."""
+        for joint in restored:
+            if joint not in self._refused and (not self._cut[joint] or joint in self._left):
+                settings_file.forget(self._kept[joint])
 
 
 def _where(paths: Sequence[Path]) -> str:

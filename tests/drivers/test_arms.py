@@ -163,7 +163,11 @@ def test_current_and_pwm_joints_on_one_arm(opened: Open, fast: bool, one_write: 
 def test_another_master_is_found_on_current_and_pwm_joints_of_one_arm(opened: Open, place: int) -> None:
     """The XL430-W250 has no Goal Current: a read that ends there would be refused."""
     bus, port = opened(*current_and_pwm(), interval=0.01)
-    with bus, bus.torque(watchdog=0.1), pytest.raises(BusShared, match=f"ID {place}.* another program"):
+    with (
+        bus,
+        bus.torque(watchdog=0.1),
+        pytest.raises(BusShared, match=f"ID {place}.* another program.* changed on the way"),
+    ):
         for cycle in range(40):
             due = port.clock.now() + 0.01
             bus.exchange([0.01 * cycle] * 3)

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from hil.estimation.unsettled.agreement import disagreement
 from hil.estimation.unsettled.defects import defect_said, is_certain, is_other_arm, likely_defect
 from hil.estimation.unsettled.local_defects import Array, local_defects, local_residual
@@ -48,11 +50,23 @@ def causes(fitted: Fitted) -> tuple[str, ...]:
 
 def _clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return tuple(
-        f"The torque of joint {each.joint} seems to have been limited to about {each.level:.3g} N m; its column "
-        f"exceeds that in {100 * each.beyond:.2g} % of the samples. With this limit, inverse dynamics leaves "
-        f"{100 * each.residual:.2g} % of the torque unexplained instead of {100 * each.residual_given:.2g} %. A "
+        f"{_unsigned(recordings, each.joint)}The torque of joint {each.joint} seems to have been limited to about "
+        f"{each.level:.3g} N m; its column exceeds that in {100 * each.beyond:.2g} % of the samples. With this limit, "
+        f"inverse dynamics leaves {100 * each.residual:.2g} % of the torque unexplained instead of "
+        f"{100 * each.residual_given:.2g} %. A "
         "current limit or the supply voltage clips it (saturation): use the measured current, or smaller commands."
         for each in suspect_clipped(recordings)
+    )
+
+
+def _unsigned(recordings: Sequence[Recording], joint: int) -> str:
+    """A sentence if the torque of a joint (from 1) never changes its sign; "" otherwise."""
+    torque = np.concatenate([each.torque[joint - 1] for each in recordings])
+    if torque.min() < 0.0 < torque.max():
+        return ""
+    return (
+        f"The torque of joint {joint} never changes its sign: its column may hold magnitudes. If so, log it with its "
+        "sign. Otherwise: "
     )
 
 

@@ -1,5 +1,6 @@
 """The command line as users see it: output, files, exit codes, and one clear message instead of a traceback."""
 
+import errno
 import json
 import os
 import signal
@@ -13,6 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hil.cli.errors import exit_code
+from hil.errors import RunFolderError
 from hil.runs.recording import load_samples
 from tests.support.command_line import hil
 from tests.support.paths import CONFIGS
@@ -131,6 +134,14 @@ def test_a_failure_is_one_message_and_an_exit_code(
     if "outside" in said:
         assert "Torque is off on both servos, confirmed by reading it back." in printed.err
         assert printed.err.splitlines()[-1].startswith("Next: hil check "), "the last line is what to type next"
+
+
+@pytest.mark.parametrize("is_cause", [False, True])
+def test_too_many_open_files_are_no_wrong_input(is_cause: bool) -> None:
+    raised, lost = OSError(errno.EMFILE, "Too many open files"), RunFolderError("samples.npy cannot be read.")
+    lost.__cause__ = raised if is_cause else OSError(errno.EACCES, "Permission denied")
+    assert exit_code(lost) == (1 if is_cause else 2)
+    assert exit_code(raised) == 1
 
 
 def test_bad_arguments_and_files(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:

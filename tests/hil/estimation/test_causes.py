@@ -122,6 +122,14 @@ def test_a_torque_that_the_drive_limits_is_named_with_the_limit() -> None:
     assert limit and float(limit[1]) == pytest.approx(0.75, rel=0.1) and "saturation" in named
 
 
+def test_a_torque_without_its_sign_is_no_limit() -> None:
+    """To a magnitude, a limit near zero fits much better."""
+    named = found(replace(healthy(), torque=np.abs(healthy().torque)), healthy().position + 1e-4)
+    assert named
+    for each in named:
+        assert re.match(r"The torque of joint \d never changes its sign: its column may hold magnitudes", each)
+
+
 def test_no_limit_is_sought_among_torques_that_are_mostly_zero() -> None:
     """Two recordings in each of which one joint is driven: limited to zero, one of them would have no torque at all."""
     driven = [replace(healthy(), torque=healthy().torque * np.array(each)[:, None]) for each in ((1, 0), (0, 1))]

@@ -169,6 +169,42 @@ def test_a_position_that_creeps_is_seen_before_it_is_far_off(rate: int, speed: f
     assert 0.0 < when - begun <= most
 
 
+@pytest.mark.parametrize("rate", [100, 400])
+def test_a_slow_creep_is_seen_before_the_position_is_far_off(rate: int) -> None:
+    """In a long memory of little over a second it would stay below what rounding may cause."""
+    when = seen_after(
+        rate,
+        lambda now: 0.25 * math.sin(math.tau * now) + 0.04 * max(now - 3.0, 0.0),
+        lambda now: 0.25 * math.tau * math.cos(math.tau * now),
+    )
+    assert 4.0 < when <= 5.5
+
+
+@pytest.mark.parametrize("speed", [0.047, 0.11])
+def test_a_velocity_that_is_rounded_towards_zero_in_a_long_motion_one_way_is_accepted(speed: float) -> None:
+    assert seen_after(100, lambda now: speed * now, lambda _: TICK * int(speed / TICK)) == math.inf
+
+
+def test_a_velocity_that_is_rounded_downwards_is_accepted() -> None:
+    look = Consistency()
+    for index in range(3000):
+        velocity = TICK * math.floor(0.25 * math.tau * math.cos(math.tau * 0.01 * index) / TICK)
+        assert not look.look(quantised(0.25 * math.sin(math.tau * 0.01 * index), STEP), velocity, 0.01)
+
+
+def test_a_velocity_that_jumps_between_samples_is_accepted() -> None:
+    """Teeth that change sides: where in the interval they do is unknown, and adds up at random."""
+    random = Random(5)
+    look, position = Consistency(), 0.0
+    former = 0.0
+    for index in range(2000):
+        velocity = 1.5 * (-1) ** (index // 20) * random.uniform(0.8, 1.2) if index % 20 == 0 else former
+        share = random.uniform(0.0, 1.0)
+        position += 0.01 * (share * former + (1.0 - share) * velocity)
+        assert not look.look(position, velocity, 0.01)
+        former = velocity
+
+
 @pytest.mark.parametrize("scale", [1.25, 0.8, 1.1])
 def test_a_position_that_is_scaled_contradicts_its_velocity(scale: float) -> None:
     def position(now: float) -> float:

@@ -5,10 +5,11 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,14 +18,15 @@ import serial
 from hil.cli.errors import message
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import BusShared, DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongSetting
+from hil.drivers.errors import BusShared, DriverError, PortLost, TorqueHeld, TorqueNotOff, WrongModel, WrongSetting
+from hil.drivers.joint import Joint
 from hil.errors import Cause, ExperimentError, HilError, SafetyStop, StopRequested
 from hil.experiment.run import run_experiment
 from hil.fakes.bus.faults import Fault
 from hil.fakes.servo.servo import EmulatedServo
 from hil.runs.run_folder import RunFolder
 from hil.setup.preflight import Finding, Level, check_arm
-from hil.setup.servo_session import COUNT_DOWN_S, SETTINGS_NAME, servo_session
+from hil.setup.servo_session import COUNT_DOWN_S, SETTINGS_NAME, ServoSession, servo_session
 from hil.setup.settings_file import settings_path
 from tests.support.command_line import hil
 
@@ -397,6 +399,46 @@ def test_settings_are_not_restored_to_a_servo_of_another_model(arm: Arm, bench: 
         bench.servos[2].memory.set("Model Number", 1060)
         bench.eeprom[2].clear()
     assert bench.eeprom[2] == []
+
+
+def test_two_servos_of_different_models_that_swapped_their_ids_are_named() -> None:
+    tables = [SimpleNamespace(number=number) for number in (1060, 1020)]
+    bus: Any = SimpleNamespace(drives={table.number: SimpleNamespace(table=table) for table in tables})
+    answers: Any = SimpleNamespace(table=tables[1], title="Joint 'elbow'", read_despite_error=lambda _: 1060)
+    with pytest.raises(WrongModel, match=r"Another joint has a servo of that model: their IDs may have been swapped"):
+        ServoSession(bus, print)._check_model(answers)
+
+
+def test_a_servo_that_swaps_its_id_while_settings_are_restored_is_restored_too(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path
+) -> None:
+    """The servo that was restored first then answers for the second one as well, and its settings are right."""
+    restore = ServoSession._put_back
+
+    def swapping(session: ServoSession, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
+        first, second = list(bench.port.bus.servos.values())
+        failed = restore(session, list(joints)[:1])
+        for servo, other in ((first, 2), (second, 1)):
+            servo.memory.set("ID", other)
+            servo._derive()
+        monkeypatch.setattr(ServoSession, "_put_back", restore)
+        return failed | restore(session, list(joints)[1:])
+
+    with servo_session(arm(SHORT)):
+        assert bench.changed() != []
+        monkeypatch.setattr(ServoSession, "_put_back", swapping)
+    assert bench.changed() == []
+    assert not list(state_folder.rglob("*.json"))
+
+
+def test_settings_that_do_not_read_back_as_restored_stay_on_file(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path
+) -> None:
+    monkeypatch.setattr(ServoSession, "_put_back", lambda *_: {})
+    said = r"ID 1.* and .*ID 2.* could not be restored\. .*they are unverified.* restores them from 2 files"
+    with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
+        pass
+    assert len(list(state_folder.rglob("*.json"))) == 2
 
 
 def test_what_was_put_back_in_part_is_put_back_whole(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
