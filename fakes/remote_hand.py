@@ -55,7 +55,9 @@ class HandSocket:
 
 
 def ask_hand(device: Path | str, request: str) -> None:
-    """Send a request to the hand of the arm served on a terminal, given by its path or a link to it.
+    """Send a request to the simulated hand that moves the joints of a fake arm.
+
+    device: path of the pseudo-terminal on which the arm is served, or a link to it.
 
     Raises NoHand if no arm is served there, ValueError for an invalid request.
     """

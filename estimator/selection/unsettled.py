@@ -81,8 +81,10 @@ def choose_by_shooting(
 ) -> SegmentChoice:
     """Fit friction with the terms that the recordings support.
 
-    Arguments as for `estimate_by_shooting`; torque_scale: whether the ratio of the torque constants is kept in any
-    case. Raises RecordingError if no recording has two segments, ConvergenceError if no model can be fitted.
+    Arguments as for `estimate_by_shooting`. torque_scale: whether the ratio of the torque constants is always fitted,
+    even if the recordings do not support it.
+
+    Raises RecordingError if no recording has two segments, ConvergenceError if no model can be fitted.
     """
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
         raise RecordingError(

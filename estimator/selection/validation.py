@@ -24,7 +24,7 @@ class Levels:
     """RMS by source, in encoder steps (joints,)."""
 
     excited: Array
-    """Motion on the lines that were excited at some joint."""
+    """Motion at the spectral lines that were excited in one or more joints."""
     distortion: Array
     """Motion on the other lines, caused by the arm's nonlinearity."""
     noise: Array

@@ -122,7 +122,9 @@ class Columns(_Table):
         if self.time is not None and self.rate is not None:
             raise ValueError("columns: give either time or rate, not both")
         if self.current is not None and self.torque_constant is None:
-            raise ValueError("columns.torque_constant is missing: current needs it [N m/A per joint]")
+            raise ValueError(
+                "columns.torque_constant is missing: columns.current requires it (in N m/A, one value per joint)"
+            )
         if drives in (["voltage"], ["pwm"]):
             if self.torque_per_volt is None and (self.torque_constant is None or self.resistance is None):
                 raise ValueError(

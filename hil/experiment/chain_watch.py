@@ -34,8 +34,8 @@ WIDENED = 1.5
 
 LYING_RAD = 0.08
 _FRICTIONS = 8.0
-"""Lower bound on the torque from which the alarm thresholds follow, in multiples of the mean dry friction: twice that
-friction must not raise an alarm.
+"""Smallest torque to which the alarm thresholds are relative, in multiples of the mean dry friction: friction that is
+twice as large as the mean must not raise an alarm.
 """
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06

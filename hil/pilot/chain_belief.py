@@ -35,11 +35,9 @@ _FEWEST_ROWS = 50
 _LEAST_FRICTION_SHARE = 1e-4
 _POSES = 12
 _HALVINGS = 6
-_LIGHTER = 0.25
-"""Smallest plausible inertia of a joint, relative to that of the lightest arm of the prior."""
-_LIGHTER_THAN_MEAN = 0.5
-"""Smallest plausible inertia of a joint, relative to that of the arm with the fitted parameters; the smaller of the two
-values is used.
+_LIGHTER, _LIGHTER_THAN_MEAN = 0.25, 0.5
+"""Smallest plausible inertia of a joint, as a fraction of its inertia in the lightest arm of the prior, and in the arm
+with the fitted parameters. The smaller of these two inertias is the lower bound.
 """
 
 SIMULATED = 100

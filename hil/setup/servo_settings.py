@@ -111,8 +111,9 @@ def _set_id(servo: Servo, confirm: Confirm, new_id: int) -> tuple[Change, Servo]
             return Change("ID", servo.id, new_id, True), renamed
         if not _answers(servo):
             raise NoReply(
-                f"{servo.title} was sent its new ID {new_id} but answers neither there nor at ID {servo.id}, at "
-                f"{servo.port.baud} baud on {servo.port.url}. Check its supply and its cable; `hil scan` finds it."
+                f"{servo.title} was sent its new ID {new_id} but answers neither at that ID nor at ID {servo.id} "
+                f"({servo.port.baud} baud on {servo.port.url}). Check its supply and its cable, then run `hil scan` "
+                "to find it."
             )
     raise NoReply(
         f"{servo.title} still has its old ID {servo.id}: {_ATTEMPTS} attempts to change it to {new_id} failed."
@@ -150,7 +151,7 @@ def _set_baud(servo: Servo, confirm: Confirm, baud: int) -> Change:
         if not _answers(servo):
             raise NoReply(
                 f"{servo.title} was set from {former} to {baud} baud but answers at neither, on {port.url}. "
-                "Check its supply and its cable; `hil scan` finds it."
+                "Check its supply and its cable, then run `hil scan` to find it."
             )
     raise NoReply(f"{servo.title} is still at {former} baud: {_ATTEMPTS} attempts to change it to {baud} failed.")
 

@@ -1,4 +1,4 @@
-"""A supply that sags under load: detected from the servos' Present Input Voltage, and its effect on the torque.
+"""Supply sag under load: its detection from the servos' Present Input Voltage, and its effect on the torque.
 
 A motor at velocity v draws a supply current with terms in u^2 and u v if it is driven with voltage u, or in i^2
 and i v if it is driven with current i. The resistance of the supply turns this current into a voltage drop. The

@@ -166,8 +166,8 @@ class Lowering:
         longest = self._config.safety.lower_time
         if seconds > longest:
             raise SafetyStop(
-                f"the arm was pushed off its path, and another path would take the lowering to {seconds:.1f} s; "
-                f"safety.lower_time is {longest:g} s.",
+                f"the arm was pushed off its path. With a new path, lowering would take {seconds:.1f} s in all; "
+                f"safety.lower_time allows {longest:g} s.",
                 Cause.UNEXPECTED,
             )
 

@@ -15,7 +15,7 @@ STEP_RAD = 0.04
 """Smallest step [rad]; smaller ones are left to the feedback."""
 
 BENDS_RAD_S2 = 200.0
-"""Largest acceleration assumed for a joint of a lowered arm [rad/s^2]; it determines the uncertainty of predictions."""
+"""Largest joint acceleration assumed while an arm is lowered [rad/s^2]; it determines how uncertain predictions are."""
 
 MOST_STEPS = 6
 """Largest number of steps of one joint that are corrected; a single false reading causes two."""

@@ -315,7 +315,7 @@ def test_one_lost_packet_loses_no_servo(port: Callable[..., Port], kind: str, pl
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"new_id": 9}, "answers neither there nor at ID 2"),
+        ({"new_id": 9}, "answers neither at that ID nor at ID 2"),
         ({"new_baud": 57_600}, "from 1000000 to 57600 baud but answers at neither"),
     ],
 )
