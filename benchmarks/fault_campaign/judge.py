@@ -228,6 +228,8 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
     # While servos are set up, before the first goals of a servo with torque, nobody needs to be heard regularly.
     holds = np.asarray(record["torque"].any(axis=1))
     holds &= time > told.first_goal(float(time[np.argmax(holds)]))
+    # A fault that makes the set-up longer delays the motion, and changes nothing else in it.
+    later = max(0, _begins(record) - _begins(undisturbed.record))
     found: list[Reason | None] = []
     for joint in joints:
         own = record[:, joint]
@@ -246,7 +248,7 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
                 ("is beyond a limit", _beyond(config, joint, own), 1, GAP_MS),
                 (
                     "is not where it would be",
-                    _astray(config, drawn, joint, own, undisturbed.record[:, joint]),
+                    _astray(config, drawn, own[later:], undisturbed.record[:, joint], later),
                     LASTING_MS,
                     GAP_MS,
                 ),
@@ -415,11 +417,17 @@ def _beyond(config: Config, joint: int, own: NDArray[Any]) -> NDArray[np.bool_]:
     return (position < low - 1e-3) | (position > high + 1e-3) | (np.abs(velocity) > 1.02 * fastest)
 
 
+def _begins(record: NDArray[Any]) -> int:
+    """The millisecond in which motors drive the arm for the first time."""
+    return int(np.argmax(record["driven"].any(axis=1)))
+
+
 def _astray(
-    config: Config, drawn: Drawn, joint: int, own: NDArray[Any], undisturbed: NDArray[Any]
+    config: Config, drawn: Drawn, own: NDArray[Any], undisturbed: NDArray[Any], later: int
 ) -> NDArray[np.bool_]:
+    """Whether a joint is away from where it is in the undisturbed run, by millisecond; `own` begins `later` ms late."""
     count = min(own.size, undisturbed.size)
-    wrong = np.zeros(own.size, bool)
+    wrong = np.zeros(later + own.size, bool)
     if set(drawn.kinds) & SHIFTED:
         return wrong
     if config.stabiliser is None:
@@ -427,7 +435,7 @@ def _astray(
     position: Numbers = own["position"]
     expected: Numbers = undisturbed["position"]
     most = ASTRAY_RAD + ASTRAY_SHARE * float(np.ptp(expected))
-    wrong[:count] = np.abs(position[:count] - expected[:count]) > most
+    wrong[later : later + count] = np.abs(position[:count] - expected[:count]) > most
     return wrong
 
 

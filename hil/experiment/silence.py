@@ -105,7 +105,8 @@ class Silence:
         elapsed = max(now - last, listened)
         count = self.counts[joint] + refused
         count += self._already  # replies may have been missing before the arm was lowered
-        together = self._blind if self.is_busy else self._limit
+        # A refusal is an answer: it was not this computer that kept it from being heard.
+        together = self._blind if self.is_busy and not refused else self._limit
         allowed = self._alone if alone or self.others_answer else together
         if is_missing_too_long(count, listened, allowed):
             delayed = self._delayed(elapsed - listened)

@@ -209,6 +209,10 @@ def test_one_refusal_is_enough_after_the_time_allowed(arm: Arm) -> None:
     silence = Silence(arm(), 0.02)
     assert asked(silence, [0.02], refused=True)[-1] is not None
     assert asked(Silence(arm(), 0.02), [0.02])[-1] is None
+    busy = Silence(arm(), 0.0025)
+    busy.woke_up(0.0, 0.003)
+    times = [0.0025 * count for count in range(1, 9)]
+    assert asked(busy, times, refused=True, alone=False)[-1] is not None, "a busy computer is no excuse"
 
 
 @given(
