@@ -169,7 +169,7 @@ class LikelihoodOptions:
     same_cost: float = 1.0
     """Minima whose sums of squares differ by less than this count as the same."""
     close_cost: float = 25.0
-    """Minima whose sums of squares differ by less than this are compared with fine steps."""
+    """Minima whose sums of squares differ by less than this are compared again, simulated with fine steps."""
     explained_cost: float = 1.03
     """Cost per sample below which no further initial guess is tried."""
     hopeless_cost: float = 2.0

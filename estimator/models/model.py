@@ -17,7 +17,9 @@ from hil.estimator.models.terms import (
 )
 
 LEVER_STD = 0.05
-"""Relative standard deviation of a measured link length divided by gravity; gravity depends on the configured tilt."""
+"""Relative standard deviation of the ratio of a measured link length to the gravitational acceleration in the plane of
+motion, which depends on the configured tilt.
+"""
 
 
 @dataclass(frozen=True)

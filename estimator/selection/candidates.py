@@ -99,7 +99,7 @@ class Linearised:
         return [self.names.index(name) for name in names]
 
     def fall(self, names: Sequence[str]) -> tuple[float, Array]:
-        """Return the decrease of the sum of squares if these parameters are freed, and the resulting changes of them.
+        """Return the decrease of the sum of squares if these parameters are freed, and the changes in their values.
 
         The initial state is freed as well.
         """

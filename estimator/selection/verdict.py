@@ -260,8 +260,9 @@ def _reason(change: float, seconds: float) -> str:
         warm = f"To obtain the warm arm's values, set experiment.warm_up = {_warm_up(seconds)}."
         return f", as is typical while grease warms up: {holds}. {warm}"
     return (
-        f", which warming up does not explain: {holds}. Look for a cable or part that began to rub, a loose screw, "
-        "a horn that slipped, or a hot motor or falling supply, which reduces the torque. Then record again."
+        f", which warming up does not explain: {holds}. Look for a cable or part that has started to "
+        "rub, a loose screw, or a horn that has slipped. A hot motor or a falling supply voltage also reduces the "
+        "torque. Then record again."
     )
 
 

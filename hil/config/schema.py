@@ -282,7 +282,9 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is spatial. An arm with [arm] urdf is spatial, except a planar arm without [joint_path]."""
+        """Whether the arm is treated as spatial: [arm] urdf is given, and it describes no planar arm or [joint_path] is
+        given too.
+        """
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property

@@ -39,8 +39,8 @@ unexplained torque has another cause.
 """
 
 MOST_UNEVEN = 3
-"""Number of tests in a row in which the unexplained torque fell unevenly, after which it counts as the motor's all the
-same.
+"""Number of consecutive tests in which the unexplained torque falls unevenly, after which it is attributed to the motor
+nevertheless.
 """
 
 MOVES_RAD_S = 0.1
