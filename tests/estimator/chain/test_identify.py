@@ -189,6 +189,7 @@ def test_a_tilted_base_is_found(setup: bench.Setup) -> None:
     assert found.unseen == ()
 
 
+@pytest.mark.slow
 def test_a_tilt_that_gravity_cannot_show_is_said(setup: bench.Setup, period: SettledPeriod) -> None:
     weightless = Chain(*setup.base.chain.arrays[:3], np.array([0.0, 0.0, -1e-9]))
     base = BaseParameters.of(weightless)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.fit.stabilised_run import StabilisedRun
@@ -68,6 +69,7 @@ def test_derivatives_are_those_of_the_motion() -> None:
         assert np.abs(found - true).max() < 1e-4 * np.abs(true).max()
 
 
+@pytest.mark.slow
 def test_the_motion_without_derivatives_is_the_same() -> None:
     """Steps are judged by it: springs, encoders and substeps must agree with the simulation with derivatives."""
     physics = Physics.of(PARAMETERS | ERRORS)

@@ -99,6 +99,7 @@ def test_the_middle_of_the_period_is_left_alone_and_its_ends_are_opposite(
     )
 
 
+@pytest.mark.slow
 def test_choosing_a_model_corrects_for_a_change_of_friction_instead_of_adding_terms(
     periods: tuple[SettledPeriod, SettledPeriod], constant: Estimate
 ) -> None:

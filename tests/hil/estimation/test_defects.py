@@ -77,6 +77,7 @@ def test_a_torque_column_in_another_scale_than_that_of_the_other_file_is_named()
     assert found.startswith("The motor torque of joint 1 seems to be 0.8") and "in b.csv" in found
 
 
+@pytest.mark.slow
 def test_angles_of_two_joints_in_wrong_scales_are_named_with_both_scales() -> None:
     motion = two_joints(8.0)
     recording = Recording(motion.time, motion.torque, motion.position, np.full(2, STEP), "held")

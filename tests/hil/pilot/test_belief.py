@@ -102,6 +102,7 @@ def test_a_joint_that_friction_holds_against_its_weight_gets_a_spring_alone(conf
     assert kept is not None and kept.stiffness[0] == 0.0 < kept.stiffness[1], "a joint that had a spring keeps it"
 
 
+@pytest.mark.slow
 def test_the_search_gives_up_at_the_current_limit_only_and_says_what_it_tried(tmp_path: Path) -> None:
     text = (CONFIGS / "first_time.toml").read_text(encoding="utf-8")
     path = tmp_path / "held.toml"

@@ -244,6 +244,7 @@ def test_an_arm_too_heavy_for_any_path_is_refused_with_the_reason_and_what_helps
         search.safe(step_config(search.config), (1.0, 0.9))
 
 
+@pytest.mark.slow
 def test_paths_from_other_seeds_are_tried_before_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
     config = chain_config(load_config(LEG))
     said: list[str] = []

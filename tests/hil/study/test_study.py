@@ -49,6 +49,7 @@ def without_timings(dataset: Dataset) -> pa.Table:
     return dataset.table().drop_columns(list(TIMINGS))
 
 
+@pytest.mark.slow
 def test_one_worker_and_two_give_the_same_rows(study_file: Path, tmp_path: Path) -> None:
     study_file.write_text(STUDY.replace("runs = 4", "runs = 2"), encoding="utf-8")
     study = load_study(study_file)
