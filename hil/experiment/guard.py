@@ -291,7 +291,7 @@ class Guard:
         # An error with a valid checksum is an answer, not a lost packet: one is enough, unless it reports that the
         # request was damaged.
         refused = bool(error) and error != StatusError.CRC
-        too_long = self._silence.missed(index, now, refused=refused, alone=alone)
+        too_long = self._silence.missed(index, now, answered=bool(error), refused=refused, alone=alone)
         if too_long is None:
             return
         if error:

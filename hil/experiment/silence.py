@@ -86,13 +86,16 @@ class Silence:
         """Record an exchange, begun at `now` [s], in which all joints replied, as they did in the previous one."""
         self._asked_at = self._all_heard_at = now
 
-    def missed(self, joint: int, now: float, *, refused: bool = False, alone: bool = True) -> str | None:
+    def missed(
+        self, joint: int, now: float, *, answered: bool = False, refused: bool = False, alone: bool = True
+    ) -> str | None:
         """Record a missing reply to an exchange; return a description of a silence that is too long, or None.
 
         now: when that exchange began, or when waiting for its replies ended [s].
 
-        refused: whether the servo answered with an error instead of its state; one such answer is enough. alone:
-        whether only this servo is silent, i.e. another one was heard.
+        answered: whether the servo answered with an error instead of its state. refused: whether that error shows that
+        it received the request undamaged; one such answer is enough. alone: whether only this servo is silent, i.e.
+        another one was heard.
         """
         last = max(self._last_heard[joint], self._all_heard_at)
         if last == -inf:
@@ -105,8 +108,8 @@ class Silence:
         elapsed = max(now - last, listened)
         count = self.counts[joint] + refused
         count += self._already  # replies may have been missing before the arm was lowered
-        # A refusal is an answer: it was not this computer that kept it from being heard.
-        together = self._blind if self.is_busy and not refused else self._limit
+        # A servo that was heard, if only with an error, was not kept from being heard by this computer.
+        together = self._blind if self.is_busy and not answered else self._limit
         allowed = self._alone if alone or self.others_answer else together
         if is_missing_too_long(count, listened, allowed):
             delayed = self._delayed(elapsed - listened)
