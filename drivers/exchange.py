@@ -472,7 +472,7 @@ class _Turns:
         self._status_every = self._until_status = status_every
         self._slow = 0
         self.usual = 0
-        """Number of usual cycles that were planned, less those that have been counted."""
+        """Number of planned cycles with the usual span that have not been counted yet."""
         self.between = 0
         """Number of cycles between two samples that have not been counted yet."""
 

@@ -54,7 +54,8 @@ class CoordinateOptions:
     width_floor: float
     """Lower bound of the width of every smoothed Coulomb step [rad/s]."""
     widths_per_substep: float = 2.0
-    """Number of Coulomb step widths through which a reversal of friction may take a joint in the shortest substep.
+    """Largest change of a joint's velocity that a reversal of friction may cause in the shortest substep, in widths of
+    the smoothed Coulomb step.
 
     Beyond about ten, the simulation jumps back and forth across the step: its motion hardly changes, but its
     derivatives grow without limit.

@@ -33,8 +33,8 @@ _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Numbers of read-backs of a foreign value that prove another writer, and the time in which they must occur [s].
 
 Three of the same value are required for a goal that this program may have written in an earlier cycle, and for 0, which
-a servo itself may have set. By then, the status has detected lost writes, a tripped watchdog or a reboot; and writes
-that are lost occasionally leave a different goal each time.
+a servo itself may have set. By then, the status would have revealed lost writes, a tripped watchdog or a reboot; and
+writes that are lost occasionally leave a different goal each time.
 """
 
 _UNSURE_S = 0.01

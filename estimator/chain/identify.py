@@ -115,7 +115,7 @@ def identify_chain(
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)
     for period in given:
         if model.joints != period.joints:
-            raise ModelError(f"the model has {model.joints} joints and the period {period.joints}: they must agree")
+            raise ModelError(f"the model has {model.joints} joints but the period has {period.joints}")
     used = [without_spikes(period) for period in given]
     linear = fit_lines(used, model, prior, added)
     fit = _best_fit(used, model, linear, prior, replace(DEFAULTS, test_zeros=test_zeros), added)

@@ -64,7 +64,8 @@ class Geom:
     """A shape of an MJCF file, in the frame of its moving link.
 
     link: 0 for whatever is fixed to the world. kind: "sphere", "capsule", "cylinder", "box" or "mesh". size: as in
-    MuJoCo, half edge lengths, or radius and half length [m]; for a mesh and any other shape, those of its bounding box.
+    MuJoCo, the half edge lengths of a box, or the radius and, except for a sphere, the half length [m]; for a mesh, the
+    half edge lengths of its bounding box. Any other shape is treated as a mesh.
     """
 
     link: int

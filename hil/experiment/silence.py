@@ -69,7 +69,7 @@ class Silence:
             self._busy_until = now + BUSY_S
 
     def ask(self, now: float) -> None:
-        """Record that an exchange began at `now` [s]. If all joints reply to it, call `all_heard` instead."""
+        """Record an exchange that began at `now` [s], unless all joints replied to it (`all_heard`)."""
         since = 0.0 if self._asked_at is None else now - self._asked_at
         self._turn = since if since < self._longest_turn else self._longest_turn
         self._asked_at = now

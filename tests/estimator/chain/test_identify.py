@@ -93,7 +93,7 @@ def test_a_model_of_other_joints_is_refused(setup: bench.Setup, period: SettledP
     one = replace(
         period, position=period.position[:3], torque=period.torque[:3], position_step=period.position_step[:3]
     )
-    with pytest.raises(ModelError, match="4 joints and the period 3"):
+    with pytest.raises(ModelError, match="4 joints but the period has 3"):
         identify_chain(replace(one, stabiliser=None), ChainModel(setup.base), setup.prior)
 
 
