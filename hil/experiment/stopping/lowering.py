@@ -128,38 +128,46 @@ class Lowering:
         the motion so far. Without it, a motor that turns against its goal is detected only when its joint runs away.
         """
         self._recent, self._watch = recent, watch
-        position, velocity = np.array(state.position), np.array(recent.until(state).believed(state))
+        self._obedience = Obedience(len(state.position))
+        self._paths = 0
+        self.slow_down(1)
+        velocity = self._believed(state)
+        count = self._set_out(state, velocity, goal)
+        if watch is not None:
+            self._obedience.suspect(watch.residual, velocity.tolist(), state.time_before_write)
+        return count
+
+    def begin_again(self, state: State, goal: list[float]) -> int:
+        """Plan another path home from this sample; return its number of samples."""
+        return self._set_out(state, self._believed(state), goal)
+
+    def _believed(self, state: State) -> NDArray[np.float64]:
+        return np.array(self._recent.until(state).believed(state))
+
+    def _set_out(self, state: State, velocity: NDArray[np.float64], goal: list[float]) -> int:
+        """Plan a path home from this sample; return its number of samples."""
+        position = np.array(state.position)
         self._path = self._way.path(position, velocity)
         torque = self._thought.of(self._path)
         count = torque.shape[1]
         self._share = np.clip((count - np.arange(count)) / self._fade, 0.0, 1.0)
         self._feed = (self._share * torque).T
         self._pull = np.zeros_like(position)
-        self.slow_down(1)
         self._position, self._velocity = self._path.position.T.copy(), self._path.velocity.T.copy()
         self._guard = Guard(
             _widened(self._config, self._path.position, velocity),
             self._planned,
             interval=self._interval,
             patience=LONGEST_S,
-            recent=recent,
+            recent=self._recent,
             lowers_since=state.time_before_write,
         )
         self._guard.holding(goal)
-        self._obedience = Obedience(len(position))
-        if watch is not None:
-            self._obedience.suspect(watch.residual, velocity.tolist(), state.time_before_write)
         self._excess = deque[tuple[float, NDArray[np.float64]]]()
         self._against = np.zeros_like(position)
-        self._paths, self.needs_another_path = 1, False
+        self._paths += 1
+        self.needs_another_path = False
         return int(count)
-
-    def begin_again(self, state: State, goal: list[float]) -> int:
-        """Plan another path home from this sample; return its number of samples."""
-        obedience, paths = self._obedience, self._paths
-        count = self.begin(state, goal, self._recent, self._watch)
-        self._obedience, self._paths = obedience, paths + 1
-        return count
 
     def check_time(self, seconds: float) -> None:
         """Raise SafetyStop if lowering takes `seconds` [s] in all and that is too long."""

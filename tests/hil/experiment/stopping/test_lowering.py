@@ -117,6 +117,20 @@ def test_a_false_velocity_does_not_drive_the_arm_on_its_way_down() -> None:
     assert max(torque) - min(torque) < 0.1 * config.stabiliser.damping[0] * 4.0
 
 
+def test_another_path_keeps_the_soft_gains_that_late_replies_require() -> None:
+    config = load_config(CONFIGS / NAME)
+    rest, none = tuple(config.arm.rest_pose), (0.0,) * 4
+    still = State(0.0, 0.001, none, none, none, (rest[0] + 0.3, *rest[1:]), (0,) * 4, (False,) * 4)
+    lowering = Lowering(config, make_chain_plan(config))
+    lowering.begin(still, list(none), seen_moving(config, still))
+    usual = lowering._damping.copy()
+    lowering.slow_down(8)
+    soft = lowering._damping.copy()
+    lowering.begin_again(still, list(none))
+    np.testing.assert_array_equal(lowering._damping, soft)
+    assert (soft < usual).any()
+
+
 def test_torque_towards_the_path_grows_where_a_joint_stays_off_it() -> None:
     """Friction holds a light joint against a soft spring, but never a joint whose position is unknown."""
     config = load_config(CONFIGS / NAME)
