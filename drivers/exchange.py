@@ -28,6 +28,7 @@ from hil.drivers.others.read_back import REMEMBERED, TRY_AGAIN_S, Overruled, Rea
 from hil.drivers.packet import BROADCAST_ID, HEADER, Instruction
 from hil.drivers.port import Port, ReplyTime
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
+from hil.drivers.turns import NEVER, Turns
 
 HOST_S = 0.75e-3
 """Time allowed for the computer itself, including USB frames, on top of wire, servos and adapter [s]."""
@@ -43,7 +44,6 @@ AFTER_LOSS = 5
 many cycles late is recognised by its length.
 """
 
-_NEVER = 1 << 62
 _LONGEST_REPLY = 1024
 _DOUBTS = 3
 
@@ -135,7 +135,7 @@ class Exchange:
             for span, read in enumerate(reads)
         ]
         self._doubts = _DOUBTS
-        self._turns = _Turns(len(spans) - 1, slow_every, _NEVER if status is None else status_every)
+        self._turns = Turns(len(spans) - 1, slow_every, NEVER if status is None else status_every)
         self._usual_left = self._turns.plan()
         """Number of cycles that still read the usual span before another one may be due."""
         self._late_possible = False
@@ -454,60 +454,6 @@ class _Plan:
     wire_s: float
     soonest: float
     is_after_loss: bool
-
-
-class _Turns:
-    """When spans other than the usual one are due.
-
-    A cycle only decrements one counter, the number of usual cycles that `plan` has promised. `count` derives from it
-    what has passed.
-
-    slow_spans: number of slow spans. slow_every: samples between two of them. status_every: cycles between two status
-    reads.
-    """
-
-    def __init__(self, slow_spans: int, slow_every: int, status_every: int) -> None:
-        self._slow_spans = slow_spans
-        self._slow_every = self._until_slow = slow_every
-        self._status_every = self._until_status = status_every
-        self._slow = 0
-        self.usual = 0
-        """Number of planned cycles with the usual span that have not been counted yet."""
-        self.between = 0
-        """Number of cycles between two samples that have not been counted yet."""
-
-    def count(self, left: int) -> None:
-        """Count the cycles so far; `left` of the planned ones have not taken place (-1: one more than planned has)."""
-        passed = self.usual - left
-        self._until_status -= passed
-        self._until_slow -= passed - self.between
-        self.usual, self.between = left, 0
-
-    def due(self, between: bool) -> int:
-        """Return the span to read now, once all cycles including this one are counted; 0 is the usual one."""
-        if self._until_slow <= 0 and not between:
-            self._until_slow = self._slow_every
-            # If a status is due as well, it waits for the next cycle, so that the two long reads never coincide.
-            return self._next_slow()
-        if self._until_status > 0:
-            return 0
-        self._until_status = self._status_every
-        return 1 + self._slow_spans
-
-    def _next_slow(self) -> int:
-        if not self._slow_spans:
-            return 0
-        self._slow = self._slow % self._slow_spans + 1
-        return self._slow
-
-    def read_status_next(self) -> None:
-        if self._status_every < _NEVER:
-            self._until_status = min(self._until_status, 1)
-
-    def plan(self) -> int:
-        """Return how many cycles will read the usual span; if all of them lie between samples, there will be more."""
-        self.usual = max(0, min(self._until_slow, self._until_status) - 1)
-        return self.usual
 
 
 class _GoalWrite:

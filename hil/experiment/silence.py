@@ -111,12 +111,10 @@ class Silence:
         # A servo that was heard, if only with an error, was not kept from being heard by this computer.
         together = self._blind if self.is_busy and not answered else self._limit
         allowed = self._alone if alone or self.others_answer else together
-        if is_missing_too_long(count, listened, allowed):
-            delayed = self._delayed(elapsed - listened)
-            return f"{_ms(elapsed)} ago{delayed}; {allowed.said} allows {_ms(allowed.seconds)}"
-        if is_missing_too_long(count, elapsed, self._blind):
-            delayed = self._delayed(elapsed - listened)
-            return f"{_ms(elapsed)} ago{delayed}; {self._blind.said} allows {_ms(self._blind.seconds)}"
+        for seconds, limit in ((listened, allowed), (elapsed, self._blind)):
+            if is_missing_too_long(count, seconds, limit):
+                delayed = self._delayed(elapsed - listened)
+                return f"{_ms(elapsed)} ago{delayed}; {limit.said} allows {_ms(limit.seconds)}"
         return None
 
     def _delayed(self, seconds: float) -> str:

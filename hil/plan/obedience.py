@@ -160,8 +160,9 @@ class Obedience:
         """Whether a test that ends with these torques shows that the motor is reversed."""
         if test.share(lacking, torque) <= TURNED:
             return False
-        self._uneven[joint] += test.is_uneven(lacking, torque)
-        return not test.is_uneven(lacking, torque) or self._uneven[joint] >= MOST_UNEVEN
+        is_uneven = test.is_uneven(lacking, torque)
+        self._uneven[joint] += is_uneven
+        return not is_uneven or self._uneven[joint] >= MOST_UNEVEN
 
 
 def _drives(lacking: float, velocity: float) -> bool:

@@ -10,13 +10,14 @@ from hypothesis import strategies as st
 
 from hil.drivers.control_table import load_control_table
 from hil.drivers.errors import PortLost
-from hil.drivers.exchange import HOST_S, Exchange, _Turns
+from hil.drivers.exchange import HOST_S, Exchange
 from hil.drivers.others.read_back import LOST_OF, TRY_AGAIN_S
 from hil.drivers.packet import HEADER, Framer, Instruction, crc, encode, encode_status
 from hil.drivers.port import Port
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import read_back_spans, spans
 from hil.drivers.sync_read import FastSyncRead, Span, SyncRead
+from hil.drivers.turns import Turns
 
 XM430 = load_control_table("XM430-W350")
 XL430 = load_control_table("XL430-W250")
@@ -485,7 +486,7 @@ def test_after_a_lost_reply_the_next_read_back_waits_unless_another_master_is_su
 def test_a_goal_that_was_not_taken_asks_for_the_status(held: int, is_due: bool) -> None:
     wire = Wire([answer(1, 1, 2, 3) + answer(2, 4, 5, 6)])
     cycles = read_back_of(wire)
-    cycles._turns = _Turns(slow_spans=2, slow_every=100, status_every=20)
+    cycles._turns = Turns(slow_spans=2, slow_every=100, status_every=20)
     cycles._usual_left = cycles._turns.plan()
     cycles.cycle([0, 0])
     assert cycles._read_back is not None

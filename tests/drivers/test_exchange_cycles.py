@@ -4,11 +4,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.drivers.exchange import Exchange, _Turns
+from hil.drivers.exchange import Exchange
 from hil.drivers.others.read_back import TRY_AGAIN_S
 from hil.drivers.packet import encode_status
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import spans, status_span
+from hil.drivers.turns import Turns
 from tests.drivers.test_exchange import XM430, Wire, answer, exchange, read_back_of
 
 FINE = answer(1, 1, 2, 3) + answer(2, 4, 5, 6)
@@ -97,7 +98,7 @@ def test_the_longest_exchange_is_all_that_is_sent_and_received(ids: tuple[int, .
 def test_spans_are_due_as_if_every_cycle_counted_down_to_each_of_them(
     slow_every: int, status_every: int, cycles: list[str]
 ) -> None:
-    turns, until_slow, until_status, slow = _Turns(2, slow_every, status_every), slow_every, status_every, 0
+    turns, until_slow, until_status, slow = Turns(2, slow_every, status_every), slow_every, status_every, 0
     left = turns.plan()
     for cycle in cycles:
         if cycle == "asked":

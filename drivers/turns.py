@@ -1,0 +1,61 @@
+"""When a cycle reads another span than the usual one: slow registers, or the status."""
+
+__all__ = ["NEVER", "Turns"]
+
+NEVER = 1 << 62
+"""Number of cycles after which nothing is ever due."""
+
+
+class Turns:
+    """Counts cycles until spans other than the usual one are due.
+
+    A cycle only decrements one counter, the number of usual cycles that `plan` has promised. `count` derives from it
+    what has passed.
+
+    slow_spans: number of slow spans. slow_every: samples between two of them. status_every: cycles between two status
+    reads.
+    """
+
+    def __init__(self, slow_spans: int, slow_every: int, status_every: int) -> None:
+        self._slow_spans = slow_spans
+        self._slow_every = self._until_slow = slow_every
+        self._status_every = self._until_status = status_every
+        self._slow = 0
+        self.usual = 0
+        """Number of planned cycles with the usual span that have not been counted yet."""
+        self.between = 0
+        """Number of cycles between two samples that have not been counted yet."""
+
+    def count(self, left: int) -> None:
+        """Count the cycles so far; `left` of the planned ones have not taken place (-1: one more than planned has)."""
+        passed = self.usual - left
+        self._until_status -= passed
+        self._until_slow -= passed - self.between
+        self.usual, self.between = left, 0
+
+    def due(self, between: bool) -> int:
+        """Return the span to read now, once all cycles including this one are counted; 0 is the usual one."""
+        if self._until_slow <= 0 and not between:
+            self._until_slow = self._slow_every
+            # If a status is due as well, it waits for the next cycle, so that the two long reads never coincide.
+            return self._next_slow()
+        if self._until_status > 0:
+            return 0
+        self._until_status = self._status_every
+        return 1 + self._slow_spans
+
+    def _next_slow(self) -> int:
+        if not self._slow_spans:
+            return 0
+        self._slow = self._slow % self._slow_spans + 1
+        return self._slow
+
+    def read_status_next(self) -> None:
+        """Let the status be due in the next cycle."""
+        if self._status_every < NEVER:
+            self._until_status = min(self._until_status, 1)
+
+    def plan(self) -> int:
+        """Return how many cycles will read the usual span; if all of them lie between samples, there will be more."""
+        self.usual = max(0, min(self._until_slow, self._until_status) - 1)
+        return self.usual
