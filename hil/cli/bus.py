@@ -136,8 +136,8 @@ def setup(
     from hil.cli.views.setup_view import changed, print_changes
     from hil.config.schema import port_url
     from hil.drivers.port import open_port
-    from hil.setup.killed_run import recover
     from hil.setup.servo_settings import open_servo, set_up
+    from hil.setup.session.killed_run import recover
 
     for each in (baud, new_baud):
         if each is not None:

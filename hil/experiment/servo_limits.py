@@ -11,7 +11,7 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import WrongSetting
 from hil.drivers.joint import Joint
 from hil.drivers.servo_model import FULL_PWM_TICKS, VOLTAGE_UNIT, Mode
-from hil.setup.current_limit import current_limit_ticks
+from hil.setup.session.current_limit import current_limit_ticks
 
 
 @contextmanager

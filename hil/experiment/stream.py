@@ -38,7 +38,7 @@ from hil.plan.brake import Brake, may_brake
 from hil.plan.plan import Plan, Segment, rest_window
 from hil.plan.stabiliser import Stabiliser, must_balance
 from hil.runs.recording import Phase, Recorder, missed
-from hil.setup.servo_session import has_moved
+from hil.setup.session.servo_session import has_moved
 
 _WATCH_EVERY_S = 0.05
 _LEAST_MOTION_STEPS = 4

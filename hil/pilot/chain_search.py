@@ -30,7 +30,7 @@ from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 from hil.setup.lying import from_where_it_lies, said_of_the_rest, wait_for_rest
-from hil.setup.servo_session import servo_session
+from hil.setup.session.servo_session import servo_session
 
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7

@@ -19,7 +19,7 @@ from hil.pilot.steps import Played, Player, Say
 from hil.plan.plan import ROLES
 from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
-from hil.setup.servo_session import servo_session
+from hil.setup.session.servo_session import servo_session
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ config.toml     copied byte for byte
 experiment.json the [experiment] as run, if hil chose it (pilot, torque found by dry runs)
 stabiliser.json the [stabiliser] as used, if hil chose it
 run.json        versions, start time, and the facts needed to interpret the samples
-servo_settings.json  the servos' settings before the run (hil.setup.servo_session)
+servo_settings.json  the servos' settings before the run (hil.setup.session.servo_session)
 events.jsonl    events with their time, one JSON object per line, written as they happen
 samples.npy     every sample (hil.runs.recording)
 lateness.json   histogram of the samples' lateness (hil.runs.timing)

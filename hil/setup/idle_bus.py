@@ -7,7 +7,7 @@ from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.rate import FixedRate
 from hil.drivers.servo_model import VELOCITY_UNIT, VOLTAGE_UNIT, Mode
-from hil.setup.servo_session import servo_session
+from hil.setup.session.servo_session import servo_session
 
 _SECONDS = 1.0
 

@@ -13,7 +13,7 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import BusShared, DriverError, TorqueNotOff
 from hil.drivers.torque.off import and_list
 from hil.rest_pose_hint import within_limits
-from hil.setup.servo_session import has_moved
+from hil.setup.session.servo_session import has_moved
 
 AFTER_A_RUN = 2.0
 """Factor applied to arm.rest_tolerance after a run: friction may hold the arm farther from its rest pose than before.

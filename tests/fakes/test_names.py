@@ -12,7 +12,7 @@ from hil.config.schema import load_config, port_url
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.description import DescriptionError, load_fake, make_bus
 from hil.fakes.names import arm_names, find_arm
-from hil.setup.servo_session import servo_session
+from hil.setup.session.servo_session import servo_session
 from tests.support.command_line import hil
 
 READY = {

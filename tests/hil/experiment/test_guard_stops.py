@@ -25,7 +25,7 @@ from hil.fakes.bus.faults import Fault, FaultKind
 from hil.plan.plan import Plan, make_plan
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
-from hil.setup import servo_session
+from hil.setup.session import servo_session
 from tests.support.paths import CONFIGS
 from tests.support.spied_plant import SpiedPlant, Spy, call_at
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import attainable, put_back, read_settings
 from hil.drivers.servo import Servo
-from hil.setup import settings_file
-from hil.setup.settings_file import Kept
+from hil.setup.session import settings_file
+from hil.setup.session.settings_file import Kept
 
 __all__ = ["Left", "Restored", "left_behind", "recover", "what_is_left"]
 

@@ -26,8 +26,9 @@ from hil.fakes.bus.faults import Fault
 from hil.fakes.servo.servo import EmulatedServo
 from hil.runs.run_folder import RunFolder
 from hil.setup.preflight import Finding, Level, check_arm
-from hil.setup.servo_session import COUNT_DOWN_S, SETTINGS_NAME, ServoSession, servo_session
-from hil.setup.settings_file import settings_path
+from hil.setup.session.saved_settings import SavedSettings
+from hil.setup.session.servo_session import COUNT_DOWN_S, SETTINGS_NAME, servo_session
+from hil.setup.session.settings_file import settings_path
 from tests.support.command_line import hil
 
 Arm = Callable[..., Config]
@@ -406,27 +407,27 @@ def test_two_servos_of_different_models_that_swapped_their_ids_are_named() -> No
     bus: Any = SimpleNamespace(drives={table.number: SimpleNamespace(table=table) for table in tables})
     answers: Any = SimpleNamespace(table=tables[1], title="Joint 'elbow'", read_despite_error=lambda _: 1060)
     with pytest.raises(WrongModel, match=r"Another joint has a servo of that model: their IDs may have been swapped"):
-        ServoSession(bus, print)._check_model(answers)
+        SavedSettings(bus, print)._check_model(answers)
 
 
 def test_a_servo_that_swaps_its_id_while_settings_are_restored_is_restored_too(
     arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path
 ) -> None:
     """The servo that was restored first then answers for the second one as well, and its settings are right."""
-    restore = ServoSession._put_back
+    restore = SavedSettings.put_back
 
-    def swapping(session: ServoSession, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
+    def swapping(session: SavedSettings, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
         first, second = list(bench.port.bus.servos.values())
         failed = restore(session, list(joints)[:1])
         for servo, other in ((first, 2), (second, 1)):
             servo.memory.set("ID", other)
             servo._derive()
-        monkeypatch.setattr(ServoSession, "_put_back", restore)
+        monkeypatch.setattr(SavedSettings, "put_back", restore)
         return failed | restore(session, list(joints)[1:])
 
     with servo_session(arm(SHORT)):
         assert bench.changed() != []
-        monkeypatch.setattr(ServoSession, "_put_back", swapping)
+        monkeypatch.setattr(SavedSettings, "put_back", swapping)
     assert bench.changed() == []
     assert not list(state_folder.rglob("*.json"))
 
@@ -434,7 +435,7 @@ def test_a_servo_that_swaps_its_id_while_settings_are_restored_is_restored_too(
 def test_settings_that_do_not_read_back_as_restored_stay_on_file(
     arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path
 ) -> None:
-    monkeypatch.setattr(ServoSession, "_put_back", lambda *_: {})
+    monkeypatch.setattr(SavedSettings, "put_back", lambda *_: {})
     said = r"ID 1.* and .*ID 2.* could not be restored\. .*they are unverified.* restores them from 2 files"
     with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
         pass
@@ -698,7 +699,7 @@ def test_a_killed_process_on_a_pty_is_put_back(arm_file: Any, tmp_path: Path) ->
         config = load_config(real)
         code = (
             "import os, signal, sys; from pathlib import Path; from hil.config.schema import load_config;"
-            "from hil.setup.servo_session import servo_session\n"
+            "from hil.setup.session.servo_session import servo_session\n"
             "with servo_session(load_config(Path(sys.argv[1]))): os.kill(os.getpid(), signal.SIGKILL)"
         )
         killed = subprocess.run([sys.executable, "-c", code, str(real)], check=False, env=dict(os.environ))

@@ -1,0 +1,93 @@
+"""How a session ends: what its exception says about torque, and which exception is raised in the end."""
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from hil.drivers.bus import ServoBus
+from hil.drivers.errors import DriverError, TorqueNotOff
+from hil.drivers.torque.off import signals_held_back
+from hil.errors import ExperimentError, StopRequested
+
+_LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
+"""Message if every servo has answered in the end and nothing else is wrong."""
+
+_TELLS_OF_TORQUE = re.compile("torque (off )?is", re.IGNORECASE)
+"""Matches every sentence that says whether torque is off (see `TorqueOff`)."""
+
+
+def end_with(bus: ServoBus, stopped: BaseException | None, left: Sequence[str], told: str) -> None:
+    """Add what is left to say to the exception that ended the block, or raise another one where it does not apply.
+
+    told: the sentence about torque before the settings were restored.
+    """
+    report = bus.torque_off_report
+    instead: BaseException | None = None
+    if isinstance(stopped, TorqueNotOff):
+        instead = confirmed_later(bus, stopped)
+    elif report is not None and not report.is_off:
+        instead = TorqueNotOff(str(report))
+        if stopped is not None:
+            _retract(stopped, told)
+            instead.last_samples = getattr(stopped, "last_samples", None)
+    if ended := instead or stopped:
+        for line in left:  # after what stopped the arm and the state of its torque, which matter more
+            ended.add_note(line)
+    elif left:
+        raise ExperimentError(" ".join(left))
+    if isinstance(instead, TorqueNotOff):
+        raise instead
+    if instead is not None:
+        raise instead from None
+
+
+def _retract(stopped: BaseException, told: str) -> None:
+    """Remove a sentence about torque that no longer holds from an exception's notes."""
+    if notes := getattr(stopped, "__notes__", None):
+        notes[:] = [rest for note in notes if (rest := note.replace(told, "").strip())]
+
+
+def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
+    """The exception to raise in place of `error` if torque is off on all servos by now; None if it is not.
+
+    It is the exception that led to cutting torque. If there was none, and replies were only missing when torque was cut
+    at the end, it is an ExperimentError. A note about the torque state is attached to it.
+    """
+    report = bus.torque_off_report
+    error.args = (str(report),)
+    if report is None or not report.is_off:
+        return None
+    cause = error.__context__ or ExperimentError(_LATE_CONFIRMED)
+    cause.add_note(str(report))
+    return cause
+
+
+@contextmanager
+def telling_of_torque(bus: ServoBus) -> Iterator[None]:
+    """Add a note about torque to any exception that ends the block, unless it has one: a stop may come between two
+    runs.
+    """
+    try:
+        yield
+    except TorqueNotOff:
+        raise
+    except BaseException as ended:
+        is_stop = isinstance(ended, KeyboardInterrupt | StopRequested)
+        told = any(_TELLS_OF_TORQUE.search(note) for note in getattr(ended, "__notes__", []))
+        if not told and (is_stop or bus.torque_off_report is not None):
+            with signals_held_back():
+                ended.add_note(_about_torque(bus))
+        raise
+
+
+def _about_torque(bus: ServoBus) -> str:
+    """A sentence about the servos' torque while no run is in progress."""
+    if bus.torque_off_report is not None:
+        return str(bus.torque_off_report)
+    try:
+        on = [joint.title for joint, servo in bus.drives.items() if servo.read("Torque Enable")]
+    except DriverError as error:
+        return f"This command has not switched torque on; whether it is off could not be read: {error}"
+    if on:
+        return f"TORQUE IS ON at {' and '.join(on)}: it was on before this command."
+    return "Torque is off on all servos, confirmed by reading it back; this command has not switched it on."

@@ -1,0 +1,140 @@
+"""The settings of an arm's servos: saved before the first write, restored, and verified once all are restored."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+from hil.drivers.bus import ServoBus
+from hil.drivers.errors import DriverError, WrongModel, WrongSetting
+from hil.drivers.joint import Joint
+from hil.drivers.preparation.settings import attainable, holds, put_back, read_settings
+from hil.drivers.servo import Servo
+from hil.errors import RunFolderError
+from hil.setup.session import settings_file
+from hil.setup.session.killed_run import Left, left_behind, what_is_left
+from hil.setup.session.settings_file import Kept
+
+_MOST_CHECKS = 3
+"""How often the settings of all servos are read again once they have been restored."""
+
+_UNVERIFIED = "its registers were written but read differently afterwards: they are unverified."
+
+
+@dataclass
+class SavedSettings:
+    """What the servos are restored to. Each servo has a file on disk until its settings have been restored.
+
+    say: receives messages for the user.
+    """
+
+    bus: ServoBus
+    _say: Callable[[str], None]
+    left: dict[Joint, Kept] = field(default_factory=dict)
+    """Saved settings of the servos that an earlier run did not restore."""
+    kept: dict[Joint, Kept] = field(default_factory=dict)
+    """Saved settings of the servos that this session changes."""
+    wanted: dict[Joint, dict[str, int]] = field(default_factory=dict)
+    """Settings to restore: the saved ones, except for registers that another program has changed since a run was
+    killed.
+    """
+    reduced: dict[Joint, dict[str, int]] = field(default_factory=dict)
+    """Goals that could only be restored as far as a lowered limit allows, with the restored values."""
+    _refused: set[Joint] = field(default_factory=set)
+    """Servos whose Current Limit another program has left too low for this run; the file keeps its former value."""
+
+    def look_for_left(self) -> None:
+        """Find the settings that an earlier run on this port did not restore."""
+        url = self.bus.port.url
+        self.left = {joint: kept for joint in self.bus.drives if (kept := left_behind(url, joint)) is not None}
+
+    def save(self, joint: Joint, changed: dict[str, int]) -> None:
+        """Read a servo's settings and write them to disk. changed: the EEPROM registers that this session will set.
+
+        Raises DriverError.
+        """
+        servo = self.bus.drives[joint]
+        settings = read_settings(servo)
+        if joint in self.left:
+            self._take_over(joint, what_is_left(self.left[joint], servo, settings), changed)
+        else:
+            self._keep(joint, settings, changed)
+
+    def _take_over(self, joint: Joint, left: Left, changed: dict[str, int]) -> None:
+        """Save what an earlier run left, and say what of it will be restored.
+
+        What another program has changed is the servo's own value from now on, unless it prevents this run.
+        """
+        if said := left.told(joint.title):
+            self._say(said)
+        if left.is_refused(changed):
+            self._refused.add(joint)
+            self._keep(joint, left.kept.settings, changed, left.kept.since)
+            self.wanted[joint] = left.wanted
+        else:
+            self._keep(joint, left.wanted, changed)
+
+    def _keep(self, joint: Joint, settings: dict[str, int], changed: dict[str, int], since: str = "") -> None:
+        url, model = self.bus.port.url, joint.servo.name
+        self.wanted[joint] = settings
+        try:
+            self.kept[joint] = settings_file.keep(url, joint.id, model, settings, changed, since)
+        except RunFolderError as error:
+            self._say(
+                f"The settings of {joint} cannot be saved ({error}). If this program is killed, the servo's Operating "
+                f"Mode {settings['Operating Mode']} and Current Limit must be restored by hand."
+            )
+            self.kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")
+
+    def put_back(self, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
+        """Restore the settings of these joints; return the error of each joint that failed."""
+        failed: dict[Joint, DriverError] = {}
+        for joint in joints:
+            try:
+                self.bus.confirm_later(joint)
+                servo, settings = self.bus.drives[joint], self.wanted[joint]
+                self._check_model(servo)
+                put_back(servo, settings)
+                possible = attainable(servo, settings)
+                self.reduced[joint] = {name: value for name, value in possible.items() if value != settings[name]}
+            except DriverError as error:
+                failed[joint] = error
+        return failed
+
+    def verify(self, failed: dict[Joint, DriverError]) -> None:
+        """Read the settings of all servos again once the last one has been restored, and restore those that differ.
+
+        Replies that belong to earlier requests, or IDs that are swapped meanwhile, make a servo seem restored that was
+        never reached. failed: receives the errors of the servos whose settings still differ.
+        """
+        for attempt in range(_MOST_CHECKS):
+            unlike = {
+                joint: error
+                for joint in self.kept
+                if joint not in failed and (error := self._differs(joint)) is not None
+            }
+            if not unlike:
+                return
+            failed |= self.put_back(unlike) if attempt < _MOST_CHECKS - 1 else unlike
+
+    def forget(self, restored: Iterable[Joint]) -> None:
+        """Remove the files of these servos; not where a goal or limit has yet to be restored."""
+        for joint in restored:
+            if joint not in self._refused and (not self.reduced[joint] or joint in self.left):
+                settings_file.forget(self.kept[joint])
+
+    def _differs(self, joint: Joint) -> DriverError | None:
+        """The error for a servo whose settings are not read as restored, or cannot be read; None if they are."""
+        try:
+            is_held = holds(self.bus.drives[joint], self.wanted[joint])
+        except DriverError as error:
+            return error
+        return None if is_held else WrongSetting(f"{joint.title}: {_UNVERIFIED}")
+
+    def _check_model(self, servo: Servo) -> None:
+        """Raise WrongModel if a servo of another model answers at this servo's ID."""
+        found = servo.read_despite_error("Model Number")
+        if found == servo.table.number:
+            return
+        said = f"{servo.title}: a servo of a different model now answers at this ID."
+        if found in {other.table.number for other in self.bus.drives.values()}:
+            said += " Another joint has a servo of that model: their IDs may have been swapped."
+        raise WrongModel(said)

@@ -1,0 +1,129 @@
+"""What is not as it was before the session, although every servo's settings have been restored as far as possible."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from hil.drivers.errors import DriverError
+from hil.drivers.joint import Joint
+from hil.drivers.torque.off import and_list, by_reason
+from hil.setup.changed_settings import Settings
+from hil.setup.session.killed_run import recover
+from hil.setup.session.saved_settings import SavedSettings
+
+_DELAY = "Return Delay Time"
+_OFFSET, _DRIVE_MODE = "Homing Offset", "Drive Mode"
+_PWM_LIMIT, _GOAL_PWM = "PWM Limit", "Goal PWM"
+_NEXT = "The next hil identify, record, check or setup on this port restores them from"
+
+
+def unrestored(
+    saved: SavedSettings,
+    failed: Mapping[Joint, DriverError],
+    before: Settings,
+    delays: Mapping[Joint, int],
+    *,
+    is_ours: bool,
+) -> list[str]:
+    """A message for each reason why a setting is not as it was.
+
+    failed: the errors of the servos whose settings could not be restored. before, delays: all settings, and the Return
+    Delay Times [2 us], at the beginning of the session. is_ours: whether the servos may be written to.
+    """
+    return [
+        *_not_reached(saved, is_ours=is_ours),
+        *_changed_delays(saved, delays, failed),
+        *_lowered_limits(saved, before, failed),
+        *_changed_meaning(saved, before, failed),
+        *(
+            f"The settings of {and_list(map(str, joints))} could not be restored. {why} {_NEXT} "
+            f"{_where([saved.kept[joint].path for joint in joints])}."
+            for why, joints in by_reason((joint, str(error)) for joint, error in failed.items()).items()
+        ),
+    ]
+
+
+def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
+    """Restore what an earlier run left on servos that this one did not get to; say where that is impossible."""
+    waiting: list[tuple[Joint, str]] = []
+    for joint, kept in saved.left.items():
+        if joint in saved.kept:
+            continue
+        why = "This run ended before it could restore them."
+        if is_ours:
+            try:
+                saved.bus.confirm_later(joint)
+                if (others := recover(saved.bus.drives[joint], kept.port).others) != "":
+                    yield f"{joint.title}: {others}"
+                continue
+            except DriverError as error:
+                why = str(error)
+        waiting.append((joint, why))
+    for why, joints in by_reason(waiting).items():
+        paths = [saved.left[joint].path for joint in joints]
+        yield (
+            f"The settings that an earlier run left on {and_list(map(str, joints))} are not restored yet. {why} "
+            f"{_NEXT} {_where(paths)}."
+        )
+
+
+def _changed_delays(saved: SavedSettings, delays: Mapping[Joint, int], silent: Collection[Joint]) -> Iterator[str]:
+    """Say which Return Delay Times were changed meanwhile, by another program or a factory reset."""
+    for joint, before in delays.items():
+        now = before
+        if joint not in silent:
+            with suppress(DriverError):
+                now = saved.bus.drives[joint].read(_DELAY)
+        if now != before:
+            yield (
+                f"{joint.title}: {_DELAY} was changed during this command from {2 * before} to {2 * now} us, by "
+                "another program or a factory reset, which changes other settings too. To restore it: "
+                f"hil setup {saved.bus.port.url} --id {joint.id} --return-delay-us {2 * before}"
+            )
+
+
+def _lowered_limits(saved: SavedSettings, settings: Settings, silent: Collection[Joint]) -> Iterator[str]:
+    """Say which PWM Limits were lowered meanwhile, and which goals they keep from being restored."""
+    for joint, servo in saved.bus.drives.items():
+        before = settings.get((joint, _PWM_LIMIT))
+        if before is None or joint in silent:
+            continue
+        with suppress(DriverError):
+            now, wanted = servo.read(_PWM_LIMIT), saved.wanted[joint]
+            if now == before:
+                continue
+            reduced = [
+                f"{name} is {value}, not {wanted[name]}"
+                for name, value in saved.reduced[joint].items()
+                if name == _GOAL_PWM
+            ]
+            is_later = reduced and joint not in saved.left
+            later = "; the next start on this port then restores the goal" if is_later else ""
+            yield (
+                f"{joint.title}: {_PWM_LIMIT} was changed during this command from {before} to {now}, by another "
+                f"program or a factory reset, and is left as it is{': ' if reduced else ''}{', '.join(reduced)}. "
+                f"To change it back, use DYNAMIXEL Wizard 2.0{later}."
+            )
+
+
+def _changed_meaning(saved: SavedSettings, settings: Settings, silent: Collection[Joint]) -> Iterator[str]:
+    """Say which settings were changed meanwhile that give angles or goals another meaning: the next start takes them as
+    they are.
+    """
+    for joint, servo in saved.bus.drives.items():
+        for name in (_OFFSET, _DRIVE_MODE):
+            before = settings.get((joint, name))
+            if before is None or joint in silent:
+                continue
+            with suppress(DriverError):
+                if (now := servo.read(name)) != before and servo.read(name) == now:
+                    yield (
+                        f"{joint.title}: {name} was changed during this command from {before} to {now}, by another "
+                        f"program or a factory reset, and is left as it is. Set it back to {before} with DYNAMIXEL "
+                        "Wizard 2.0 before the next start."
+                    )
+
+
+def _where(paths: Sequence[Path]) -> str:
+    """The file that holds the settings of a servo; for several servos, their folder."""
+    return str(paths[0]) if len(paths) == 1 else f"{len(paths)} files in {paths[0].parent}"
