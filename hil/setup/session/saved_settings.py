@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, WrongModel, WrongSetting
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import attainable, holds, put_back, read_settings
+from hil.drivers.preparation.settings import attainable, holds, put_back
 from hil.drivers.servo import Servo
 from hil.errors import RunFolderError
 from hil.setup.session import settings_file
@@ -46,15 +46,13 @@ class SavedSettings:
         url = self.bus.port.url
         self.left = {joint: kept for joint in self.bus.drives if (kept := left_behind(url, joint)) is not None}
 
-    def save(self, joint: Joint, changed: dict[str, int]) -> None:
-        """Read a servo's settings and write them to disk. changed: the EEPROM registers that this session will set.
+    def save(self, joint: Joint, settings: dict[str, int], changed: dict[str, int]) -> None:
+        """Write a servo's settings to disk. changed: the EEPROM registers that this session will set.
 
         Raises DriverError.
         """
-        servo = self.bus.drives[joint]
-        settings = read_settings(servo)
         if joint in self.left:
-            self._take_over(joint, what_is_left(self.left[joint], servo, settings), changed)
+            self._take_over(joint, what_is_left(self.left[joint], self.bus.drives[joint], settings), changed)
         else:
             self._keep(joint, settings, changed)
 

@@ -18,6 +18,7 @@ from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
+from hil.drivers.preparation.settings import read_settings
 from hil.drivers.servo_model import Mode
 from hil.drivers.torque.off import and_list, signals_held_back
 from hil.setup.changed_settings import Settings, settings_now
@@ -28,6 +29,17 @@ from hil.setup.session.end_of_session import end_with, telling_of_torque
 from hil.setup.session.saved_settings import SavedSettings
 from hil.setup.session.unrestored import unrestored
 from hil.setup.unmoved import Lies, where_it_lies
+
+__all__ = [
+    "SETTINGS_NAME",
+    "Say",
+    "ServoSession",
+    "has_moved",
+    "lay_at_start",
+    "servo_session",
+    "settings_at_start",
+    "to_stderr",
+]
 
 Say = Callable[[str], None]
 
@@ -92,12 +104,13 @@ class ServoSession:
             drive: each for joint, each in zip(bus.joints, config.joints, strict=True) for drive in joint.drives
         }
         for joint, servo in bus.drives.items():
+            settings = read_settings(servo)
             self._delays[joint] = servo.read("Return Delay Time")
             changed = {"Operating Mode": int(joint.mode)}
             if joint.mode is Mode.CURRENT:
                 share = described[joint].goal_limit / len(described[joint].ids)
                 changed["Current Limit"] = current_limit_ticks(joint, share)
-            self.saved.save(joint, changed)
+            self.saved.save(joint, settings, changed)
         self.settings = settings_now(bus)
         if folder is not None:
             copies = {str(joint.id): kept.settings for joint, kept in self.saved.kept.items()}

@@ -384,9 +384,7 @@ def _raise(_: bytes) -> int:
 
 def test_what_somebody_set_since_a_kill_stays(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     config = arm(SHORT)
-    with monkeypatch.context() as gone, pytest.raises(PortLost), servo_session(config) as bus:
-        gone.setattr(bench.port, "write", _raise)
-        bus.exchange([0.0, 0.0])
+    kill(config, bench, monkeypatch)
     for servo in bench.servos.values():
         servo.write(11, bytes((4,)))
     list(check_arm(config))
@@ -444,9 +442,7 @@ def test_settings_that_do_not_read_back_as_restored_stay_on_file(
 
 def test_what_was_put_back_in_part_is_put_back_whole(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     config = arm(SHORT)
-    with monkeypatch.context() as gone, pytest.raises(PortLost), servo_session(config) as bus:
-        gone.setattr(bench.port, "write", _raise)
-        bus.exchange([0.0, 0.0])
+    kill(config, bench, monkeypatch)
     for servo in bench.servos.values():
         servo.write(11, bytes((3,)))
         servo.write(102, (7).to_bytes(2, "little"))
