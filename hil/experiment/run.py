@@ -32,7 +32,7 @@ from hil.runs.timing import lateness_histogram
 from hil.setup.changed_settings import EXPLAINED, WRITTEN, Settings, changed_settings, may_be_later, settings_now
 from hil.setup.lying import from_where_it_lies, moved_without_torque, said_of_the_rest, tolerance_now, wait_for_rest
 from hil.setup.realtime import on_time
-from hil.setup.session.end_of_session import confirmed_later
+from hil.setup.session.end_of_session import about_torque, confirmed_later
 from hil.setup.session.servo_session import REBOOT_S, has_moved, lay_at_start, servo_session, settings_at_start
 from hil.setup.unmoved import Lies, has_stirred, refuse_moved, where_it_lies
 
@@ -160,7 +160,7 @@ def _play(
         if isinstance(error, DriverError | HilError):
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):
-            error.add_note(str(bus.torque_off_report))
+            error.add_note(about_torque(bus))
             try:
                 moved = _moved_without_torque(config, bus, recorder)
             except DriverError as driven:
@@ -168,7 +168,7 @@ def _play(
             if moved:
                 error.add_note(moved)
         cause = error.__context__ if isinstance(error, TorqueNotOff) else error
-        note(f"stopped: {cause or 'end of the run.'} {bus.torque_off_report}")
+        note(f"stopped: {cause or 'end of the run.'} {about_torque(bus)}")
         if isinstance(error, TorqueNotOff):
             _try_again(bus, note)
         if (who := _who_was_silent(bus, cause)) and isinstance(cause, SafetyStop):

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, TorqueNotOff
-from hil.drivers.torque.off import signals_held_back
+from hil.drivers.torque.off import TorqueOff, signals_held_back
 from hil.errors import ExperimentError, StopRequested
 
 _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
@@ -15,11 +15,13 @@ _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the ru
 _TELLS_OF_TORQUE = re.compile("torque (off )?is", re.IGNORECASE)
 """Matches every sentence that says whether torque is off (see `TorqueOff`)."""
 
+_NEVER_ON = "Torque is off on all servos, confirmed by reading it back; this command has not switched it on."
 
-def end_with(bus: ServoBus, stopped: BaseException | None, left: Sequence[str], told: str) -> None:
+
+def end_with(bus: ServoBus, stopped: BaseException | None, left: Sequence[str], before: TorqueOff | None) -> None:
     """Add what is left to say to the exception that ended the block, or raise another one where it does not apply.
 
-    told: the sentence about torque before the settings were restored.
+    before: the report on torque before the settings were restored; None if this command had not switched torque on.
     """
     report = bus.torque_off_report
     instead: BaseException | None = None
@@ -28,7 +30,7 @@ def end_with(bus: ServoBus, stopped: BaseException | None, left: Sequence[str], 
     elif report is not None and not report.is_off:
         instead = TorqueNotOff(str(report))
         if stopped is not None:
-            _retract(stopped, told)
+            _retract(stopped, _NEVER_ON if before is None else str(before))
             instead.last_samples = getattr(stopped, "last_samples", None)
     if ended := instead or stopped:
         for line in left:  # after what stopped the arm and the state of its torque, which matter more
@@ -76,11 +78,11 @@ def telling_of_torque(bus: ServoBus) -> Iterator[None]:
         told = any(_TELLS_OF_TORQUE.search(note) for note in getattr(ended, "__notes__", []))
         if not told and (is_stop or bus.torque_off_report is not None):
             with signals_held_back():
-                ended.add_note(_about_torque(bus))
+                ended.add_note(about_torque(bus))
         raise
 
 
-def _about_torque(bus: ServoBus) -> str:
+def about_torque(bus: ServoBus) -> str:
     """A sentence about the servos' torque while no run is in progress."""
     if bus.torque_off_report is not None:
         return str(bus.torque_off_report)
@@ -90,4 +92,4 @@ def _about_torque(bus: ServoBus) -> str:
         return f"This command has not switched torque on; whether it is off could not be read: {error}"
     if on:
         return f"TORQUE IS ON at {' and '.join(on)}: it was on before this command."
-    return "Torque is off on all servos, confirmed by reading it back; this command has not switched it on."
+    return _NEVER_ON

@@ -227,10 +227,10 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             raise
         finally:
             _outermost.reset(token)
-            told = str(bus.torque_off_report)
+            before = bus.torque_off_report
             with signals_held_back():
                 left = session.end()
-            end_with(bus, stopped, left, told)
+            end_with(bus, stopped, left, before)
 
 
 def has_moved() -> bool:

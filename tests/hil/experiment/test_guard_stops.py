@@ -279,9 +279,15 @@ def test_a_joint_that_turns_before_torque_comes_on_is_refused(
     """Its horn slips, or another servo answers: every angle would be off, by less than the rest pose's tolerance."""
     monkeypatch.setattr(where, after, lambda *_: fault(ports, FaultKind.ENCODER_JUMP, servo=2, amount=60))
     config = arm()
-    with pytest.raises(ExperimentError, match=r"'elbow'.* has turned by \+0\.092 rad since .* before torque was"):
-        run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
+    made = RunFolder.create(tmp_path / "run", config)
+    said = r"'elbow'.* has turned by \+0\.092 rad since .* before torque was"
+    with pytest.raises(ExperimentError, match=said) as stop:
+        run_experiment(config, made, config.path, lambda _: None, plan)
     assert_stopped(ports[0])
+    off = "Torque is off on all servos, confirmed by reading it back; this command has not switched it on."
+    notes = getattr(stop.value, "__notes__", [])
+    assert notes == ([off] if where is run else []), "once everything was ready to switch it on"
+    assert "None" not in (made.path / "events.jsonl").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("holds", [False, True], ids=["free", "with a stabiliser"])

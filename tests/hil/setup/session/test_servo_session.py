@@ -26,6 +26,7 @@ from hil.fakes.bus.faults import Fault
 from hil.fakes.servo.servo import EmulatedServo
 from hil.runs.run_folder import RunFolder
 from hil.setup.preflight import Finding, Level, check_arm
+from hil.setup.session.end_of_session import about_torque
 from hil.setup.session.saved_settings import SavedSettings
 from hil.setup.session.servo_session import COUNT_DOWN_S, SETTINGS_NAME, servo_session
 from hil.setup.session.settings_file import settings_path
@@ -351,6 +352,19 @@ def test_torque_that_another_program_keeps_switching_on_is_said_in_capitals(
     assert "CUT THE SUPPLY NOW" in said and "Torque is off on joint 'shoulder' (ID 1" in said
     assert "both servos" not in "\n".join((said, *getattr(stop, "__notes__", ())))
     assert ("It swings." in said) is (stop is not None)
+
+
+def test_torque_that_another_program_keeps_switching_on_before_a_run_is_not_said_to_be_off(
+    arm: Arm, bench: Bench
+) -> None:
+    stop = ExperimentError("The elbow has turned.")
+    with pytest.raises(TorqueNotOff) as ended, servo_session(arm(SHORT)) as bus:
+        stop.add_note(about_torque(bus))
+        drive_again(bench, 0, 1_000_000)
+        raise stop
+    said = message(ended.value)
+    assert said.startswith("hil: TORQUE IS ON AT JOINT 'ELBOW'") and "The elbow has turned." in said
+    assert "Torque is off on all servos" not in said and stop.__notes__ == []
 
 
 def test_a_killed_run_is_put_back_by_the_next_one_and_by_check(
