@@ -1,0 +1,200 @@
+"""What a killed program left is restored by the next one, and what was changed since stays."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from hil.config.schema import Config, load_config
+from hil.drivers.bus import ServoBus
+from hil.drivers.errors import PortLost, TorqueNotOff, WrongSetting
+from hil.fakes.bus.faults import Fault
+from hil.fakes.servo.servo import EmulatedServo
+from hil.setup.preflight import Level, check_arm
+from hil.setup.session.servo_session import servo_session
+from hil.setup.session.settings_file import settings_path
+from tests.support.bench import SHORT, Arm, Bench, play
+from tests.support.command_line import hil
+
+
+def test_settings_that_a_killed_program_left_are_restored_up_to_a_limit_lowered_since(
+    arm: Arm, bench: Bench, state_folder: Path
+) -> None:
+    config = arm(SHORT)
+    joint = config.bus.joints[1]
+    with servo_session(config):
+        bench.servos[2].write(36, (300).to_bytes(2, "little"))
+        kept = settings_path(config.url, joint.id, joint.servo.name)
+        left = kept.read_text(encoding="utf-8")
+        bench.servos[2].write(36, (885).to_bytes(2, "little"))
+    bench.servos[2].write(36, (300).to_bytes(2, "little"))
+    kept.write_text(left, encoding="utf-8")
+    list(check_arm(config))
+    assert not kept.exists() and bench.servos[2].value("Goal PWM") == 300
+
+
+class _Gone(BaseException):
+    """Simulates the end of the program."""
+
+
+def test_a_killed_run_is_put_back_by_the_next_one_and_by_check(
+    arm: Arm, tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = arm(SHORT)
+
+    def kill() -> None:
+        with pytest.raises(TorqueNotOff), servo_session(config) as bus, bus.torque(0.1):
+            write = bench.port.write
+            monkeypatch.setattr(bench.port, "write", _raise)  # nothing leaves a killed program
+            bench.port.clock.wait_until(bench.port.clock.now() + 1.0)
+            raise _Gone
+        monkeypatch.setattr(bench.port, "write", write)
+        bench.port.close()
+
+    kill()
+    assert bench.changed(), "mode and torque are as the killed run left them"
+    play(config, tmp_path / "next")
+    assert "earlier run" in capsys.readouterr().err
+    assert bench.changed() == []
+    kill()
+    levels = [finding.level for finding in check_arm(config)]
+    assert Level.STOP not in levels
+    assert bench.changed() == []
+
+
+def _raise(_: bytes) -> int:
+    raise serial.SerialException("no such program")
+
+
+def test_what_somebody_set_since_a_kill_stays(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = arm(SHORT)
+    kill(config, bench, monkeypatch)
+    for servo in bench.servos.values():
+        servo.write(11, bytes((4,)))
+    list(check_arm(config))
+    assert [servo.operating_mode for servo in bench.servos.values()] == [4, 4]
+
+
+def test_what_was_put_back_in_part_is_put_back_whole(arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = arm(SHORT)
+    kill(config, bench, monkeypatch)
+    for servo in bench.servos.values():
+        servo.write(11, bytes((3,)))
+        servo.write(102, (7).to_bytes(2, "little"))
+    list(check_arm(config))
+    assert bench.changed() == []
+
+
+LOWERED = 60
+"""A Current Limit that is too low for the arm [ticks]."""
+
+
+def kill(config: Config, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as gone, pytest.raises(PortLost), servo_session(config) as bus:
+        gone.setattr(bench.port, "write", _raise)  # nothing leaves a killed program
+        bus.exchange([0.0, 0.0])
+    monkeypatch.setattr(bench.port, "write", type(bench.port).write.__get__(bench.port))
+    bench.port.close()
+
+
+def lower(servo: EmulatedServo, limit: int) -> None:
+    servo.write(38, limit.to_bytes(2, "little"))
+    assert servo.value("Current Limit") == limit
+
+
+def test_a_current_limit_that_another_program_lowered_before_a_kill_stays_on_file_until_it_is_restored(
+    arm: Arm, tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path
+) -> None:
+    config = arm(SHORT)
+    kill(config, bench, monkeypatch)
+    lower(bench.servos[2], LOWERED)
+    for number in range(3):
+        said: list[str] = []
+        with (
+            pytest.raises(WrongSetting, match="Current Limit is 60, but") as refused,
+            servo_session(config, say=said.append),
+        ):
+            play(config, tmp_path / str(number))
+        assert not hasattr(refused.value, "__notes__"), "nothing is promised"
+        assert f"ts Current Limit is {LOWERED} and was 1193 before the run of" in said[-1]
+        assert ("this one will" in said[-1]) is (number == 0), "all the rest is restored once"
+        assert bench.changed() == [f"Current Limit of 2: 1193 -> {LOWERED}", f"Goal Current of 2: 1193 -> {LOWERED}"]
+    (found,) = (each for each in check_arm(config) if each.what == "settings from an earlier run")
+    assert found.level is Level.WARNING and "was 1193 before the run of" in found.fix
+    lower(bench.servos[2], 1193)
+    with servo_session(config):
+        pass
+    assert bench.changed() == [] and list(state_folder.glob("*.json")) == []
+
+
+def test_a_current_limit_that_another_program_lowered_and_that_suffices_is_the_servos_own(
+    arm: Arm, tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path
+) -> None:
+    config = arm(SHORT)
+    kill(config, bench, monkeypatch)
+    lower(bench.servos[2], 900)
+    said: list[str] = []
+    with servo_session(config, say=said.append):
+        play(config, tmp_path / "next")
+    assert "Its Current Limit is 900 and was 1193" in said[-1]
+    assert bench.changed() == ["Current Limit of 2: 1193 -> 900", "Goal Current of 2: 1193 -> 900"]
+    assert list(state_folder.glob("*.json")) == []
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_start_that_is_stopped_before_it_reaches_a_servo_restores_it_too_or_says_so(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path, answers: bool
+) -> None:
+    config = arm(SHORT)
+    kill(config, bench, monkeypatch)
+
+    def stop(said: str) -> None:
+        assert "'shoulder'" in said
+        if not answers:
+            bench.port.bus.faults.add(Fault(kind="silent_servo", servo=2, at=0.0))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as stopped, servo_session(config, say=stop):
+        pass
+    waiting = [each.name for each in state_folder.glob("*.json")]
+    if answers:
+        assert bench.changed() == [] and waiting == []
+        return
+    assert len(waiting) == 1 and {each.split(" of ")[1][0] for each in bench.changed()} == {"2"}
+    (told,) = (note for note in stopped.value.__notes__ if "are not restored yet" in note)
+    assert "left on joint 'elbow' (ID 2, XM430-W350)" in told and told.endswith(f"{waiting[0]}.")
+
+
+def test_a_killed_process_on_a_pty_is_put_back(arm_file: Any, tmp_path: Path) -> None:
+    """Two programs, a real SIGKILL between them, and the fake arm in a third process."""
+    path = arm_file()
+    link = tmp_path / "arm"
+    served = subprocess.Popen(
+        [sys.executable, "-m", "hil", "fake", str(path), "--pty", "--link", str(link), "--quiet"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert served.stdout is not None and served.stdout.readline()
+        real = path.with_name("real.toml")
+        real.write_text(path.read_text().split("\n[fake]\n")[0].replace('"fake://"', f'"{link}"'))
+        config = load_config(real)
+        code = (
+            "import os, signal, sys; from pathlib import Path; from hil.config.schema import load_config;"
+            "from hil.setup.session.servo_session import servo_session\n"
+            "with servo_session(load_config(Path(sys.argv[1]))): os.kill(os.getpid(), signal.SIGKILL)"
+        )
+        killed = subprocess.run([sys.executable, "-c", code, str(real)], check=False, env=dict(os.environ))
+        assert killed.returncode == -9
+        with ServoBus.connect(config.bus) as bus:
+            assert [bus.servo(joint).read("Operating Mode") for joint in bus.joints] == [0, 0]
+        assert hil("check", real) in (0, 1)
+        with ServoBus.connect(config.bus) as bus:
+            assert [bus.servo(joint).read("Operating Mode") for joint in bus.joints] == [3, 3]
+    finally:
+        served.terminate()
+        served.wait()
