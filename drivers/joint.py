@@ -72,6 +72,10 @@ class Joint:
             return self.direction * self.servo.current_unit
         return self.direction * supply_voltage / FULL_PWM_TICKS
 
+    def current_limit_ticks(self, limit: float) -> int:
+        """The smallest Current Limit [ticks] with which a servo of this joint accepts every goal up to `limit` [A]."""
+        return math.ceil(limit / abs(self.drive_unit(0.0)) - 1e-9)
+
     def angle(self, position_ticks: int) -> float:
         """Return the joint angle [rad] for a value of Present Position [ticks]."""
         return (position_ticks - self.zero_ticks) * self.position_unit

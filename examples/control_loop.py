@@ -16,7 +16,7 @@ from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.guard import Guard
 from hil.experiment.run import run_experiment
 from hil.runs.run_folder import RunFolder
-from hil.setup.servo_session import servo_session
+from hil.setup.session.servo_session import servo_session
 
 Array = NDArray[np.float64]
 MOST_JOINTS = 2

@@ -11,7 +11,6 @@ from hil.drivers.bus import ServoBus
 from hil.drivers.errors import WrongSetting
 from hil.drivers.joint import Joint
 from hil.drivers.servo_model import FULL_PWM_TICKS, VOLTAGE_UNIT, Mode
-from hil.setup.session.current_limit import current_limit_ticks
 
 
 @contextmanager
@@ -29,7 +28,7 @@ def servo_limits(config: Config, bus: ServoBus, note: Callable[[str], None]) -> 
 
 def _lower(config: Config, bus: ServoBus, joint: Joint, limit: float, note: Callable[[str], None]) -> None:
     servos = bus.servos(joint)
-    needed = current_limit_ticks(joint, limit / len(servos))  # they share the goal
+    needed = joint.current_limit_ticks(limit / len(servos))  # they share the goal
     for servo in servos:
         present = servo.read("Current Limit")
         if present < needed:

@@ -24,7 +24,6 @@ from hil.drivers.torque.off import and_list, signals_held_back
 from hil.setup.changed_settings import Settings, settings_now
 from hil.setup.others import others_on_the_bus
 from hil.setup.session import settings_file
-from hil.setup.session.current_limit import current_limit_ticks
 from hil.setup.session.end_of_session import end_with, telling_of_torque
 from hil.setup.session.saved_settings import SavedSettings
 from hil.setup.session.unrestored import unrestored
@@ -109,7 +108,7 @@ class ServoSession:
             changed = {"Operating Mode": int(joint.mode)}
             if joint.mode is Mode.CURRENT:
                 share = described[joint].goal_limit / len(described[joint].ids)
-                changed["Current Limit"] = current_limit_ticks(joint, share)
+                changed["Current Limit"] = joint.current_limit_ticks(share)
             self.saved.save(joint, settings, changed)
         self.settings = settings_now(bus)
         if folder is not None:
