@@ -26,7 +26,7 @@ from hil.fakes.remote_hand import HandSocket
 __all__ = ["Counts", "LinkError", "PtyServer", "ServerClock"]
 
 OVERRUN_S = 1e-3
-"""A reply delivered later than this after it was due counts as a real-time overrun [s]."""
+"""A reply delivered more than this long after it was due counts as a real-time overrun [s]."""
 
 TOO_SLOW_S = 5e-3
 """If simulating the arm takes this much longer than the simulated time, twice in a row, the excess is not simulated

@@ -35,7 +35,7 @@ def rest_pose_hint(position: float, rest: float, tolerance: float, zero_ticks: i
         else "If direction or id is that of another joint, correct it first. "
     )
     return (
-        "Move it there by hand: friction may hold it away from rest, or it has fallen since an earlier run. If this "
-        "configuration has run before, direction and zero_ticks were right then: leave them as they are. "
+        "Move it there by hand: friction may be holding it away from its rest pose, or it may have fallen since an "
+        "earlier run. If this configuration has run before, direction and zero_ticks were right then: leave them as they are. "
         f"{mirrored}Only if it is in its rest pose now, set zero_ticks = {zero_ticks}."
     )

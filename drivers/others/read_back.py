@@ -117,7 +117,7 @@ class ReadBack:
         """Indices of the latest read-backs that found an older goal of this program, by servo."""
         self.doubts_until = -math.inf
         self.sighted: Overruled | None = None
-        """The latest value read back that this program did not write; it is recent until `doubts_until`."""
+        """The latest value read back that this program did not write; it is treated as recent until `doubts_until`."""
 
     @property
     def read(self) -> GroupRead:

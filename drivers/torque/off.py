@@ -109,8 +109,8 @@ class TorqueOff:
         if not self.driven:
             return self._outcome_alone()
         told = [
-            f"TORQUE IS ON AT {and_list(str(joint).upper() for joint in self.driven)}: ANOTHER PROGRAM SWITCHES IT ON "
-            "AS OFTEN AS IT IS CUT. CUT THE SUPPLY NOW, then end that program."
+            f"TORQUE IS ON AT {and_list(str(joint).upper() for joint in self.driven)}: ANOTHER PROGRAM TURNS IT BACK "
+            "ON EVERY TIME IT IS CUT. CUT THE SUPPLY NOW, then end that program."
         ]
         if self.unconfirmed:
             told.append(self._outcome_alone())

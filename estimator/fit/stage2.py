@@ -313,10 +313,10 @@ def _tempered(
 ) -> Minimum:
     """Return the minimum with priors reweighted by the data's actual information, or `minimum` if that is the same.
 
-    The sum of squares takes the errors of all samples as independent. Under a model error, which repeats at every
-    reversal, the data determine a parameter much less well, as its standard error shows, and the error would override
-    any prior: a torque constant of half the smallest plausible value, encoder errors of several degrees. Therefore each
-    prior's precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
+    The sum of squares treats the errors of all samples as independent. A model error repeats at every reversal, so the
+    data constrain a parameter far less than that implies, as its standard error shows, and the fit would override any
+    prior, giving for example a torque constant of half the smallest plausible value. Therefore each prior's precision
+    is multiplied by the factor by which the data's variance exceeds that of independent errors.
     """
     count, prior = objective.count, objective.prior
     if objective.lever is None and not prior.precision.any():

@@ -127,7 +127,7 @@ class Term:
     spread: Scale | float | None = None
     """Typical deviation from its `absent` value among real arms, as a scale or a number [unit]; None if unknown."""
     log_spread: float | None = None
-    """Standard deviation of a positive term's logarithm from the logarithm of `initial`; None if unknown."""
+    """Standard deviation of a positive term's logarithm about the logarithm of `initial`; None if unknown."""
 
     @property
     def of_torque(self) -> bool:

@@ -39,7 +39,7 @@ class Drift:
     std: Array
     """Standard error of the change (joints,)."""
     seconds: float
-    """Time between the middles of the periods that are compared [s]."""
+    """Time between the midpoints of the periods that are compared [s]."""
     left: float = np.inf
     """Sum of squares of the residual that the change does not explain, in units of the noise."""
 

@@ -176,7 +176,7 @@ def _solve(A: Any, b: Any, x: Any) -> None:
 
 
 def _stick(A: Any, b: Any, dry: Any, x: Any) -> None:
-    """Compute the velocities when each joint's friction may take any impulse up to `dry` [N m s], into `x`.
+    """Compute the velocities `x` if each joint's friction can exert any impulse up to `dry` [N m s].
 
     They minimise x'Ax/2 - b'x + dry'|x|, which is convex, so solving for one joint at a time converges.
     """

@@ -17,7 +17,7 @@ PRESENT_END = 147
 
 STATE_START = 126
 STATE_END = 136
-"""Address after the block Present Current, Velocity and Position, which begins at `STATE_START`."""
+"""First address after the block of Present Current, Velocity and Position, which begins at `STATE_START`."""
 
 _TICKS_PER_RAD = TICKS_PER_TURN / math.tau
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM

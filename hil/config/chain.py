@@ -24,7 +24,7 @@ POSITION_RESERVE = 0.08
 """Fraction of a joint's position_limit that a designed path leaves free at either end."""
 
 DEFAULT_BAND = (0.1, 1.5)
-"""Default band of a spatial arm's pilot [Hz]."""
+"""Default frequency band of the excitation in a spatial arm's pilot [Hz]."""
 
 _MOST_TURNED_RAD = 4.5 * math.pi
 _SAME_GRAVITY = 0.1  # m/s^2

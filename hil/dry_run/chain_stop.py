@@ -218,7 +218,7 @@ def _lowered(
 
 
 def _needed(arms: ChainArms, pose: Array) -> Array:
-    """Torque with which each joint moves slowly in this pose, of the arm that needs most (joints,) [N m]."""
+    """Torque needed to move each joint slowly in this pose, for the arm that needs the most (joints,) [N m]."""
     each = (np.abs(weights(arms, pose)) + arms.drive[:, COULOMB]) / arms.drive[:, SCALE]
     most: Array = each.max(axis=0)
     return most

@@ -131,9 +131,9 @@ the measurements [rad].
 """
 
 _STEPS = np.dtype([("square", "f8"), ("age", "f8"), ("since", "f8"), ("count", "f8")])
-"""Jumps of a position.
+"""Jumps in the readings of a position.
 
-square: mean square of the usual differences [rad^2]. age: time since the beginning [s]. count: number of jumps in quick
+square: mean square of the ordinary differences [rad^2]. age: time since the start [s]. count: number of jumps in quick
 succession. since: time since the latest one [s].
 """
 

@@ -156,7 +156,7 @@ def _matched(rng: np.random.Generator, samples: int, count: int) -> Array:
 def _physical(
     source: Source, names: tuple[str, ...], mean: Array, covariance: Array, values: Array, rng: np.random.Generator
 ) -> tuple[Array, int]:
-    """Replace draws with negative inertia or friction or without physical masses; return the draws and the number
+    """Redraw every draw that has negative inertia or friction or no physical masses; return the draws and how many were
     replaced.
     """
     root, redrawn = _root(covariance), 0

@@ -21,7 +21,7 @@ def export_csv(source: Recorded, path: Path) -> list[str]:
     writer.writerows(zip(*(column.tolist() for column in table.values()), strict=True))
     write_text(path, text.getvalue())
     return [
-        "the identified parameters (a CSV is one table; export toml or json for them)",
+        "the identified parameters (a CSV file holds a single table; export them to TOML or JSON)",
         "units (SI, temperature in degrees C)",
     ]
 

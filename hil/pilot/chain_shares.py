@@ -182,7 +182,7 @@ class SafeShares:
         return self._rescaled(former)
 
     def _rescaled(self, former: Paths) -> float:
-        """Convert the shares of the former paths to those of the present ones; return the ratio of their amplitudes."""
+        """Convert the shares from the old paths to the new ones; return the ratio of their amplitudes."""
         times = self.paths.amplitude_over(former)
         self.last = self.last / times
         self.cap = min(self.cap / times, 1.0) if self.cap < 1.0 else 1.0

@@ -282,8 +282,9 @@ def _run_loop(  # noqa: PLR0912
 ) -> bool:
     """Simulate the samples of `torque` (samples, steps, joints) from `state` (2, joints); return False if it diverges.
 
-    The results are written to `position` (samples, joints) and, unless there are no causes, `derivative` (samples,
-    joints, causes). A step in which a joint may come near standstill is divided into up to `finer` smaller ones.
+    The results are written to `position` (samples, joints) and, if derivatives are requested, `derivative`
+    (samples, joints, causes). A step in which a joint may come close to standstill is divided into up to `finer`
+    smaller ones.
 
     The rows of `z` are the derivatives of angles and velocities, the direct derivatives of a stage's equation, and,
     from row `first` on, the derivatives of the first stage's accelerations; `dl` holds those of the second stage's.

@@ -163,7 +163,7 @@ def _spikes(joint: _Joint) -> list[str]:
 def _departs(time: Array, values: Array, doubtful: Mask, least: float) -> Mask:
     """Return which `doubtful` samples (samples,) differ by more than `least` from the cubic through their neighbours.
 
-    Where a motion turns, its samples are beyond those before and after, but on the same smooth curve.
+    At a reversal, samples lie beyond their neighbours but still on the same smooth curve.
     """
     departs = np.zeros_like(doubtful)
     sound = np.flatnonzero(~doubtful)
