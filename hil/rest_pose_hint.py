@@ -36,6 +36,7 @@ def rest_pose_hint(position: float, rest: float, tolerance: float, zero_ticks: i
     )
     return (
         "Move it there by hand: friction may be holding it away from its rest pose, or it may have fallen since an "
-        "earlier run. If this configuration has run before, direction and zero_ticks were right then: leave them as they are. "
+        "earlier run. If this configuration has run before, direction and zero_ticks were right then: leave them as "
+        "they are. "
         f"{mirrored}Only if it is in its rest pose now, set zero_ticks = {zero_ticks}."
     )

@@ -14,7 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.fault_campaign.attack import Kind, Request, blocks_in, field_of, goals_in, request_among, request_in
+from benchmarks.fault_campaign.attack import (
+    Attack,
+    Kind,
+    Request,
+    blocks_in,
+    field_of,
+    goals_in,
+    request_among,
+    request_in,
+)
 from benchmarks.fault_campaign.draw import HARMLESS, SHIFTED, UNHEARD, WORDS, Drawn, causes_of
 from benchmarks.fault_campaign.middle import Traffic
 from benchmarks.fault_campaign.twin import Heard, has_healthy_twin
@@ -117,7 +126,7 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     bound = BOUND_MS
     if set(drawn.kinds) & UNHEARD:
         bound = max(bound, 1e3 * config.safety.watchdog + TRIP_MS)
-    again = [attack.start for attack in drawn.attacks if attack.kind == Kind.MODE_TAKEN]
+    again = [acts_at(attack, drawn.attacks) for attack in drawn.attacks if attack.kind == Kind.MODE_TAKEN]
     since = since_again(time[driven], since, again)
     late_ms, unseen = _flowed_ms(time[driven], since), False
     plain = min([when for what, when in reasons if not what.endswith(TO_BE_SEEN)], default=np.inf)
@@ -174,6 +183,12 @@ def received(config: Config, story: Story) -> Heard:
     """What the program received in a run, and what it commanded."""
     told = Told(config, story.traffic, 0.0)
     return Heard.of(config, told.heard, told.sent)
+
+
+def acts_at(attack: Attack, attacks: Sequence[Attack]) -> float:
+    """When an attack acts [s]: in virtual time, one during a stop of the program acts once the program goes on."""
+    stops = [each for each in attacks if each.kind in (Kind.STALL, Kind.SUSPENDED) and each.start <= attack.start]
+    return max([attack.start, *(each.start + each.amount for each in stops)])
 
 
 def since_again(driven: NDArray[np.float64], since: float, again: list[float]) -> float:

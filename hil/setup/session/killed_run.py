@@ -70,7 +70,9 @@ class Left:
 
 
 def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
-    """Compare the settings saved before a program was killed with the present ones. Raises the same errors as `Servo.read`.
+    """Compare the settings saved before a program was killed with the present ones.
+
+    Raises the same errors as `Servo.read`.
 
     If another program changed the Operating Mode, the present goals and gains belong to the new mode and are left as
     they are.

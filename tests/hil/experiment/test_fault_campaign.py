@@ -11,7 +11,7 @@ from benchmarks.fault_campaign.arms import MIXED, RATES, Setting, names, setting
 from benchmarks.fault_campaign.attack import Attack, Kind
 from benchmarks.fault_campaign.campaign import Outcome, inject_drawn, prepare
 from benchmarks.fault_campaign.draw import Drawn
-from benchmarks.fault_campaign.judge import judge_words, received, since_again
+from benchmarks.fault_campaign.judge import acts_at, judge_words, received, since_again
 from benchmarks.fault_campaign.twin import has_healthy_twin
 from benchmarks.fault_campaign.witness import CURRENT_MODE, PWM_MODE, Witness
 from benchmarks.faults import campaign, figures
@@ -165,3 +165,10 @@ def test_torque_that_another_program_switches_on_is_a_new_reason(
 ) -> None:
     driven = np.concatenate((np.arange(0.5, ended, 1e-3), np.arange(again + later, again + later + 0.05, 1e-3)))
     assert since_again(driven, 1.0, [again]) == pytest.approx(since)
+
+
+@pytest.mark.parametrize(("start", "acts"), [(0.9, 0.9), (1.1, 1.5), (1.6, 1.6)])
+def test_an_attack_during_a_stop_of_the_program_acts_when_it_goes_on(start: float, acts: float) -> None:
+    stop = Attack(Kind.SUSPENDED, 1.0, 1.0, amount=0.5)
+    taken = Attack(Kind.MODE_TAKEN, start, start)
+    assert acts_at(taken, (stop, taken)) == pytest.approx(acts)
