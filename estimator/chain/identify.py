@@ -49,8 +49,6 @@ class ChainEstimate(FittedParameters):
     """Parameters of a spatial arm estimated from settled periods; see also `hil.estimator.identify.Estimate`."""
 
     model: ChainModel
-    linear_value: Array
-    """Result of stage 1, in the order of `ChainModel.linear_names`."""
     start: Array
     """Angles and velocities at the first sample (2, joints) [rad, rad/s]."""
     position: Array
@@ -59,7 +57,6 @@ class ChainEstimate(FittedParameters):
     """One-step-ahead prediction of each period (joints, samples) [rad]."""
     iterations: int
     outliers: int
-    white_std: Array
     correlation_time: float
     systematic: float
     """Median ratio of the base parameters' standard errors to those under white noise: how far model errors exceed
@@ -133,13 +130,11 @@ def identify_chain(
         residual=np.where(used[0].valid, used[0].position - fit.positions[0], np.nan),
         position_step=used[0].position_step,
         model=model,
-        linear_value=linear.value,
         start=fit.starts[0],
         position=fit.positions[0],
         positions=fit.positions,
         iterations=fit.iterations,
         outliers=fit.outliers + spikes,
-        white_std=np.sqrt(np.diag(fit.white_covariance)),
         correlation_time=fit.correlation_time,
         systematic=systematic,
         softness=fit.softness,

@@ -100,11 +100,6 @@ def design_problem(config: Config, physics: Physics, names: tuple[str, ...]) -> 
     return DesignProblem(smoothed(physics), names, limits, np.array(config.arm.rest_pose), step, feedback_of(config))
 
 
-def _plain_segment(config: Config, seed: int) -> Segment:
-    experiment = config.experiment.model_copy(update={"seed": seed, "held_out": False})
-    return with_peaks(config.model_copy(update={"experiment": experiment}), _torque_limits(config)).segments[0]
-
-
 def _with_wave(config: Config, segment: Segment, wave: Multisine) -> Segment:
     return replace(segment, multisine=wave, period_current=period_current(config, wave))
 

@@ -147,7 +147,7 @@ def _play(
         with on_time(bus.port.clock) as granted:
             bus.refuse_switched_on()  # rather than blame the motion that this causes on a hand or a horn
             settings = _check_unchanged(bus)
-            refuse_moved(lay, where_it_lies(bus))
+            refuse_moved(lay, where_it_lies(bus), bus)
             stream.begins_at(bus.read_positions())
             with bus.torque(config.safety.watchdog):
                 if granted:
@@ -285,7 +285,7 @@ def _wait_for_rest(config: Config, bus: ServoBus) -> Lies:
     bus.refuse_switched_on()
     lay, lies = lay_at_start(), where_it_lies(bus)
     try:
-        refuse_moved(lay, lies)
+        refuse_moved(lay, lies, bus)
     except ExperimentError:
         _check_unchanged(bus)  # which names another program that shifted the angles
         if config.is_chain and not wait_for_rest(bus):

@@ -25,12 +25,12 @@ from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths, chain_config
 from hil.pilot.chain_shares import PILOT_SHARES, SHARES, Found, SafeShares, step_config
 from hil.pilot.punctual import punctual
-from hil.pilot.steps import Say, Step, tells_of_the_arm
+from hil.pilot.steps import Step, tells_of_the_arm
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 from hil.setup.lying import from_where_it_lies, said_of_the_rest, wait_for_rest
-from hil.setup.session.servo_session import servo_session
+from hil.setup.session.servo_session import Say, servo_session
 
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7

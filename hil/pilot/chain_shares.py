@@ -19,10 +19,10 @@ from hil.errors import NoSafeTorque
 from hil.estimator.progress import Tell
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths
-from hil.pilot.steps import Say
 from hil.plan.chain_model import limit_names
 from hil.plan.chain_plan import NoHeadroom
 from hil.plan.plan import Plan
+from hil.setup.session.servo_session import Say
 
 Array = NDArray[np.float64]
 

@@ -15,11 +15,11 @@ from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Watch
 from hil.pilot.chain_search import identify_chain_in_steps
 from hil.pilot.search import Search, with_torque
-from hil.pilot.steps import Played, Player, Say
+from hil.pilot.steps import Played, Player
 from hil.plan.plan import ROLES
 from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
-from hil.setup.session.servo_session import servo_session
+from hil.setup.session.servo_session import Say, servo_session
 
 Array = NDArray[np.float64]
 

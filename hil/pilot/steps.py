@@ -1,6 +1,5 @@
 """One intermediate run: its execution, the comparison with its prediction, and the report."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,9 +20,9 @@ from hil.pilot.supply import delivered_speed
 from hil.results.parts import PlayedStep
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
+from hil.setup.session.servo_session import Say
 
 Array = NDArray[np.float64]
-Say = Callable[[str], None]
 
 _AT_A_LIMIT = (Cause.POSITION, Cause.VELOCITY, Cause.OUT_OF_VOLTAGE)
 

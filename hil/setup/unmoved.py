@@ -33,11 +33,22 @@ def has_stirred(before: Lies, now: Lies) -> bool:
     return any(abs(_turned(drive, before, now)) > STIRRED_RAD for drive in now)
 
 
-def refuse_moved(before: Lies, now: Lies) -> None:
-    """Raise ExperimentError if a joint has moved by more than MOST_RAD between two readings."""
+def refuse_moved(before: Lies, now: Lies, bus: ServoBus) -> None:
+    """Raise ExperimentError if a joint has moved by more than MOST_RAD between two readings.
+
+    Such a joint is read again, because a reply to an earlier request is not its angle. Raises the same errors as
+    `Servo.read`.
+    """
     for drive in now:
         turned = _turned(drive, before, now)
         if abs(turned) > MOST_RAD:
+            again = _turned(drive, before, {drive: bus.drives[drive].read("Present Position")})
+            if abs(again) <= MOST_RAD:
+                raise ExperimentError(
+                    f"{drive.title} reported an angle {turned:+.3f} rad from the first one, and {again:+.3f} rad when "
+                    "it was read again: its replies come one request late, or it was moved and is back. Unplug the "
+                    "adapter, plug it in and start again; if this recurs, replace the adapter or its cable."
+                )
             raise ExperimentError(
                 f"{drive.title} has turned by {turned:+.3f} rad since this command first read its angle, before "
                 f"torque was switched on; at most {MOST_RAD} is allowed. Let the arm come to rest, then start "

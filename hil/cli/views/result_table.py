@@ -11,7 +11,6 @@ from hil.config.schema import Config
 from hil.estimation.physical import physical_lines
 from hil.estimation.torque_constants import by_voltage_said, torque_constants_said
 from hil.estimation.truth import Truth, truth_of
-from hil.estimator.models.terms import TERMS, kind_of, term_of
 from hil.next_step import command, next_step
 from hil.printing import print_fitting, say
 from hil.results.parts import Quantity
@@ -95,27 +94,6 @@ def _parameters(result: SettledResult, truth: Truth) -> Table:
         table.add_row(escape(name), escape(entry.unit), f"{entry.value:.5g}", f"{entry.std:.1e}")
     table.add_row()
     return table
-
-
-def _undetermined(result: SettledResult) -> list[str]:
-    """Name the values that this motion hardly determines, so that nobody mistakes them for measured ones."""
-    known = {**result.parameters, **result.extra}
-    names = [
-        name
-        for name, entry in known.items()
-        if not math.isfinite(entry.std) or (name in result.extra and _may_be_absent(name, entry))
-    ]
-    if not names:
-        return []
-    return [f"Not determined by this motion (effect within one standard error of zero): {', '.join(names)}."]
-
-
-def _may_be_absent(name: str, entry: Quantity) -> bool:
-    """Whether a term is within one standard error of having no effect."""
-    kind = kind_of(name)
-    if kind == "stribeck_velocity":  # a term without effect has no Stribeck velocity
-        return entry.std > abs(entry.value)
-    return kind in TERMS and not abs(entry.value - term_of(name).absent) > entry.std
 
 
 def _numbers(name: str, entry: Quantity, truth: Truth) -> list[str]:
