@@ -248,7 +248,7 @@ def _check_unchanged(bus: ServoBus) -> Settings:
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, modes_seen_ago: float) -> None:
     """Name settings that another program changed; read only once torque is off, because reading takes time.
 
-    A change that can explain a stop is named before it, any other one, and one that may be later, after it.
+    A change that can explain a stop is named before it; all others, including one that may have come later, after it.
     """
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return

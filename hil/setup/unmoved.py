@@ -36,14 +36,14 @@ def has_stirred(before: Lies, now: Lies) -> bool:
 def refuse_moved(before: Lies, now: Lies, bus: ServoBus) -> None:
     """Raise ExperimentError if a joint has moved by more than MOST_RAD between two readings.
 
-    Such a joint is read again, because a reply to an earlier request is not its angle. Raises the same errors as
-    `Servo.read`.
+    Such a joint is read again, because a reply to an earlier request is not its angle: the two readings then differ by
+    more than an arm can turn in between. Raises the same errors as `Servo.read`.
     """
     for drive in now:
         turned = _turned(drive, before, now)
         if abs(turned) > MOST_RAD:
             again = _turned(drive, before, {drive: bus.drives[drive].read("Present Position")})
-            if abs(again) <= MOST_RAD:
+            if abs(again) <= MOST_RAD < abs(turned - again):
                 raise ExperimentError(
                     f"{drive.title} reported an angle {turned:+.3f} rad from the first one, and {again:+.3f} rad when "
                     "it was read again: its replies come one request late, or it was moved and is back. Unplug the "

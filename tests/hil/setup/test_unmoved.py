@@ -39,3 +39,8 @@ def test_a_reply_to_an_earlier_request_is_not_blamed_on_a_hand() -> None:
     with pytest.raises(ExperimentError, match="replies come one request late") as refused:
         refuse_moved({ELBOW: 2048}, {ELBOW: 0}, reads(2050))
     assert "hand" not in str(refused.value)
+
+
+def test_a_joint_that_hardly_moves_between_the_two_readings_is_no_late_reply() -> None:
+    with pytest.raises(ExperimentError, match=r"has turned by -0\.051 rad .* a hand or a cable"):
+        refuse_moved({ELBOW: 100}, {ELBOW: 100 + 33}, reads(100 + 32))
