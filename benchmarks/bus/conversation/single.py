@@ -167,7 +167,7 @@ class SingleInstructions(Host):
         """
         servo = self.any_servo()
         held = servo.rules.held
-        if held.get(TORQUE_ENABLE) or servo.level < 2 or servo.alert:
+        if held.get(TORQUE_ENABLE) or servo.level < 2 or servo.alert or 34 not in held:
             return
         row = servo.rules.rows[34]
         assert row.high is not None
