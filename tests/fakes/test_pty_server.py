@@ -120,20 +120,34 @@ def test_a_link_that_exists_or_cannot_be_made(tmp_path: Path) -> None:
     assert len(os.listdir("/proc/self/fd")) == descriptors  # noqa: PTH208
 
 
-def test_a_pulled_cable_hangs_up_and_comes_back(serve: Serve, tmp_path: Path) -> None:
-    link = tmp_path / "arm"
-    server = serve(Fault(kind="cable_pulled", at=0.3, duration=0.5), link=link)
-    port = opened(str(link))
+def used_until_hung_up(port: serial.Serial) -> None:
     with pytest.raises((OSError, serial.SerialException)):
-        for _ in range(200):
+        for _ in range(1000):
             port.write(PING)
             port.read(14)
             time.sleep(0.01)
     port.close()
-    assert not link.exists()
+
+
+def within_five_seconds(holds: Callable[[], bool]) -> bool:
     deadline = time.monotonic() + 5.0
-    while not link.exists() and time.monotonic() < deadline:
+    while not holds() and time.monotonic() < deadline:
         time.sleep(0.02)
+    return holds()
+
+
+def test_a_pulled_cable_hangs_up_and_removes_the_link(serve: Serve, tmp_path: Path) -> None:
+    link = tmp_path / "arm"
+    serve(Fault(kind="cable_pulled", at=0.3), link=link)  # for good: a slow test cannot miss that the link is gone
+    used_until_hung_up(opened(str(link)))
+    assert within_five_seconds(lambda: not link.is_symlink())
+
+
+def test_a_pulled_cable_comes_back(serve: Serve, tmp_path: Path) -> None:
+    link = tmp_path / "arm"
+    server = serve(Fault(kind="cable_pulled", at=0.3, duration=0.3), link=link)
+    used_until_hung_up(opened(str(link)))
+    assert within_five_seconds(link.exists)
     with opened(str(link)) as port:
         port.write(PING)
         assert port.read(14) == PONG
