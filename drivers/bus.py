@@ -145,8 +145,9 @@ class ServoBus(TorqueSwitch):
     def check_identity(self) -> None:
         """Ping every servo and compare its model and firmware with the configuration; raises NoReply, WrongModel.
 
-        The first reply also reveals whether the adapter is slower than its type suggests.
+        The first reply also reveals whether the adapter is slower than its type suggests, once its timer is lowered.
         """
+        self.port.lower_latency()
         learn_latency(next(iter(self._servos.values())))
         for joint, servo in self._servos.items():
             number = servo.ping()
@@ -190,7 +191,6 @@ class ServoBus(TorqueSwitch):
         Raises ServoFault, BusShared if another master is heard, and WrongSetting if a register rules out an experiment
         and only the user may change it.
         """
-        self.port.lower_latency()
         check_quiet(self.port)
         ids = {drive.id for drive in self._drives}
         for joint, servo in self._servos.items():

@@ -35,7 +35,8 @@ TIME_BASED_PROFILE = 0x04
 def learn_latency(servo: Servo) -> None:
     """Increase the port's reply timeout if this servo's replies are slow, as over Bluetooth or a network.
 
-    The port's `latency` is raised to the measured value if that exceeds what this kind of adapter should need.
+    The port's `latency` is raised to the measured value, with a margin, if that exceeds what this kind of adapter should
+    need: a full-speed USB adapter needs 1 to 2.5 ms.
     """
     port, usual = servo.port, servo.port.latency
     trips = _trips(servo)
@@ -53,7 +54,7 @@ def learn_latency(servo: Servo) -> None:
     taken = min(trips, default=0.0) - bytes_s
     # If nobody replies, the next request raises an error that says so.
     port.latency_measured = taken >= usual + _SLOWER_THAN_KNOWN_S
-    port.latency = _MARGIN * taken if port.latency_measured else usual
+    port.latency = max(usual, _MARGIN * taken)
 
 
 def _trips(servo: Servo) -> list[float]:

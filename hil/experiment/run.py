@@ -11,7 +11,7 @@ from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.clock import Clock, WallClock
 from hil.drivers.errors import DriverError, PortLost, ServoFault, TorqueNotOff, WrongSetting
-from hil.drivers.latency import command_to_set, latency_timer
+from hil.drivers.latency import WANTED_MS, command_to_set, latency_timer, read_latency_ms
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
@@ -311,7 +311,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if slowest <= 1 / rate:
         return
     file = latency_timer(bus.port.url)
-    if file is not None:
+    if file is not None and read_latency_ms(file) > WANTED_MS:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the adapter's latency timer is {bus.port.latency * 1e3:.0f} ms, which allows "
             f"at most {1 / slowest:.0f} Hz. You do not have permission to change it. Type: {command_to_set(file)}"

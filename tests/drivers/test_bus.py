@@ -9,6 +9,7 @@ from hil.drivers.bus import BusConfig, ServoBus
 from hil.drivers.errors import PortLost, ServoFault, ServoRefused, WrongReply, WrongSetting
 from hil.drivers.joint import Joint
 from hil.drivers.packet import HardwareError
+from hil.drivers.port import Port
 from hil.drivers.servo_model import Mode, servo_model
 
 from .conftest import JOINTS
@@ -29,6 +30,17 @@ def test_opened_means_ready_for_an_exchange_and_without_torque(fake_config: Make
         assert state.position == pytest.approx((-1.5708, 0.0), abs=2e-3)
         assert not any(servo.torque_enabled for servo in servos(bus).values())
     assert not bus.port.is_open
+
+
+@pytest.mark.parametrize("latency_us", [900, 1800, 2400, 4000])
+def test_no_reply_is_lost_whatever_the_adapters_delay_and_its_former_timer(
+    fake_config: Make, fake_file: File, monkeypatch: pytest.MonkeyPatch, latency_us: int
+) -> None:
+    monkeypatch.setattr("hil.drivers.port.adapter_latency", lambda _: 0.016)
+    monkeypatch.setattr(Port, "lower_latency", lambda port: setattr(port, "latency", 1e-3))
+    url = fake_file(("adapter_latency_us = 60.0", f"adapter_latency_us = {latency_us}"))
+    with ServoBus.open(fake_config(url, interval=4e-3)) as bus:
+        assert not any(any(bus.exchange([0.0, 0.0]).missing) for _ in range(50))
 
 
 def test_a_failed_opening_leaves_the_port_closed(

@@ -95,6 +95,13 @@ def test_only_an_adapter_that_is_always_slow_is_slow(until: float, is_slow: bool
     assert servo.clock.now() < 1.0
 
 
+@pytest.mark.parametrize(("slow", "latency"), [(3e-4, 1e-3), (2e-3, 2.2e-3)])
+def test_an_adapter_a_little_slower_than_its_kind_is_waited_for(slow: float, latency: float) -> None:
+    servo = Pinged(slow, math.inf)
+    learn_latency(cast("Servo", servo))
+    assert servo.port.latency == pytest.approx(latency) and not servo.port.latency_measured
+
+
 def attempts_of(results: list[int]) -> tuple[list[float], str]:
     """When attempts at a read with these results are made [s], and the message if all fail."""
     clock, times = VirtualClock(), []
