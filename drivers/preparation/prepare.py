@@ -35,8 +35,8 @@ TIME_BASED_PROFILE = 0x04
 def learn_latency(servo: Servo) -> None:
     """Increase the port's reply timeout if this servo's replies are slow, as over Bluetooth or a network.
 
-    The port's `latency` is raised to the measured value, with a margin, if that exceeds what this kind of adapter should
-    need: a full-speed USB adapter needs 1 to 2.5 ms.
+    The port's `latency` is raised to the measured value, with a margin, if that exceeds what this kind of adapter
+    should need: a full-speed USB adapter needs 1 to 2.5 ms.
     """
     port, usual = servo.port, servo.port.latency
     trips = _trips(servo)

@@ -3,7 +3,7 @@
 from hil.drivers.bus import ServoBus
 from hil.drivers.clock import WallClock
 from hil.drivers.control_table import load_control_table
-from hil.drivers.errors import DriverError
+from hil.drivers.errors import DriverError, WrongSetting
 from hil.drivers.servo import Servo
 from hil.setup.scan import Found, listen
 
@@ -12,7 +12,10 @@ _AT_ONCE_S = 0.005
 
 
 def others_on_the_bus(bus: ServoBus) -> list[str]:
-    """Describe each servo at this baud rate that is not part of the arm. Raises PortLost."""
+    """Describe each servo at this baud rate that is not part of the arm.
+
+    Raises PortLost; WrongSetting if one of them obeys commands to a servo of the arm.
+    """
     ours = {drive.id for drive in bus.drives}
     heard = listen(bus.port) if isinstance(bus.port.clock, WallClock) else listen(bus.port, _AT_ONCE_S)
     return [_describe(bus, found) for found in heard.servos if found.id not in ours]
@@ -22,8 +25,17 @@ def _describe(bus: ServoBus, found: Found) -> str:
     name = f"ID {found.id}, {found.model or f'model number {found.model_number}'}"
     if found.model is None:
         return name
+    servo = Servo(bus.port, found.id, load_control_table(found.model))
     try:
-        torque = Servo(bus.port, found.id, load_control_table(found.model)).read("Torque Enable")
+        secondary = servo.read("Secondary(Shadow) ID")
+        torque = servo.read("Torque Enable")
     except (DriverError, KeyError):
         return name
+    for drive in bus.drives:
+        if drive.id == secondary:
+            raise WrongSetting(
+                f"{name}: its Secondary ID is {secondary}, so it obeys torque and goals meant for {drive}, in its own "
+                "mode and unwatched, although it is not in the configuration. Remove the Secondary ID: hil setup "
+                f"{bus.port.url} --id {found.id} --secondary-id 255. If it moves the same joint, list both IDs there."
+            )
     return f"{name}, torque {'on' if torque else 'off'}"

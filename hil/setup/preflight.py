@@ -10,7 +10,7 @@ from hil.config.joint import JointConfig
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.control_table import model_names
-from hil.drivers.errors import BusShared, DriverError, NoReply, PortLost, PortNotOpened
+from hil.drivers.errors import BusShared, DriverError, NoReply, PortLost, PortNotOpened, WrongSetting
 from hil.drivers.joint import Joint
 from hil.drivers.latency import FACTORY_MS, WANTED_MS, command_to_set, latency_timer, read_latency_ms
 from hil.drivers.packet import MAX_ID, HardwareError
@@ -158,6 +158,11 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
         return
     try:
         found = others_on_the_bus(bus)
+    except WrongSetting as error:
+        yield Finding(
+            Level.STOP, config.port.url, "other servos on this bus", "one obeys commands to this arm", str(error)
+        )
+        return
     except DriverError as error:
         yield Finding(Level.WARNING, config.port.url, "others", "not searched for", str(error))
         return

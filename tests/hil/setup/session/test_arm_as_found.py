@@ -152,3 +152,16 @@ def test_a_servo_of_somebody_else_keeps_its_torque_and_is_told_of(
     assert bench.servos[2].torque_enabled
     assert "ID 2, XM430-W350, torque on" in capsys.readouterr().err
     assert any("ID 2" in finding.found for finding in check_arm(config) if finding.level is Level.WARNING)
+
+
+SHADOW = SERVO_2.replace("id = 2", "id = 3") + 'joint = 2\nregisters = { "Secondary(Shadow) ID" = 2 }\n'
+
+
+def test_a_servo_outside_the_arm_that_obeys_commands_to_it_is_refused(arm: Arm, tmp_path: Path, bench: Bench) -> None:
+    """As on a ViperX whose shadow servo is not in the configuration."""
+    config = arm(SHORT, ("[fake.arm]", f"[[fake.servos]]\n{SHADOW}[fake.arm]"))
+    (stop,) = [finding for finding in stops(config) if "other servos" in finding.what]
+    assert "--id 3 --secondary-id 255" in stop.fix
+    with pytest.raises(WrongSetting, match=r"ID 3.*obeys torque and goals meant for joint 'elbow' \(ID 2"):
+        play(config, tmp_path / "run")
+    assert not bench.servos[3].torque_enabled and bench.changed() == []
