@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import serial
 
 from hil.drivers.clock import Clock, WallClock
+from hil.drivers.device import is_pseudo_terminal, keep_others_out, other_users, true_baud
 from hil.drivers.errors import NotPermitted, PortLost, PortNotOpened
 from hil.drivers.latency import WANTED_MS, adapter_latency, latency_timer, read_latency_ms, write_latency_ms
 
@@ -26,6 +27,7 @@ _REASONS = {
     "Inappropriate ioctl": "it is not a serial port",
     "Permission denied": "permission denied",
     "Is a directory": "it is a folder, not a serial port",
+    "resource busy": "it is in use",
 }
 """Explanations of the operating system's error messages."""
 
@@ -48,6 +50,9 @@ _EARLY_BITS = 9.0
 transmitted at this number of bits. The true number is ten; the difference allows for inaccurate baud rates.
 """
 
+_BAUD_TOLERANCE = 0.03
+"""Largest relative error of a baud rate with which bytes are still received."""
+
 _WRITE_PATIENCE_S = 0.1
 """How long a device may refuse to accept bytes before it counts as lost [s]."""
 
@@ -60,7 +65,37 @@ def open_port(url: str, baud: int) -> "Port":
     except (OSError, termios.error, ValueError) as error:
         kind = NotPermitted if "Permission denied" in str(error) else PortNotOpened
         raise kind(f"Cannot open port {url!r}: {_why(error, baud)}. {_advice(error, url)}".rstrip()) from error
-    return (DescriptorPort if type(opened) is serial.Serial else Port)(url, baud, opened)
+    if type(opened) is not serial.Serial:
+        return Port(url, baud, opened)
+    try:
+        _claim(url, opened)
+        _check_baud(url, opened, baud)
+    except PortNotOpened:
+        opened.close()
+        raise
+    return DescriptorPort(url, baud, opened)
+
+
+def _claim(url: str, opened: serial.Serial) -> None:
+    """Keep other programs from opening the device, and raise PortNotOpened if one already has."""
+    if is_pseudo_terminal(url):
+        return
+    keep_others_out(opened.fileno())
+    if users := other_users(url):
+        raise PortNotOpened(
+            f"Cannot open port {url!r}: {' and '.join(users)} has it open too and would take replies or send goals of "
+            "its own. Close that program first."
+        )
+
+
+def _check_baud(url: str, opened: serial.Serial, baud: int) -> None:
+    """Raise PortNotOpened if the adapter runs at another baud rate."""
+    actual = true_baud(opened.fileno())
+    if actual is not None and abs(actual - baud) > _BAUD_TOLERANCE * baud:
+        raise PortNotOpened(
+            f"Port {url!r} cannot be set to {baud} baud: its adapter runs at {actual} instead. Use a lower rate, or "
+            "another adapter."
+        )
 
 
 class ReplyTime(NamedTuple):
@@ -286,6 +321,15 @@ class DescriptorPort(Port):
             self.overheard += received
         return b""
 
+    def set_baud(self, baud: int) -> None:
+        former = self.baud
+        super().set_baud(baud)
+        try:
+            _check_baud(self.url, self._serial, baud)
+        except PortNotOpened:
+            super().set_baud(former)
+            raise
+
     def put_aside(self) -> None:
         self.overheard = os.read(self._descriptor, _MOST_OVERHEARD)
         self.discard_input()
@@ -352,8 +396,8 @@ def _advice(error: BaseException, url: str) -> str:
     text = str(error)
     if "Permission denied" in text:
         return "Add yourself to the port's group (`sudo usermod -aG dialout $USER`), then log out and in again."
-    if "exclusively lock" in text:
-        return "Another program has it open; close that program first."
+    if "exclusively lock" in text or "busy" in text:
+        return "Another program has it open; close that program first. ModemManager opens new ports for half a minute."
     if "No such file" in text and "://" in url:
         return "The file in this URL does not exist; a relative path is resolved from the file or folder that names it."
     if "No such file" in text:

@@ -1,7 +1,8 @@
 """The servos' settings before a program changed them, in files that outlive the program.
 
 There is one file per servo in the user's state folder, named after port, ID and model: however a program ends, the next
-program on that port finds the file and restores the settings.
+program on that port finds the file and restores the settings. The name of a USB port may change when the cable is
+plugged in again, and may then be that of another arm: an adapter with a serial number takes the place of the port.
 """
 
 import json
@@ -12,6 +13,7 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 
+from hil.drivers.device import adapter_name
 from hil.errors import RunFolderError
 
 SCHEMA = 1
@@ -22,7 +24,8 @@ _LONGEST_NAME = 80
 class Kept:
     """Saved settings of one servo.
 
-    changed: the EEPROM registers that the program sets, with their values. program: the program's process ID.
+    changed: the EEPROM registers that the program sets, with their values. program: the program's process ID. adapter:
+    lasting name of the USB adapter; "" if it has none.
     """
 
     port: str
@@ -32,10 +35,11 @@ class Kept:
     changed: dict[str, int]
     program: int
     since: str
+    adapter: str = ""
 
     @property
     def path(self) -> Path:
-        return settings_path(self.port, self.id, self.model)
+        return _path(self.adapter or self.port, self.id, self.model)
 
     @property
     def may_restore(self) -> bool:
@@ -61,6 +65,10 @@ def state_folder() -> Path:
 
 def settings_path(port: str, servo_id: int, model: str) -> Path:
     """Path of the file of one servo."""
+    return _path(adapter_name(port) or port, servo_id, model)
+
+
+def _path(port: str, servo_id: int, model: str) -> Path:
     name = re.sub(r"[^A-Za-z0-9]+", "-", port).strip("-")[-_LONGEST_NAME:]
     return state_folder() / f"{name}_ID{servo_id}_{model}.json"
 
@@ -73,7 +81,7 @@ def keep(
     since: when these settings were first saved; by default, now.
     """
     since = since or datetime.now().astimezone().isoformat(timespec="seconds")
-    kept = Kept(port, servo_id, model, settings, changed, os.getpid(), since)
+    kept = Kept(port, servo_id, model, settings, changed, os.getpid(), since, adapter_name(port))
     write_durably(kept.path, {"schema": SCHEMA, **asdict(kept)})
     return kept
 

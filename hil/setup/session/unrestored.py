@@ -46,14 +46,14 @@ def unrestored(
 def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
     """Restore what an earlier run left on servos that this one did not get to; say where that is impossible."""
     waiting: list[tuple[Joint, str]] = []
-    for joint, kept in saved.left.items():
+    for joint in saved.left:
         if joint in saved.kept:
             continue
         why = "This run ended before it could restore them."
         if is_ours:
             try:
                 saved.bus.confirm_later(joint)
-                if (others := recover(saved.bus.drives[joint], kept.port).others) != "":
+                if (others := recover(saved.bus.drives[joint], saved.bus.port.url).others) != "":
                     yield f"{joint.title}: {others}"
                 continue
             except DriverError as error:

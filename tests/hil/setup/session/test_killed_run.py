@@ -15,6 +15,7 @@ from hil.drivers.errors import PortLost, TorqueNotOff, WrongSetting
 from hil.fakes.bus.faults import Fault
 from hil.fakes.servo.servo import EmulatedServo
 from hil.setup.preflight import Level, check_arm
+from hil.setup.session import settings_file
 from hil.setup.session.servo_session import servo_session
 from hil.setup.session.settings_file import settings_path
 from tests.support.bench import SHORT, Arm, Bench, play
@@ -35,6 +36,20 @@ def test_settings_that_a_killed_program_left_are_restored_up_to_a_limit_lowered_
     kept.write_text(left, encoding="utf-8")
     list(check_arm(config))
     assert not kept.exists() and bench.servos[2].value("Goal PWM") == 300
+
+
+def test_settings_are_found_by_their_adapter_whatever_its_port_is_called_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a pulled cable, ttyUSB0 may come back as ttyUSB1, and another arm's adapter as ttyUSB0."""
+    plugged = {"/dev/ttyUSB0": "usb-A", "/dev/ttyUSB1": "usb-B"}
+    monkeypatch.setattr("hil.setup.session.settings_file.adapter_name", lambda port: plugged.get(port, ""))
+    kept = settings_file.keep("/dev/ttyUSB0", 1, "XM430-W350", {"Operating Mode": 3}, {"Operating Mode": 0})
+    plugged.clear()
+    assert settings_file.load("/dev/ttyUSB0", 1, "XM430-W350") is None
+    plugged.update({"/dev/ttyUSB0": "usb-B", "/dev/ttyUSB1": "usb-A"})
+    assert settings_file.load("/dev/ttyUSB0", 1, "XM430-W350") is None
+    assert settings_file.load("/dev/ttyUSB1", 1, "XM430-W350") == kept
+    settings_file.forget(kept)
+    assert settings_file.load("/dev/ttyUSB1", 1, "XM430-W350") is None
 
 
 class _Gone(BaseException):

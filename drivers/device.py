@@ -1,0 +1,81 @@
+"""A local serial device, beyond what pyserial knows: who else has it open, its true baud rate, which adapter it is."""
+
+import fcntl
+import os
+import termios
+from contextlib import suppress
+from pathlib import Path
+from struct import Struct
+
+_TCGETS2 = 0x802C542A
+_SPEEDS = Struct("36x2I")  # input and output rate, the end of `struct termios2`
+_PROC, _SYSFS = Path("/proc"), Path("/sys")
+
+
+def is_pseudo_terminal(device: str) -> bool:
+    """Whether this is a pty, at whose other end is a program; that program may keep this end open too."""
+    return Path(device).resolve().parent == Path("/dev/pts")
+
+
+def keep_others_out(descriptor: int) -> None:
+    """Let the system refuse further openings of this device, except by root.
+
+    pyserial's `exclusive` is a lock that only programs that ask for it respect: DYNAMIXEL SDK and Wizard do not.
+    """
+    with suppress(OSError):
+        fcntl.ioctl(descriptor, termios.TIOCEXCL)
+
+
+def other_users(device: str, proc: Path = _PROC) -> list[str]:
+    """Return the other programs that have this device open, as far as this user may know: "NAME (PID 12)"."""
+    wanted, found = os.path.realpath(device), []
+    for process in proc.glob("[0-9]*"):
+        with suppress(OSError):
+            if process.name != str(os.getpid()) and any(_leads_to(each, wanted) for each in process.glob("fd/*")):
+                name = (process / "comm").read_text(encoding="utf-8", errors="replace").strip()
+                found.append(f"{name} (PID {process.name})")
+    return sorted(found)
+
+
+def _leads_to(link: Path, wanted: str) -> bool:
+    with suppress(OSError):
+        return os.readlink(link) == wanted  # noqa: PTH115  # half the time of Path.readlink
+    return False
+
+
+def true_baud(descriptor: int) -> int | None:
+    """Return the baud rate at which the driver runs the device; None if the system does not say.
+
+    A driver does not refuse a rate that its adapter cannot do: it sets another one.
+    """
+    speeds = bytearray(_SPEEDS.size)
+    try:
+        fcntl.ioctl(descriptor, _TCGETS2, speeds)
+    except OSError:
+        return None
+    return int(_SPEEDS.unpack(speeds)[1])
+
+
+def adapter_name(device: str, sysfs: Path = _SYSFS) -> str:
+    """Return a name of the USB adapter behind a device that it keeps when it is plugged in again under another name.
+
+    It is "" if there is none: for an adapter without a serial number, or if two adapters present have the same one.
+    """
+    if "://" in device:
+        return ""
+    own = Path(device).resolve().name
+    ports = sysfs / "class" / "tty"
+    name = _identity(ports / own / "device")
+    others = (each for pattern in ("ttyUSB*", "ttyACM*") for each in ports.glob(pattern) if each.name != own)
+    return "" if any(name and _identity(each / "device") == name for each in others) else name
+
+
+def _identity(device: Path) -> str:
+    """Vendor, product, serial number and interface of a USB device in sysfs; "" if one of them is missing."""
+    place = device.resolve()
+    with suppress(OSError, StopIteration):
+        interface = next(each for each in (place, *place.parents) if (each / "bInterfaceNumber").is_file())
+        usb = next(each for each in interface.parents if (each / "idVendor").is_file())
+        files = (usb / "idVendor", usb / "idProduct", usb / "serial", interface / "bInterfaceNumber")
+        return "-".join(["usb", *(file.read_text(encoding="utf-8").strip() for file in files)])
+    return ""
