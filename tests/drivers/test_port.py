@@ -1,6 +1,7 @@
 """The port on a real terminal device: bounded reads, and one clear error when the other end disappears."""
 
 import os
+import socket
 import time
 import tty
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from hil.drivers.errors import PortLost, PortNotOpened
-from hil.drivers.port import Port, open_port
+from hil.drivers.port import NetworkPort, Port, open_port
 from hil.drivers.sdk_port import SdkPort
 from hil.fakes.bus.clock import VirtualClock
 
@@ -76,6 +77,50 @@ def test_the_sdk_can_never_leave_the_port_marked_as_in_use(pty: tuple[int, str])
     sdk_port.is_using = True
     assert not sdk_port.is_using
     os.close(master)
+
+
+class Remote:
+    """A pyserial port on a network: it sees one waiting byte at most, and other calls wait for the other end."""
+
+    def __init__(self, *received: bytes) -> None:
+        self._timeout = 0.0
+        self.waiting = list(received)
+
+    timeout = property(lambda self: self._timeout)  # setting it would negotiate
+
+    @property
+    def in_waiting(self) -> int:
+        return min(1, len(self.waiting))
+
+    def read(self, count: int) -> bytes:
+        if not self.waiting and self._timeout:
+            return b"TRUE"[:count]
+        return self.waiting.pop(0)[:count] if self.waiting else b""
+
+    def write(self, data: bytes) -> int:
+        return len(data)
+
+
+def test_nothing_of_a_late_reply_on_a_network_is_taken_for_the_next_one() -> None:
+    port = NetworkPort("socket://x", 1_000_000, Remote(b"a late reply", b"and another"))
+    assert port.ask(b"request", 4, port.reply_time(0.1, 7), port.clock.now()) == b"TRUE"
+    assert port.overheard == b"a late reply"
+    port = NetworkPort("rfc2217://x", 1_000_000, Remote(b"a late reply", b"and another"))
+    port.discard_input()
+    assert port.read(4, 0.1) == b"TRUE"
+
+
+def test_two_writes_over_tcp_are_not_held_back_and_a_closed_connection_is_noticed() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = open_port(f"socket://127.0.0.1:{server.getsockname()[1]}", 1_000_000)
+        other, _ = server.accept()
+        assert port._serial._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        other.close()
+        with pytest.raises(PortLost, match="disconnected"):
+            port.read(1, 5.0)
+        with pytest.raises(PortLost, match="disconnected"):
+            port.discard_input()
+        port.close()
 
 
 def test_a_handler_that_returns_early_is_read_on_until_time_is_up() -> None:
