@@ -314,8 +314,9 @@ class ServoBus(TorqueSwitch):
         drives = (self._drives[-1], self._drives[0])
         read = SyncRead([each.id for each in drives], Span.of([self._servos[each].table for each in drives], ["ID"]))
         expected = self.port.reply_time(patience, len(read.request))
-        received = self.port.ask(read.request, read.reply_size, expected, self.port.clock.now())
-        (last, first), _ = read.search(received)
+        echo = read.request if self.port.echoes else b""
+        received = self.port.ask(read.request, len(echo) + read.reply_size, expected, self.port.clock.now())
+        (last, first), _ = read.search(received.removeprefix(echo))
         return last is not None and first is None
 
     def check_not_overruled(self, due: float) -> None:

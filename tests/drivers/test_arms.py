@@ -244,6 +244,18 @@ def test_an_echo_and_a_lost_reply(opened: Open) -> None:
         assert bus.exchange([0.0, 0.0]).missing == (False, False)
 
 
+@pytest.mark.parametrize("echoes", [False, True])
+@pytest.mark.parametrize(("silent", "hides"), [(1, True), (2, False), (None, False)])
+def test_a_silent_first_servo_is_told_from_a_silent_arm(
+    opened: Open, echoes: bool, silent: int | None, hides: bool
+) -> None:
+    joints = Joint("a", 1, XM430), Joint("b", 2, XM430)
+    bus, port = opened(arm({}, {}, adapter_echoes=echoes), *joints)
+    with bus:
+        port.bus.faults.add(Fault(kind="silent_servo", servo=silent, at=port.bus.time))
+        assert bus.first_hides_others(0.02) is hides
+
+
 # Another master
 
 
