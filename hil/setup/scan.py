@@ -21,6 +21,11 @@ _SLOT_S = 3e-3
 _PATIENCE_S = _SLOT_S * (MAX_ID + 1)
 _STATUS_BYTES = 14
 
+_DIFFERENT = ("Present Position", "Realtime Tick")
+"""Registers that differ between any two servos. Two with the same ID answer at once; equal replies, as to a ping, merge
+into one, but different ones corrupt each other.
+"""
+
 
 class Found(NamedTuple):
     """One servo that answered.
@@ -146,6 +151,9 @@ def _describe(port: Port, servo_id: int, data: bytes) -> Found:
         voltage = VOLTAGE_UNIT * servo.read("Present Input Voltage")
         temperature = float(servo.read("Present Temperature"))
         error = servo.hardware_error()
+        for register in _DIFFERENT:
+            if register in servo.table:
+                servo.read(register)
     except (DriverError, KeyError, IndexError) as problem:
         return Found(baud, servo_id, number, model, firmware, None, None, f"cannot be read: {problem}")
     trouble = f"hardware error: {describe_error(error)}; reboot it" if error else ""

@@ -1,6 +1,7 @@
 """scan, check and setup on the fake bus: findings, changes, and what must stay unchanged."""
 
 import json
+import operator
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,9 +18,11 @@ from hil.drivers.errors import NoReply, WrongSetting
 from hil.drivers.port import Port, open_port
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.faults import Fault
+from hil.fakes.description import load_fake
+from hil.fakes.protocol_fake import FakeSerial, open_fake
 from hil.setup import preflight
 from hil.setup.preflight import Finding, Level, check_arm
-from hil.setup.scan import Asking, scan
+from hil.setup.scan import Asking, listen, scan
 from hil.setup.servo_settings import open_servo, set_up
 from tests.support.paths import CONFIGS
 
@@ -72,6 +75,42 @@ def test_scan_hears_that_answers_are_damaged(port: Callable[..., Port], monkeypa
     (heard,) = scan(port(), [1_000_000])
     assert heard.servos == ()
     assert "same ID" in heard.trouble
+
+
+class Twins:
+    """Two buses on one wire, each with a servo of ID 1: bits that differ between their replies read 0."""
+
+    def __init__(self, first: FakeSerial, second: FakeSerial) -> None:
+        self._both = first, second
+        self.clock, self.timeout, self.in_waiting = first.clock, 0.0, 0
+
+    def write(self, data: bytes) -> None:
+        for each in self._both:
+            each.clock.wait_until(self.clock.now())
+            each.write(data)
+
+    def read(self, count: int) -> bytes:
+        for each in self._both:
+            each.timeout = self.timeout
+        received = [each.read(count) for each in self._both]
+        return bytes(map(operator.and_, *received))
+
+    def reset_input_buffer(self) -> None:
+        for each in self._both:
+            each.reset_input_buffer()
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.5])
+def test_scan_sees_two_servos_with_one_id_although_their_pings_are_alike(turned: float) -> None:
+    """As with two new servos, both of ID 1; those that have just been switched on differ in their positions only."""
+    description = load_fake(CONFIGS / "fake_pendulum.toml")
+    assert description.arm is not None
+    other = description.model_copy(
+        update={"arm": description.arm.model_copy(update={"start": [description.arm.start[0] + turned]})}
+    )
+    twins = Twins(open_fake(description), open_fake(other))
+    (found,) = listen(Port("fake://", 1_000_000, twins), 0.01).servos
+    assert ("second servo with ID 1" in found.trouble) == bool(turned)
 
 
 def test_scan_goes_past_a_baud_that_the_adapter_cannot_do(
