@@ -39,21 +39,25 @@ def learn_latency(servo: Servo) -> None:
     should need: a full-speed USB adapter needs 1 to 2.5 ms.
     """
     port, usual = servo.port, servo.port.latency
-    trips = _trips(servo)
+    trips = latest = _trips(servo)
     if not trips and port.read(_STATUS_BYTES, SLOWEST_S):  # no reply in time, but a late one
         port.discard_input()
         port.latency = SLOWEST_S
-        trips = _trips(servo)
+        trips = latest = _trips(servo)
     bytes_s = port.wire_time(_PING_BYTES)
     for _ in range(_TIMES):
         if min(trips, default=0.0) - bytes_s < usual + _SLOWER_THAN_KNOWN_S:
             break
         # A busy computer delays replies as well, for some ms at a time; an adapter delays every one of them.
         port.clock.wait_until(port.clock.now() + _APART_S)
-        trips += _trips(servo)
-    taken = min(trips, default=0.0) - bytes_s
+        latest = _trips(servo)
+        trips = trips + latest
+    taken, longest = min(trips, default=0.0) - bytes_s, max(latest, default=0.0) - bytes_s
     # If nobody replies, the next request raises an error that says so.
     port.latency_measured = taken >= usual + _SLOWER_THAN_KNOWN_S
+    if not port.latency_measured:
+        # The delay of a full-speed USB adapter depends on when in a frame of 1 ms a request comes.
+        taken = min(longest, usual + _SLOWER_THAN_KNOWN_S)
     port.latency = max(usual, _MARGIN * taken)
 
 

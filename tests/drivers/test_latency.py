@@ -102,6 +102,13 @@ def test_an_adapter_a_little_slower_than_its_kind_is_waited_for(slow: float, lat
     assert servo.port.latency == pytest.approx(latency) and not servo.port.latency_measured
 
 
+def test_the_slowest_phase_of_a_usb_frame_counts_but_no_pause_of_a_busy_computer() -> None:
+    for later, latency in ((2e-3, 2.2e-3), (0.05, 1.25 * 2.5e-3)):
+        servo = Pinged(later, until=later)  # the first reply is the slowest
+        learn_latency(cast("Servo", servo))
+        assert servo.port.latency == pytest.approx(latency) and not servo.port.latency_measured
+
+
 def attempts_of(results: list[int]) -> tuple[list[float], str]:
     """When attempts at a read with these results are made [s], and the message if all fail."""
     clock, times = VirtualClock(), []
