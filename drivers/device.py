@@ -10,6 +10,7 @@ from struct import Struct
 _TCGETS2 = 0x802C542A
 _SPEEDS = Struct("36x2I")  # input and output rate, the end of `struct termios2`
 _PROC, _SYSFS = Path("/proc"), Path("/sys")
+_USB_PORTS = ("ttyUSB*", "ttyACM*")
 
 
 def is_pseudo_terminal(device: str) -> bool:
@@ -66,8 +67,15 @@ def adapter_name(device: str, sysfs: Path = _SYSFS) -> str:
     own = Path(device).resolve().name
     ports = sysfs / "class" / "tty"
     name = _identity(ports / own / "device")
-    others = (each for pattern in ("ttyUSB*", "ttyACM*") for each in ports.glob(pattern) if each.name != own)
+    others = (each for pattern in _USB_PORTS for each in ports.glob(pattern) if each.name != own)
     return "" if any(name and _identity(each / "device") == name for each in others) else name
+
+
+def device_of(name: str, sysfs: Path = _SYSFS) -> str | None:
+    """Return the device that the adapter with this lasting name has now; None if it is not plugged in."""
+    ports = sysfs / "class" / "tty"
+    found = [each for pattern in _USB_PORTS for each in ports.glob(pattern) if _identity(each / "device") == name]
+    return f"/dev/{found[0].name}" if name and len(found) == 1 else None
 
 
 def _identity(device: Path) -> str:

@@ -16,7 +16,14 @@ from typing import Any, NamedTuple
 import serial
 
 from hil.drivers.clock import Clock, WallClock
-from hil.drivers.device import is_pseudo_terminal, keep_others_out, other_users, true_baud
+from hil.drivers.device import (
+    adapter_name,
+    device_of,
+    is_pseudo_terminal,
+    keep_others_out,
+    other_users,
+    true_baud,
+)
 from hil.drivers.errors import NotPermitted, PortLost, PortNotOpened
 from hil.drivers.latency import WANTED_MS, adapter_latency, latency_timer, read_latency_ms, write_latency_ms
 
@@ -67,9 +74,7 @@ def open_port(url: str, baud: int) -> "Port":
     except (OSError, termios.error, ValueError) as error:
         kind = NotPermitted if "Permission denied" in str(error) else PortNotOpened
         raise kind(f"Cannot open port {url!r}: {_why(error, baud)}. {_advice(error, url)}".rstrip()) from error
-    if (line := getattr(opened, "_socket", None)) is not None:
-        # Otherwise TCP holds back the second of two writes until the first is acknowledged, for 40 ms.
-        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    if hasattr(opened, "_socket"):
         return NetworkPort(url, baud, opened)
     if type(opened) is not serial.Serial:
         return Port(url, baud, opened)
@@ -119,8 +124,8 @@ class ReplyTime(NamedTuple):
 class Port:
     """An open serial port. Every method but `close` raises PortLost when the device fails.
 
-    After PortLost, methods may be called again; they fail as long as the device is gone. After replugging the
-    cable, open a new port. `latency` is the longest time the adapter may hold back a reply [s].
+    After PortLost, methods may be called again; they fail until `reopen` succeeds. `latency` is the longest time the
+    adapter may hold back a reply [s].
     """
 
     def __init__(self, url: str, baud: int, opened: Any) -> None:
@@ -242,6 +247,15 @@ class Port:
         with contextlib.suppress(*_FAILURES):
             self._serial.close()
 
+    def reopen(self) -> bool:
+        """Open the port again once its device is back, as after a reset of the USB hub; return whether it is."""
+        try:
+            self._serial.close()
+            self._serial.open()
+        except (*_FAILURES, ValueError):
+            return False
+        return True
+
     def _lost(self, error: BaseException) -> PortLost:
         if not self.is_open:
             return PortLost(f"Port {self.url!r} was closed.")
@@ -250,6 +264,20 @@ class Port:
 
 class NetworkPort(Port):
     """A port on a network, `socket://` or `rfc2217://`. Reading never negotiates with the other end."""
+
+    def __init__(self, url: str, baud: int, opened: Any) -> None:
+        super().__init__(url, baud, opened)
+        self._send_at_once()
+
+    def reopen(self) -> bool:
+        if is_back := super().reopen():
+            self._send_at_once()
+        return is_back
+
+    def _send_at_once(self) -> None:
+        # Otherwise TCP holds back the second of two writes until the first is acknowledged, for 40 ms.
+        if line := getattr(self._serial, "_socket", None):
+            line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def _set_timeout(self, timeout: float) -> None:
         # pyserial's own setter configures the port again, which takes 50 ms with RFC 2217.
@@ -273,12 +301,30 @@ class DescriptorPort(Port):
 
     def __init__(self, url: str, baud: int, opened: Any) -> None:
         super().__init__(url, baud, opened)
+        self._adapter = adapter_name(url)
+        self._looks = _LOOKS
+        """Number of requests for which `ask` will still look for pending input before it writes."""
+        self._use(opened)
+
+    def _use(self, opened: Any) -> None:
+        self._serial = opened
         self._descriptor: int = opened.fileno()
         poll = select.poll()
         poll.register(self._descriptor, select.POLLIN)
         self._wait_ms = poll.poll
-        self._looks = _LOOKS
-        """Number of requests for which `ask` will still look for pending input before it writes."""
+
+    def reopen(self) -> bool:
+        # The device may have another name now, and its former name may be that of another arm's adapter.
+        self._serial.close()
+        device = device_of(self._adapter)
+        if device is None:
+            return False
+        try:
+            self._use(open_port(device, self.baud)._serial)
+        except PortNotOpened:
+            return False
+        self.url = device
+        return True
 
     def write(self, data: bytes) -> None:
         try:

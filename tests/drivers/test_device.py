@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import serial
 
-from hil.drivers.device import adapter_name, is_pseudo_terminal, other_users, true_baud
-from hil.drivers.errors import PortNotOpened
+from hil.drivers.device import adapter_name, device_of, is_pseudo_terminal, other_users, true_baud
+from hil.drivers.errors import PortLost, PortNotOpened
 from hil.drivers.port import open_port
 
 _TIOCGEXCL = 0x80045440
@@ -131,6 +131,8 @@ def test_an_adapter_keeps_its_name_under_another_port_and_in_another_socket(tmp_
     before = adapter_name("/dev/ttyUSB0", tmp_path / "before")
     assert before == "usb-0403-6014-FT4THXYZ-00" == adapter_name(str(link), tmp_path / "after")
     assert adapter_name("/dev/ttyUSB0", tmp_path / "after") != before
+    assert device_of(before, tmp_path / "after") == "/dev/ttyUSB1"
+    assert device_of("", tmp_path / "after") is None
 
 
 def test_an_adapter_without_a_number_of_its_own_has_no_lasting_name(tmp_path: Path) -> None:
@@ -138,5 +140,28 @@ def test_an_adapter_without_a_number_of_its_own_has_no_lasting_name(tmp_path: Pa
     plug_in(tmp_path, "ttyUSB1", "1-3", "0001")
     assert adapter_name("/dev/ttyUSB0", tmp_path) == "" != adapter_name("/dev/ttyUSB1", tmp_path)
     plug_in(tmp_path, "ttyUSB2", "1-4", "0001")
+    assert device_of("usb-0403-6014-0001-00", tmp_path) is None
     for port in ("/dev/ttyUSB1", "/dev/ttyUSB2", "/dev/ttyS0", "fake://koch"):
         assert adapter_name(port, tmp_path) == ""
+
+
+def test_an_adapter_that_was_reset_is_used_again_under_its_new_name(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plugged: dict[str, str] = {}
+    monkeypatch.setattr("hil.drivers.port.adapter_name", lambda _: "usb-A")
+    monkeypatch.setattr("hil.drivers.port.device_of", plugged.get)
+    master, slave = os.openpty()
+    port = open_port(os.ttyname(slave), 1_000_000)
+    os.close(slave)
+    os.close(master)
+    with pytest.raises(PortLost):
+        port.write(b"x")
+    assert not port.reopen(), "it is not back"
+    with pytest.raises(PortLost):
+        port.write(b"x")
+    plugged["usb-A"] = device
+    assert port.reopen() and port.url == device
+    port.write(b"x")
+    assert port.ask(b"y", 1, port.reply_time(0.0, 1), port.clock.now()) == b""
+    port.close()

@@ -16,7 +16,7 @@ from pathlib import Path
 from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError
+from hil.drivers.errors import DriverError, PortLost
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import read_settings
 from hil.drivers.servo_model import Mode
@@ -142,6 +142,8 @@ class ServoSession:
         if failed:
             clock = self.bus.port.clock
             clock.wait_until(clock.now() + REBOOT_S)
+            if any(isinstance(error, PortLost) for error in failed.values()):
+                self.bus.port.reopen()  # a hub or an adapter that was reset, by the motors' noise for instance
             failed = saved.put_back(failed)
         saved.verify(failed)
         left = unrestored(saved, failed, self.settings, self._delays, is_ours=self._is_ours)

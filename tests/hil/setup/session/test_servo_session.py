@@ -12,7 +12,7 @@ import pytest
 
 from hil.cli.errors import message
 from hil.config.schema import load_config
-from hil.drivers.errors import BusShared, DriverError, TorqueNotOff, WrongModel
+from hil.drivers.errors import BusShared, DriverError, PortLost, TorqueNotOff, WrongModel
 from hil.drivers.joint import Joint
 from hil.errors import Cause, ExperimentError, HilError, SafetyStop, StopRequested
 from hil.fakes.bus.faults import Fault
@@ -131,6 +131,14 @@ def test_whatever_stops_a_run_its_settings_are_put_back_then_or_at_the_next_star
         found = list(check_arm(config))
         assert any(each.what == "settings from an earlier run" and each.level is Level.OK for each in found)
     assert bench.changed() == []
+
+
+def test_an_adapter_that_was_reset_during_a_run_is_used_again_to_end_it(arm: Arm, tmp_path: Path, bench: Bench) -> None:
+    bench.prepare = lambda port: port.bus.faults.add(Fault(kind="cable_pulled", at=2.0, duration=1.0))
+    with pytest.raises(PortLost) as lost:  # and not TorqueNotOff
+        play(arm(SHORT), tmp_path / "run")
+    assert "answers again" in "".join(lost.value.__notes__) and "NOT CONFIRMED" not in "".join(lost.value.__notes__)
+    assert not any(servo.torque_enabled for servo in bench.servos.values()) and bench.changed() == []
 
 
 def test_an_arm_that_was_stopped_moves_again_only_after_an_announcement(arm: Arm, bench: Bench) -> None:
