@@ -5,7 +5,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from hil.drivers.control_table import load_control_table, model_names
-from hil.drivers.errors import ServoFault, WrongModel, WrongReply
+from hil.drivers.errors import NoReply, ServoFault, WrongModel, WrongReply
 from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
 from hil.drivers.others.heard import MOST_MIXED_UP, MOST_STRANGERS
@@ -159,7 +159,13 @@ class ServoBus(TorqueSwitch):
                     f"{with_article(joint.servo.name)}. Correct `model` or `id` in the configuration, or change the "
                     "servo's ID."
                 )
-            firmware = servo.read("Firmware Version")
+            try:
+                firmware = servo.read("Firmware Version")
+            except NoReply as error:
+                raise NoReply(
+                    f"{joint.title} answers pings but not reads: its Status Return Level is probably 0. Power-cycle it, "
+                    "which sets that level to 2; `hil check` tests it."
+                ) from error
             if firmware < joint.servo.watchdog_firmware:
                 self._no_watchdog(joint, firmware)
 

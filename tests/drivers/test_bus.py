@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from hil.drivers.bus import BusConfig, ServoBus
-from hil.drivers.errors import PortLost, ServoFault, ServoRefused, WrongReply, WrongSetting
+from hil.drivers.errors import NoReply, PortLost, ServoFault, ServoRefused, WrongReply, WrongSetting
 from hil.drivers.joint import Joint
 from hil.drivers.packet import HardwareError
 from hil.drivers.port import Port
@@ -41,6 +41,13 @@ def test_no_reply_is_lost_whatever_the_adapters_delay_and_its_former_timer(
     url = fake_file(("adapter_latency_us = 60.0", f"adapter_latency_us = {latency_us}"))
     with ServoBus.open(fake_config(url, interval=4e-3)) as bus:
         assert not any(any(bus.exchange([0.0, 0.0]).missing) for _ in range(50))
+
+
+def test_a_servo_that_answers_pings_only_is_said_to(fake_config: Make) -> None:
+    with ServoBus.connect(fake_config()) as bus:
+        servos(bus)[2].write(68, b"\0")
+        with pytest.raises(NoReply, match=r"'elbow' \(ID 2.*answers pings but not reads: its Status Return Level"):
+            bus.check_identity()
 
 
 def test_a_failed_opening_leaves_the_port_closed(
