@@ -163,8 +163,8 @@ class ServoBus(TorqueSwitch):
                 firmware = servo.read("Firmware Version")
             except NoReply as error:
                 raise NoReply(
-                    f"{joint.title} answers pings but not reads: its Status Return Level is probably 0. Power-cycle it, "
-                    "which sets that level to 2; `hil check` tests it."
+                    f"{joint.title} answers pings but not reads: its Status Return Level is probably 0. Power-cycle "
+                    "it, which sets that level to 2."
                 ) from error
             if firmware < joint.servo.watchdog_firmware:
                 self._no_watchdog(joint, firmware)
