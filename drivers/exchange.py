@@ -152,6 +152,10 @@ class Exchange:
         self._read_back: ReadBack | None = None
         self._longest_again = _AGAIN_SHARE * interval
         self._asked_again_at = -math.inf
+        self.awaited_until = -math.inf
+        """Until when the reply to the latest second read-back was to be awaited, even if that delayed the next cycle [s on
+        the port's clock].
+        """
         self.read_back_at = math.inf
         """When `overruled` should be called again, before the next cycle [s on the port's clock]."""
 
@@ -273,8 +277,8 @@ class Exchange:
         now = self._now()
         if None in servos and takes < self._longest_again and now > self._asked_again_at + TRY_AGAIN_S:
             # The packet of another master may have destroyed the reply, and the next cycle overwrites what it wrote.
-            self._asked_again_at = now
-            servos = self._ask_back(read, now, takes + self._wire_s[read])
+            self._asked_again_at, self.awaited_until = now, now + takes + self._wire_s[read]
+            servos = self._ask_back(read, now, self.awaited_until - now)
         self.read_back_at = now
         if None in servos:
             self._expect_late()

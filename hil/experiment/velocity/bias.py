@@ -52,6 +52,6 @@ def unexplained(bias: Any, apart: float, moving: float) -> float:
     return float(apart - min(max(apart, low), high))
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
 unexplained = _inner(unexplained)
 look = _inner(look)

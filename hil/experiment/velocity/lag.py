@@ -2,7 +2,8 @@
 
 Servos filter their velocities, so that any servo may have a lag. It is the slope of the difference `apart` (see
 `hil.experiment.consistency`) over the velocity less its mean in the short memory; a scale error is its slope over the
-distance covered. Both are estimated by least squares, together with a constant. An estimate is only as certain as the velocity has changed.
+distance covered. Both are estimated by least squares, together with a constant. An estimate is only as certain as the
+velocity has changed.
 
 Neither of them changes during a run. The lag in the last `BLOCKS` blocks of `BLOCK_S` is therefore compared with that
 in all blocks before: the difference must not exceed what their uncertainties and a filter explain, whose lag depends on
@@ -122,7 +123,7 @@ def _fitted(sums: Any) -> tuple[float, float, float, float, float]:
     return lag, scale, determinant / far_2, max(left / seconds, NOISE_RAD * NOISE_RAD), determinant / lag_2
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)
+_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
 _fitted = _inner(_fitted)
 _completes_block = _inner(_completes_block)
 add, forget = map(_inner, (add, forget))
