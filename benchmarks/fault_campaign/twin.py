@@ -152,8 +152,10 @@ def wired_otherwise(config: Config, told: Heard) -> Heard | None:
 
 
 def _is_found(config: Config, arm: Arm, told: Heard) -> bool:
-    """Whether an arm is found that would have sent these replies."""
+    """Whether an arm is found that would have sent these replies: the true one, or one like it."""
     limits = _limits(len(arm.links), _UNDESCRIBED if config.arm.link_lengths is None else _DESCRIBED)
+    if _is_same(_differences(arm, np.zeros(limits.size), told), told):
+        return True
     picked = told.every(_COARSE_S)
     coarse = told.at(picked).averaged()
 
@@ -201,7 +203,8 @@ def _is_same(different: Array, told: Heard) -> bool:
     same = np.sqrt(np.mean(velocity**2, axis=0)) <= 1.0
     own = told.velocity + SAME_RAD_S * velocity
     return all(
-        is_same or any(_agrees(lagging(own[:, joint], told.time, lag) - told.velocity[:, joint], told) for lag in LAGS_S)
+        is_same
+        or any(_agrees(lagging(own[:, joint], told.time, lag) - told.velocity[:, joint], told) for lag in LAGS_S)
         for joint, is_same in enumerate(same.tolist())
     )
 

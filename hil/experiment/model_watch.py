@@ -32,7 +32,12 @@ WIDENED = 1.5
 """Factor applied to the ensemble's standard deviations, for effects that its model does not include."""
 
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
-_IN_BOTH = {"coupling": "coupling_of_2", "inertia_2": "inertia_of_2", "gravity_2": "gravity_of_2", "tilt_2": "tilt_of_2"}
+_IN_BOTH = {
+    "coupling": "coupling_of_2",
+    "inertia_2": "inertia_of_2",
+    "gravity_2": "gravity_of_2",
+    "tilt_2": "tilt_of_2",
+}
 """Quantities in the equations of both joints: their names in that of the first and of the second joint."""
 
 _IN_FIRST = {second: first for first, second in _IN_BOTH.items()}
