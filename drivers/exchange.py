@@ -153,8 +153,8 @@ class Exchange:
         self._longest_again = _AGAIN_SHARE * interval
         self._asked_again_at = -math.inf
         self.awaited_until = -math.inf
-        """Until when the reply to the latest second read-back was to be awaited, even if that delayed the next cycle [s on
-        the port's clock].
+        """Until when the reply to the latest second read-back was awaited, even if it delayed the next cycle [s on the
+        port's clock].
         """
         self.read_back_at = math.inf
         """When `overruled` should be called again, before the next cycle [s on the port's clock]."""

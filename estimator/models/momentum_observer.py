@@ -45,14 +45,8 @@ from hil.estimator.models import earlier_model, standstill
 NAMES = (
     *("inertia_1", "coupling", "inertia_2", "armature_2", "gravity_1", "gravity_2"),
     *("viscous_1", "viscous_2", "coulomb_1", "coulomb_2", "offset_1", "offset_2", "tilt_1", "tilt_2"),
-    *("coupling_of_2", "inertia_of_2", "gravity_of_2", "tilt_of_2"),
 )
-"""Names of the parameters. Tilts are components of gravity perpendicular to the direction assumed for angle zero.
-
-Torques are in units of what is commanded, and a motor may deliver more or less than that. What appears in the equations
-of both joints (coupling, and inertia, gravity and tilt of the second link) therefore has another value in that of the
-second joint: those of 2.
-"""
+"""Names of the parameters. Tilts are components of gravity perpendicular to the direction assumed for angle zero."""
 
 FILTER_S = 0.02
 HOLD_S = 0.05
@@ -100,7 +94,7 @@ class MomentumObserver:
     """Momentum observer for arms of one or two joints.
 
     mean: parameters by name, 0 if left out.
-    covariance: their covariance in the order of NAMES (18, 18).
+    covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
     frictions: the thresholds follow from `largest`, or from this multiple of the dry friction in `mean` if that is
@@ -122,7 +116,7 @@ class MomentumObserver:
         joints = len(largest)
         if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
             raise ValueError(
-                f"{joints} joints and a covariance of shape {covariance.shape}: 1 or 2 joints and (18, 18) are needed"
+                f"{joints} joints and a covariance of shape {covariance.shape}: 1 or 2 joints and (14, 14) are needed"
             )
         self._joints = joints
         self._memory = np.zeros((_PENDING + 1, _COUNT))
@@ -175,14 +169,14 @@ def _regressors(momentum: Any, rest: Any, q1: float, q2: float, v1: float, v2: f
     momentum[0, 0] = v1
     momentum[0, 1] = cos_2 * (v1 + both)
     momentum[0, 2] = both
-    momentum[1, 14] = cos_2 * v1
-    momentum[1, 15] = both
+    momentum[1, 1] = cos_2 * v1
+    momentum[1, 2] = both
     momentum[1, 3] = v2
-    rest[1, 14] = sin_2 * v1 * both
+    rest[1, 1] = sin_2 * v1 * both
     rest[0, 4] = math.cos(q1)
-    rest[0, 5] = rest[1, 16] = math.cos(q1 + q2)
+    rest[0, 5] = rest[1, 5] = math.cos(q1 + q2)
     rest[0, 12] = math.sin(q1)
-    rest[0, 13] = rest[1, 17] = math.sin(q1 + q2)
+    rest[0, 13] = rest[1, 13] = math.sin(q1 + q2)
     rest[0, 6] = v1
     rest[1, 7] = v2
     rest[0, 8] = math.tanh(v1 / _STANDING)
@@ -282,16 +276,14 @@ def _is_blocked(
     return bool(_blocked(rest, distance, held, friction, tolerance, momentum, FILTER_S, dt))
 
 
-def _second_moment(m: Any, j: int, weight_1: float, coupling: float, weight_2: float, armature: float) -> float:
-    """Return the mean square of a weighted sum of joint j's inertial parameters, given their mean and covariance."""
+def _second_moment(m: Any, weight_1: float, coupling: float, weight_2: float, armature: float) -> float:
+    """Return the mean square of a weighted sum of the inertial parameters, given their mean and covariance."""
     mean = variance = 0.0
-    weights, places = (weight_1, coupling, weight_2, armature), (0, 1, 2, 3)
-    if j == 1:
-        places = (0, 14, 15, 3)
+    weights = (weight_1, coupling, weight_2, armature)
     for i in range(4):
-        mean += weights[i] * m[_THETA, places[i]]
+        mean += weights[i] * m[_THETA, i]
         for n in range(4):
-            variance += weights[i] * weights[n] * m[_COVARIANCE + places[i], places[n]]
+            variance += weights[i] * weights[n] * m[_COVARIANCE + i, n]
     return mean * mean + max(variance, 0.0)
 
 
@@ -300,8 +292,8 @@ def _of_rounding(m: Any, j: int, slope: float, cos_2: float) -> float:
 
     As long as the inertias are unknown, each counts with its largest possible value.
     """
-    across = _second_moment(m, j, 0.0, cos_2, 1.0, 0.0)
-    own = _second_moment(m, j, 1.0, 2.0 * cos_2, 1.0, 0.0) if j == 0 else _second_moment(m, j, 0.0, 0.0, 1.0, 1.0)
+    across = _second_moment(m, 0.0, cos_2, 1.0, 0.0)
+    own = _second_moment(m, 1.0, 2.0 * cos_2, 1.0, 0.0) if j == 0 else _second_moment(m, 0.0, 0.0, 1.0, 1.0)
     rounding = slope * _VELOCITY_STD
     return float(rounding * rounding * (own + across))
 

@@ -32,18 +32,6 @@ WIDENED = 1.5
 """Factor applied to the ensemble's standard deviations, for effects that its model does not include."""
 
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
-_IN_BOTH = {
-    "coupling": "coupling_of_2",
-    "inertia_2": "inertia_of_2",
-    "gravity_2": "gravity_of_2",
-    "tilt_2": "tilt_of_2",
-}
-"""Quantities in the equations of both joints: their names in that of the first and of the second joint."""
-
-_IN_FIRST = {second: first for first, second in _IN_BOTH.items()}
-_RATIO_STD = 0.4
-"""Standard deviation of the ratio of the two motors' torques per commanded torque, if nothing describes the arm."""
-
 _RELATIVE_STD = 0.1
 _FRICTIONS, _FRICTIONS_UNDESCRIBED = 8.0, 3.0
 """Lower bounds on the torque from which the alarm thresholds follow, in multiples of the mean dry friction, with and
@@ -312,10 +300,9 @@ def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[di
     if arms is None and config.arm.link_lengths is None:
         return _hardly_known(config, largest)
     arms = prior_ensemble(config, ARMS) if arms is None else arms
-    joint = np.array([1 if name.endswith("_2") and name not in _IN_BOTH else 0 for name in NAMES])
-    names = [_IN_FIRST.get(name, name) for name in NAMES]
+    joint = np.array([1 if name.endswith("_2") else 0 for name in NAMES])
     drawn = np.array(
-        [[dict(zip(CONSTANTS, each.vector, strict=True)).get(name, 0.0) for name in names] for each in arms.physics]
+        [[dict(zip(CONSTANTS, each.vector, strict=True)).get(name, 0.0) for name in NAMES] for each in arms.physics]
     )
     # Convert to units of the commanded torque, which adds the uncertainty of the torque constants.
     drawn = drawn / arms.torque_scale[:, np.minimum(joint, len(largest) - 1)]
@@ -329,11 +316,6 @@ def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[di
         )
         covariance[tilt, tilt] += (_TILT_SHARE * mean[gravity]) ** 2
         covariance[offset, offset] += (0.5 * mean[coulomb]) ** 2
-    tilts = [NAMES.index("tilt_2"), NAMES.index("tilt_of_2")]
-    gravities = mean[[NAMES.index("gravity_2"), NAMES.index("gravity_of_2")]]
-    tilted = _TILT_SHARE**2 * np.outer(gravities, gravities)
-    tilted[0, 0] = 0.0  # already there
-    covariance[np.ix_(tilts, tilts)] += tilted
     return dict(zip(NAMES, mean.tolist(), strict=True)), np.asarray(covariance)
 
 
@@ -347,7 +329,7 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
     spread = np.zeros(len(NAMES))
     is_flat = config.arm.gravity == 0.0
     for index, name in enumerate(NAMES):
-        if name in _IN_FIRST or (len(largest) == 1 and name in _OF_TWO):
+        if len(largest) == 1 and name in _OF_TWO:
             continue
         joint = len(largest) - 1 if name.endswith("_2") else 0
         term = name.rpartition("_")[0]
@@ -356,9 +338,4 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
         else:
             share = _FLAT if is_flat and term in ("gravity", "tilt") else _UNDESCRIBED.get(term, _INERTIA)
             spread[index] = share * largest[joint]
-    covariance = np.diag(spread**2)
-    for first, second in _IN_BOTH.items():
-        one, other = NAMES.index(first), NAMES.index(second)
-        covariance[one, other] = covariance[other, one] = covariance[one, one]
-        covariance[other, other] = (1.0 + _RATIO_STD**2) * covariance[one, one]
-    return mean, covariance
+    return mean, np.diag(spread**2)
