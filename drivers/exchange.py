@@ -44,6 +44,9 @@ AFTER_LOSS = 5
 many cycles late is recognised by its length.
 """
 
+_AGAIN_SHARE = 0.5
+"""Largest fraction of a cycle by which a second read-back, after a lost one, may delay the next cycle."""
+
 _LONGEST_REPLY = 1024
 _DOUBTS = 3
 
@@ -147,6 +150,12 @@ class Exchange:
         """Duration of the latest cycle [s]."""
         self._usual = self._latest_plan = self._plans[0]
         self._read_back: ReadBack | None = None
+        self._longest_again = _AGAIN_SHARE * interval
+        self._asked_again_at = -math.inf
+        self.awaited_until = -math.inf
+        """Until when the reply to the latest second read-back was awaited, even if it delayed the next cycle [s on the
+        port's clock].
+        """
         self.read_back_at = math.inf
         """When `overruled` should be called again, before the next cycle [s on the port's clock]."""
 
@@ -264,20 +273,12 @@ class Exchange:
         if before + takes > due:  # woken up late
             self.read_back_at = before + TRY_AGAIN_S
             return None
-        expected = port.reply_time(due - before, len(read.request))
-        if self._echoes:
-            received = port.ask(read.request, len(read.request) + read.reply_size, expected, before)
-            received = received.removeprefix(read.request)
-        else:
-            received = port.ask(read.request, read.reply_size, expected, before)
-        if port.overheard:
-            self._overhear()
-        servos = read.unpack(received)
-        if servos is None:
-            # A master that writes between two cycles is heard here, and nowhere else if the next reply is complete.
-            servos = read.search(received)[0]
-            self.heard.beside(received, echoes=self._echoes)
+        servos = self._ask_back(read, before, due - before)
         now = self._now()
+        if None in servos and takes < self._longest_again and now > self._asked_again_at + TRY_AGAIN_S:
+            # The packet of another master may have destroyed the reply, and the next cycle overwrites what it wrote.
+            self._asked_again_at, self.awaited_until = now, now + takes + self._wire_s[read]
+            servos = self._ask_back(read, now, self.awaited_until - now)
         self.read_back_at = now
         if None in servos:
             self._expect_late()
@@ -289,6 +290,24 @@ class Exchange:
         if back.is_unexpected:
             self.read_status_next()  # it distinguishes lost goals from another master's
         return found
+
+    def _ask_back(self, read: GroupRead, start: float, timeout: float) -> list[Answer]:
+        """Send the read at `start` [s]; return the answers that arrive within `timeout` [s]."""
+        port = self._port
+        expected = port.reply_time(timeout, len(read.request))
+        if self._echoes:
+            received = port.ask(read.request, len(read.request) + read.reply_size, expected, start)
+            received = received.removeprefix(read.request)
+        else:
+            received = port.ask(read.request, read.reply_size, expected, start)
+        if port.overheard:
+            self._overhear()
+        servos = read.unpack(received)
+        if servos is None:
+            # A master that writes between two cycles is heard here, and nowhere else if the next reply is complete.
+            servos = read.search(received)[0]
+            self.heard.beside(received, echoes=self._echoes)
+        return servos
 
     def cycle(self, goal_ticks: Sequence[int], *, between: bool = False) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.

@@ -158,7 +158,7 @@ def driving_ms(config: Config, told: "Told", story: Story, undisturbed: Story) -
         sent_at = np.array([each[0] for each in sent])
         moved = _visible_motion(sent_at, np.array(heard).reshape(-1, 4))
         along = config.joints[joint].direction * np.array([each[1] for each in sent]) * np.sign(moved)
-        own = story.record[:, joint]
+        own = addressed(config, story.record, joint)
         along *= own["torque"][np.clip(np.searchsorted(own["time"], sent_at) - 1, 0, own.size - 1)]
         begun = None
         for (when, _), drives in zip(sent, along > most, strict=True):
@@ -183,6 +183,17 @@ def received(config: Config, story: Story) -> Heard:
     """What the program received in a run, and what it commanded."""
     told = Told(config, story.traffic, 0.0)
     return Heard.of(config, told.heard, told.sent)
+
+
+def addressed(config: Config, record: NDArray[Any], joint: int) -> NDArray[Any]:
+    """The record of the servo that had the joint's ID, in each millisecond; of the joint's own servo if none had it.
+
+    A program addresses IDs, and if two servos swap theirs, each does as it is told. Whether that shows in their replies
+    is another question.
+    """
+    has_id = record["id"] == config.joints[joint].id
+    servo = np.where(has_id.any(axis=1), has_id.argmax(axis=1), joint)
+    return np.asarray(record[np.arange(len(record)), servo])
 
 
 def acts_at(attack: Attack, attacks: Sequence[Attack]) -> float:
@@ -259,7 +270,12 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
                 ),
                 ("is not as fast as told", told.lies(joint, time, own, "velocity", interval), LASTING_MS, GAP_MS),
                 ("was not heard", told.silent(joint, time, interval, story.ended) & holds, LASTING_MS, 1),
-                ("does not do as told", told.disobeys(joint, time, own, interval), LASTING_MS, GAP_MS),
+                (
+                    "does not do as told",
+                    told.disobeys(joint, time, addressed(config, record, joint), interval),
+                    LASTING_MS,
+                    GAP_MS,
+                ),
                 ("is beyond a limit", _beyond(config, joint, own), 1, GAP_MS),
                 (
                     "is not where it would be",
@@ -308,7 +324,7 @@ def overruled_ms(config: Config, story: Story, told: "Told") -> float:
     time = story.record["time"][:, 0]
     longest = 0
     for joint in range(len(config.joints)):
-        own = story.record[:, joint]
+        own = addressed(config, story.record, joint)
         at = np.flatnonzero(told.disobeys(joint, time, own, 1.0 / config.experiment.rate) & own["driven"])
         breaks = np.flatnonzero(np.diff(at) > GAP_MS)
         for start, end in zip(at[np.r_[0, breaks + 1]], at[np.r_[breaks, at.size - 1]], strict=True) if at.size else ():

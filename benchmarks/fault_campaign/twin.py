@@ -5,6 +5,10 @@ configuration allows would have answered the same commands in the same way. Such
 parameters (masses, centres, inertias, friction, torque constants, a tilted base) with the emulator's own simulation, by
 least squares. If one is found, this proves that nothing could be detected. If none is found, that proves nothing, and
 the run counts as one in which the fault was detectable.
+
+A healthy arm may also have servos whose velocities lag, as far as the program accepts that of any servo, and, unless
+the configuration describes the arm, its two servos may have been wired the other way round from the start: a program
+knows a joint only by the ID that answers.
 """
 
 from collections.abc import Sequence
@@ -17,6 +21,7 @@ from scipy.optimize import least_squares
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.experiment.consistency import LAG_S
 from hil.fakes.plants import motor
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.plant import make_plant
@@ -25,6 +30,16 @@ Array = NDArray[np.float64]
 
 SAME_RAD, SAME_RAD_S = 0.02, 0.15
 """Largest difference of angles, and RMS difference of velocities, that ordinary encoders and velocity filters cause."""
+
+LAGS_S = np.linspace(0.0, LAG_S, 7)[1:]
+"""Lags of a velocity that are tried [s]."""
+
+LAGGING_S = 0.2
+"""Time within which the RMS difference of velocities must be ordinary if a lag explains them [s]: it explains them at
+all times, or not at all.
+"""
+
+_TICKS_PER_RAD = 4096 / (2 * np.pi)
 
 _UNDESCRIBED, _DESCRIBED = np.log(10.0), np.log(2.5)
 """Range of masses and inertias around the true ones, as logarithms of a factor, without and with link lengths."""
@@ -112,7 +127,35 @@ def has_healthy_twin(config: Config, heard: Heard, end: float) -> bool:
     told = heard.until(end)
     if not isinstance(arm, Arm) or any(joint.drive_mode is Mode.PWM for joint in config.joints) or told.time.size < 2:
         return False
+    if _is_found(config, arm, told):
+        return True
+    other = wired_otherwise(config, told)
+    return other is not None and _is_found(config, arm, other)
+
+
+def wired_otherwise(config: Config, told: Heard) -> Heard | None:
+    """The same replies and commands, if the two servos are wired the other way round: first those of the arm's first
+    joint. None if that cannot be: there must be two servos of the same model, and no description of the arm.
+    """
+    assert config.fake is not None
+    models = {joint.model for joint in config.joints}
+    if len(config.joints) != 2 or len(models) > 1 or config.arm.link_lengths is not None:
+        return None
+    signs, angles = [], []
+    for place, (named, mounted) in enumerate(zip(reversed(config.joints), config.fake.servos, strict=True)):
+        sign = named.direction * mounted.direction
+        ticks = named.zero_ticks - mounted.zero_ticks
+        signs.append(sign)
+        angles.append(sign * told.angle[:, 1 - place] + mounted.direction * ticks / _TICKS_PER_RAD)
+    velocity, commands = told.velocity[:, ::-1] * signs, told.commands[:, ::-1] * signs
+    return Heard(told.time, np.column_stack(angles), velocity, told.commanded_at, commands)
+
+
+def _is_found(config: Config, arm: Arm, told: Heard) -> bool:
+    """Whether an arm is found that would have sent these replies: the true one, or one like it."""
     limits = _limits(len(arm.links), _UNDESCRIBED if config.arm.link_lengths is None else _DESCRIBED)
+    if _is_same(_differences(arm, np.zeros(limits.size), told), told):
+        return True
     picked = told.every(_COARSE_S)
     coarse = told.at(picked).averaged()
 
@@ -155,7 +198,32 @@ def _differences(arm: Arm, parameters: Array, told: Heard) -> Array:
 
 def _is_same(different: Array, told: Heard) -> bool:
     angle, velocity = different.reshape(2, *told.angle.shape)
-    return bool(np.abs(angle).max() <= 1.0 and np.sqrt(np.mean(velocity**2, axis=0)).max() <= 1.0)
+    if np.abs(angle).max() > 1.0:
+        return False
+    same = np.sqrt(np.mean(velocity**2, axis=0)) <= 1.0
+    own = told.velocity + SAME_RAD_S * velocity
+    return all(
+        is_same
+        or any(_agrees(lagging(own[:, joint], told.time, lag) - told.velocity[:, joint], told) for lag in LAGS_S)
+        for joint, is_same in enumerate(same.tolist())
+    )
+
+
+def lagging(velocity: Array, time: Array, lag: float) -> Array:
+    """A velocity (n,) [rad/s] at `time` (n,) [s] as a servo reports it whose first-order filter lags by `lag` [s]."""
+    told = velocity.copy()
+    kept = np.exp(-np.diff(time) / lag)
+    mean = 0.5 * (velocity[1:] + velocity[:-1])
+    for index, (keep, value) in enumerate(zip(kept.tolist(), mean.tolist(), strict=True), 1):
+        told[index] = keep * told[index - 1] + (1.0 - keep) * value
+    return told
+
+
+def _agrees(different: Array, told: Heard) -> bool:
+    """Whether the RMS of these differences of velocities [rad/s] is ordinary within every `LAGGING_S`."""
+    _, place = np.unique(np.floor((told.time - told.time[0]) / LAGGING_S), return_inverse=True)
+    squares = np.bincount(place, different**2) / np.bincount(place)
+    return bool(np.sqrt(squares).max() <= SAME_RAD_S)
 
 
 def _limits(links: int, range_of_masses: float) -> Array:

@@ -36,6 +36,7 @@ RECORD = np.dtype(
         ("driven", "?"),
         ("torque", "?"),
         ("goal", "i4"),
+        ("id", "i4"),
         ("current", "f8"),
         ("position", "f8"),
         ("velocity", "f8"),
@@ -52,7 +53,7 @@ class Witness:
         self._tell = [_teller(servo) for servo in bus._servos]
         self._next = bus.time + STEP_S
         self._times: list[float] = []
-        self._goals: list[tuple[tuple[bool, bool, int], ...]] = []
+        self._goals: list[tuple[tuple[bool, bool, int, int], ...]] = []
         self._motion = array("d")  # currents, positions and velocities of all joints, row by row
         self._disturbed: list[tuple[int, Attack]] = []
         self._missing = [0.0] * bus.plant.joints
@@ -174,20 +175,22 @@ class Witness:
         """The record so far (milliseconds, joints), with dtype `RECORD`."""
         record = np.empty((len(self._times), self.joints), RECORD)
         record["time"] = np.array(self._times)[:, None]
-        goals = np.array(self._goals, dtype=np.int64).reshape(-1, self.joints, 3)
-        record["driven"], record["torque"], record["goal"] = np.moveaxis(goals, -1, 0)
+        goals = np.array(self._goals, dtype=np.int64).reshape(-1, self.joints, 4)
+        record["driven"], record["torque"], record["goal"], record["id"] = np.moveaxis(goals, -1, 0)
         motion = np.frombuffer(self._motion).reshape(-1, 3, self.joints)
         record["current"], record["position"], record["velocity"] = np.moveaxis(motion, 1, 0)
         return record
 
 
-def _teller(servo: EmulatedServo) -> Callable[[], tuple[bool, bool, int]]:
-    """Return a function that tells whether the servo drives its motor, whether torque is on, and its goal [ticks]."""
+def _teller(servo: EmulatedServo) -> Callable[[], tuple[bool, bool, int, int]]:
+    """Return a function that tells whether the servo drives its motor, whether torque is on, its goal [ticks] and its
+    ID.
+    """
     memory = servo.memory
-    torque_at, mode_at = (memory.registers[name].address for name in ("Torque Enable", "Operating Mode"))
+    torque_at, mode_at, id_at = (memory.registers[name].address for name in ("Torque Enable", "Operating Mode", "ID"))
     current_at, pwm_at = (_bytes_of(memory, name) for name in ("Goal Current", "Goal PWM"))
 
-    def tell() -> tuple[bool, bool, int]:
+    def tell() -> tuple[bool, bool, int, int]:
         data = memory.data  # called every millisecond: looking up registers by name takes five times as long
         torque, mode = data[torque_at] == 1, data[mode_at]
         if mode == CURRENT_MODE:
@@ -196,7 +199,7 @@ def _teller(servo: EmulatedServo) -> Callable[[], tuple[bool, bool, int]]:
             goal = int.from_bytes(data[pwm_at], "little", signed=True)
         else:
             goal = int(torque)  # position and velocity control drive the motor whenever torque is on
-        return torque and goal != 0, torque, goal
+        return torque and goal != 0, torque, goal, data[id_at]
 
     return tell
 

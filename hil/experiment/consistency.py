@@ -13,9 +13,9 @@ in this difference. The contributions of a healthy servo are known:
   lag up to `LAG_S` is accepted;
 - a velocity with a scale error: that fraction of the distance covered within the memory, at most `SCALE`;
 - a velocity that is rounded towards zero, or always downwards (which of these a servo does is unknown). In the slow
-  memory: one step of the register for as long as the joint has moved in one direction longer than in the other, or half
-  a step for as long as it has moved. After `BIASED_S` of motion, the mean difference so far counts as the servo's own,
-  up to half a step; then less is allowed. While the register shows zero, motion below one step does not count;
+  memory: one step of the register for as long as the joint has moved in one direction longer than in the other, or a
+  bias of up to half a step for as long as it has moved, as far as the motion so far leaves it open
+  (`hil.experiment.velocity.bias`). While the register shows zero, motion below one step does not count;
 - the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where
   a fraction `CURVED` of the change of velocity times the interval remains. Where the velocity jumps they do not: in the
   slow memory, which contains many jumps, their sum is a random walk.
@@ -28,8 +28,9 @@ perhaps during the last `LAG_S`. The distance covered before that must therefore
 the reported velocity is frozen. This detects a velocity that freezes near its peak sooner than the memories do, in
 which a lag could explain the difference.
 
-Lag and scale error are properties of a servo and do not change. Once the joint has moved fast for `LEARNT_S`, up to
-twice the values estimated by then (by least squares) are accepted, plus `MORE_LAG_S` and `MORE_SCALE`.
+Lag and scale error are properties of a servo and do not change. A lag that does is a fault
+(`hil.experiment.velocity.lag`). Once the motion has shown them, up to twice the estimated values are accepted, plus
+`MORE_LAG_S` and `MORE_SCALE` and twice their standard deviations.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
 that it keeps for a joint is a record of the type `MEMORY`.
@@ -43,6 +44,7 @@ import numpy as np
 
 from hil.drivers.state import State
 from hil.errors import Cause, SafetyStop
+from hil.experiment.velocity import bias, lag
 
 __all__ = ["MEMORY", "begin", "check_standstill", "look", "lost", "moved_at_standstill"]
 
@@ -60,14 +62,13 @@ rounded towards zero.
 """
 
 LAG_S = 0.03
-LEARNT_S = 1.5
 MORE_LAG_S = 0.008
-_FAST_RAD_S = 2.0
-"""Smallest range of velocities within a fading memory from which the lag can be estimated [rad/s]."""
+STDS = 2.0
+"""Number of standard deviations by which the estimates of lag and scale error may be wrong."""
 
-_SEPARATE = 0.05
-"""Determinant of the normal equations, relative to that of uncorrelated signals, below which lag and scale error cannot
-be told apart.
+BIAS_LAG_S, BIAS_SCALE, BIAS_LAG_SHARE = 0.002, 0.005, 0.1
+"""Errors of these estimates, beside their standard deviations, that a creep has to exceed [s, 1]. The last is relative
+to the lag, times the range of velocities, since a filter is not a pure delay.
 """
 
 _LAG_SHARE = 0.25
@@ -101,12 +102,6 @@ CURVED = 0.35
 """Allowance for the velocity between samples, as a fraction of its change times the interval. A wave with only four
 samples per period, the fastest that is used, needs 0.27.
 """
-
-BIASED_S = 2.5
-"""Time of motion after which the bias of a servo's velocity is known [s]."""
-
-BIAS_UNSURE_RAD_S = 0.003
-"""Its uncertainty then [rad/s]: 0.0075 rad within that time."""
 
 ROUGH_TIMES = 2.0
 """Allowance of the slow memory for a velocity that jumps between samples, as when teeth change sides: multiple of the
@@ -151,10 +146,11 @@ MEMORY = np.dtype(
     [
         *((name, "f8") for name in ("position", "velocity")),
         *((name, "f8") for name in ("seconds", "moved", "difference", "unknown", "most_curved")),
-        *((name, "f8") for name in ("turn", "seen", "headed", "heading", "moving", "timed", "bias")),
+        *((name, "f8") for name in ("turn", "seen", "headed", "heading", "moving")),
         *((name, "f8") for name in ("rough", "roughness")),
-        *((name, "f8") for name in ("learnt_for", "lag_squared", "scale_squared", "crossed", "lag_product")),
-        *((name, "f8") for name in ("scale_product", "lag", "scale")),
+        *((name, "f8") for name in ("learnt", "lag", "scale")),
+        *bias.FIELDS,
+        ("lags", lag.LAGS),
         ("steps", _STEPS),
         ("same", _SAME),
         ("short", _FADING),
@@ -168,16 +164,16 @@ position, velocity, turn: latest ones, and the latest change of velocity [rad, r
 first one and after a long gap. seconds, moved, difference, unknown, most_curved: sums (for the last one, the maximum)
 since the long memory was last updated. seen: that difference without motion that the velocity's register cannot show.
 headed: time of motion in positive less in negative direction since then [s]. rough: sum of squares of what jumps of the
-velocity may add in each interval since then [rad^2]. heading, roughness: the same two, in the slow memory. learnt_for:
-duration of the motion that lag and scale error were estimated from [s]. lag_squared, scale_squared, crossed,
-lag_product, scale_product: elements of the normal equations for lag and scale error. lag, scale: largest accepted
-values [s, 1].
+velocity may add in each interval since then [rad^2]. heading, roughness: the same two, in the slow memory. moving: time
+of motion in it [s]. learnt: information from which lag and scale error were learnt [rad^2/s]. lag, scale: their largest
+accepted values [s, 1]. Then the range of the bias, and the sums from which lag and scale error are estimated.
 """
 
 
 def begin(memory: Any) -> None:
     """Initialise a zero-filled record."""
     memory["position"] = np.nan
+    bias.begin(memory)
     memory["lag"], memory["scale"] = LAG_S, SCALE
 
 
@@ -194,9 +190,10 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
         _restart(memory.long, velocity)
         _restart(memory.slow, velocity)
         memory.turn = memory.heading = memory.roughness = 0.0
-        memory.moving = memory.timed = 0.0
+        memory.moving = 0.0
         _forget_sums(memory)
         _begin_same(memory.same)
+        _forget_block(memory.lags)
         return False
     moved = position - former
     turned = abs(velocity - before)
@@ -215,6 +212,8 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
     _add(short, SHORT_S, moved, difference, velocity, seconds, curved, unknown)
     if _is_wrong(short, short.apart, UNSURE_RAD, velocity, memory.lag, memory.scale):
         return True
+    if not unsure > seconds and _add_to_lags(memory.lags, velocity - short.mean, short.far, short.apart, seconds):
+        return True
     # The long memories process several intervals at once, so that those of a fast rate are not lost in rounding.
     memory.moved += moved
     memory.difference += difference
@@ -225,16 +224,15 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
     if heads != 0.0:
         memory.headed += seconds if heads > 0.0 else -seconds
         memory.moving += seconds
-        memory.timed += seconds
-    # A joint that seems to stand still may turn by less than one step of the velocity.
+        # A joint that seems to stand still may turn by less than one step of the velocity.
     memory.seen += difference if heads != 0.0 or abs(moved) > RESOLUTION_RAD_S * seconds + STEP_RAD else 0.0
     memory.unknown += unknown
     memory.most_curved = max(memory.most_curved, curved)
     memory.seconds += seconds
     if memory.seconds >= LONG_EVERY_S and _looks_long(memory, velocity):
         return True
-    if memory.learnt_for < LEARNT_S and short.span > _FAST_RAD_S and not unsure > seconds:
-        _learn(memory, velocity, seconds)
+    if memory.lags.information != memory.learnt:
+        _learn(memory)
     return False
 
 
@@ -288,17 +286,32 @@ def _looks_long(memory: Any, velocity: float) -> bool:
     memory.heading += memory.headed - fades * memory.heading
     memory.moving -= fades * memory.moving
     memory.roughness += memory.rough - fades * memory.roughness
-    if memory.bias == 0.0 and memory.timed > BIASED_S:
-        most = 0.5 * RESOLUTION_RAD_S
-        memory.bias = min(max(slow.apart / memory.moving, -most), most)
-    uncertain = BIAS_UNSURE_RAD_S if memory.bias != 0.0 else 0.5 * RESOLUTION_RAD_S
-    of_rounding = max(RESOLUTION_RAD_S * abs(memory.heading), uncertain * memory.moving)
-    unsure = SLOW_UNSURE_RAD + of_rounding + ROUGH_TIMES * np.sqrt(memory.roughness)
+    of_rounding, of_jumps = RESOLUTION_RAD_S * abs(memory.heading), ROUGH_TIMES * np.sqrt(memory.roughness)
+    creeps = memory.learnt > 0.0 and _creeps(memory, velocity, of_rounding + of_jumps)
+    apart = _unexplained(memory, slow.apart, memory.moving)
+    unsure = SLOW_UNSURE_RAD + of_jumps
     _forget_sums(memory)
     return bool(
-        _is_wrong(long, long.apart, LONG_UNSURE_RAD, velocity, memory.lag, memory.scale)
-        or _is_wrong(slow, slow.apart - memory.bias * memory.moving, unsure, velocity, memory.lag, memory.scale)
+        creeps
+        or _is_wrong(long, long.apart, LONG_UNSURE_RAD, velocity, memory.lag, memory.scale)
+        or (
+            _is_wrong(slow, apart, unsure, velocity, memory.lag, memory.scale)
+            and _is_wrong(slow, slow.apart, unsure + of_rounding, velocity, memory.lag, memory.scale)
+        )
     )
+
+
+def _creeps(memory: Any, velocity: float, unsure: float) -> bool:
+    """Whether the position creeps, given what is known of the velocity's errors.
+
+    unsure: allowance for rounding and jumps [rad].
+    """
+    slow, lags = memory.slow, memory.lags
+    of_lag = velocity - slow.mean
+    lag_error, scale_error = BIAS_LAG_S + STDS * lags.lag_std, BIAS_SCALE + STDS * lags.scale_std
+    known = BIAS_LAG_SHARE * abs(lags.lag) * slow.span + lag_error * abs(of_lag) + scale_error * abs(slow.far)
+    errors = max(NOISE_RAD, NOISE_TIMES * lags.noise) + known + slow.curved + memory.unknown + unsure
+    return bool(_look_at_bias(memory, slow.apart - lags.lag * of_lag - lags.scale * slow.far, errors, memory.moving))
 
 
 def _forget_sums(memory: Any) -> None:
@@ -306,24 +319,12 @@ def _forget_sums(memory: Any) -> None:
     memory.seen = memory.headed = memory.rough = 0.0
 
 
-def _learn(memory: Any, velocity: float, seconds: float) -> None:
-    apart, per_scale = memory.short.apart, memory.short.far
-    per_lag = velocity - memory.short.mean
-    memory.lag_squared += per_lag * per_lag
-    memory.scale_squared += per_scale * per_scale
-    memory.crossed += per_lag * per_scale
-    memory.lag_product += per_lag * apart
-    memory.scale_product += per_scale * apart
-    memory.learnt_for += seconds
-    if memory.learnt_for < LEARNT_S:
-        return
-    determinant = memory.lag_squared * memory.scale_squared - memory.crossed * memory.crossed
-    if determinant <= _SEPARATE * memory.lag_squared * memory.scale_squared:
-        return
-    lag = (memory.lag_product * memory.scale_squared - memory.scale_product * memory.crossed) / determinant
-    scale = (memory.scale_product * memory.lag_squared - memory.lag_product * memory.crossed) / determinant
-    memory.lag = min(LAG_S, 2.0 * max(lag, 0.0) + MORE_LAG_S)
-    memory.scale = min(SCALE, 2.0 * abs(scale) + MORE_SCALE)
+def _learn(memory: Any) -> None:
+    """Accept a multiple of the lag and the scale error estimated so far, and no longer any that a servo might have."""
+    lags = memory.lags
+    memory.learnt = lags.information
+    memory.lag = min(LAG_S, 2.0 * max(lags.lag, 0.0) + MORE_LAG_S + STDS * lags.lag_std)
+    memory.scale = min(SCALE, 2.0 * abs(lags.scale) + MORE_SCALE + STDS * lags.scale_std)
 
 
 def _begin_same(same: Any) -> None:
@@ -411,15 +412,24 @@ def _is_wrong(fading: Any, apart: float, unsure: float, velocity: float, lag: fl
     apart: their difference in this memory, without a known bias [rad]. unsure: tolerance of this memory [rad]. lag,
     scale: largest accepted lag [s] and scale error.
     """
-    of_lag = lag * (velocity - fading.mean)
-    allowed = unsure + scale * abs(fading.far) + fading.curved + fading.unknown + _LAG_SHARE * lag * fading.span
+    allowed, of_lag = _explained(fading, unsure, velocity, lag, scale)
     if of_lag > 0.0:
         return bool(apart > allowed + of_lag or apart < -allowed)
     return bool(apart > allowed or apart < of_lag - allowed)
 
 
+def _explained(fading: Any, unsure: float, velocity: float, lag: float, scale: float) -> tuple[float, float]:
+    """Difference that is accepted in either direction, and that which the largest lag adds [rad]."""
+    allowed = unsure + scale * abs(fading.far) + fading.curved + fading.unknown + _LAG_SHARE * lag * fading.span
+    return allowed, lag * (velocity - fading.mean)
+
+
 _inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
+_explained = _inner(_explained)
 _restart, _add, _is_wrong, _has_jumped, _forget_sums, _begin_same, _is_frozen = map(
     _inner, (_restart, _add, _is_wrong, _has_jumped, _forget_sums, _begin_same, _is_frozen)
 )
+NOISE_RAD, NOISE_TIMES, _look_at_bias, _unexplained = bias.NOISE_RAD, bias.NOISE_TIMES, bias.look, bias.unexplained
+_add_to_lags, _forget_block = lag.add, lag.forget
+_creeps = _inner(_creeps)
 _looks_long, _learn, look, lost = map(_inner, (_looks_long, _learn, look, lost))

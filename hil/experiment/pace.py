@@ -50,7 +50,7 @@ class Pace:
             read_back(self._bus, self._guard, former + self.interval)
         tick = self._ticks.wait()
         deadline, now, _ = tick
-        awake_at = self._awake_at
+        awake_at = max(self._awake_at, self._exchange.awaited_until)  # a second read-back delays this sample on purpose
         self._guard.woke_up(now, now - (deadline if deadline > awake_at else awake_at))
         self._deadline, self._awake_at = deadline, now
         return tick

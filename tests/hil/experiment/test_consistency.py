@@ -14,15 +14,16 @@ from hil.experiment.consistency import (
     CURVED,
     CURVED_AT_FIRST,
     LAG_S,
-    LEARNT_S,
     LONG_EVERY_S,
     LONG_S,
     MORE_LAG_S,
     MORE_SCALE,
     SCALE,
     SHORT_S,
+    STDS,
     moved_at_standstill,
 )
+from hil.experiment.velocity.lag import ALL_INFORMATION, BLOCK_S, ENOUGH_INFORMATION, LASTS_S, NOISE_RAD
 from tests.support.one_joint import Consistency
 
 RATES = (20, 100, 400, 1000)
@@ -180,6 +181,47 @@ def test_a_slow_creep_is_seen_before_the_position_is_far_off(rate: int) -> None:
     assert 4.0 < when <= 5.5
 
 
+@pytest.mark.parametrize(("rate", "most"), [(100, 3.5), (400, 2.6), (1000, 2.6)])
+@pytest.mark.parametrize(("speed", "begun"), [(0.035, 0.55), (0.04, 1.3), (-0.04, 1.3)])
+def test_a_creep_that_begins_in_the_first_moments_is_seen_before_the_position_is_far_off(
+    rate: int, speed: float, begun: float, most: float
+) -> None:
+    """What a velocity's bias may be is known before the creep, which cannot widen it afterwards."""
+    when = seen_after(
+        rate,
+        lambda now: learnt_motion(now)[0] + speed * max(now - begun, 0.0),
+        lambda now: learnt_motion(now)[1],
+    )
+    assert 0.5 < when - begun <= most
+
+
+def filtered(lag: float, rate: int, since: float = 0.0, before: float = 0.0) -> Callable[[float], float]:
+    """The velocity of `learnt_motion` through a first-order filter of this lag [s] from `since` on."""
+    state = [learnt_motion(0.0)[1]]
+
+    def velocity(now: float) -> float:
+        time_constant = lag if now >= since else before
+        kept = math.exp(-1 / rate / time_constant) if time_constant else 0.0
+        state[0] = kept * state[0] + (1.0 - kept) * learnt_motion(now)[1]
+        return state[0]
+
+    return velocity
+
+
+@pytest.mark.parametrize("rate", [100, 400, 1000])
+@pytest.mark.parametrize(("before", "after"), [(0.0, 0.021), (0.006, 0.028)])
+def test_a_lag_of_the_velocity_that_changes_is_seen(rate: int, before: float, after: float) -> None:
+    """Any servo may have had the new lag from the start; but no servo's filter changes."""
+    when = seen_after(rate, lambda now: learnt_motion(now)[0], filtered(after, rate, since=1.0, before=before))
+    assert 1.0 < when <= 1.4
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("lag", [0.004, 0.012, 0.025])
+def test_a_lag_that_a_servo_always_had_is_accepted(rate: int, lag: float) -> None:
+    assert seen_after(rate, lambda now: learnt_motion(now)[0], filtered(lag, rate)) == math.inf
+
+
 @pytest.mark.parametrize("speed", [0.047, 0.11])
 def test_a_velocity_that_is_rounded_towards_zero_in_a_long_motion_one_way_is_accepted(speed: float) -> None:
     assert seen_after(100, lambda now: speed * now, lambda _: TICK * int(speed / TICK)) == math.inf
@@ -295,6 +337,8 @@ def test_both_memories_and_what_is_learnt_are_what_their_definitions_say() -> No
     short = long = _Reference(SHORT_S, 0.0)
     waiting: list[tuple[float, ...]] = []
     lessons: list[tuple[float, float, float, float]] = []
+    learnt: tuple[float, ...] = ()
+    done = since = 0.0
     for index in range(1100):
         seconds = random.choice((0.002, 0.0025, 0.004)) if index else 0.0
         now += seconds
@@ -317,20 +361,37 @@ def test_both_memories_and_what_is_learnt_are_what_their_definitions_say() -> No
                 long.rows.append((*sums[:2], velocity, sums[2], max(each[4] for each in waiting), sums[3]))
                 waiting = []
             memory = look.memory["short"]
-            if memory["span"] > 2.0 and sum(each[2] for each in lessons) < LEARNT_S:
-                lessons.append(
-                    tuple(float(each) for each in (velocity - memory["mean"], memory["far"], seconds, memory["apart"]))
-                )
+            lessons.append(
+                tuple(float(each) for each in (velocity - memory["mean"], memory["far"], seconds, memory["apart"]))
+            )
+            since += seconds
+            if since >= BLOCK_S:
+                since = 0.0
+                if done < ALL_INFORMATION:
+                    learnt = _fitted(lessons)
+                    done = learnt[-1]
         before, former = velocity, position
     for memory, reference in ((look.memory["short"], short), (look.memory["long"], long)):
         for name, value in reference.of().items():
             assert memory[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
-    assert sum(each[2] for each in lessons) >= LEARNT_S
-    signals = np.array(lessons)
-    (lag, scale), *_ = np.linalg.lstsq(signals[:, :2], signals[:, 3], rcond=None)
-    assert look.memory["lag"] == pytest.approx(2 * lag + MORE_LAG_S)
-    assert look.memory["scale"] == pytest.approx(2 * scale + MORE_SCALE)
+    lag, scale, lag_std, scale_std, _ = learnt
+    assert done > ENOUGH_INFORMATION
+    assert look.memory["lag"] == pytest.approx(2 * lag + MORE_LAG_S + STDS * lag_std)
+    assert look.memory["scale"] == pytest.approx(2 * scale + MORE_SCALE + STDS * scale_std)
     assert look.memory["lag"] < LAG_S and look.memory["scale"] < SCALE
+
+
+def _fitted(lessons: list[tuple[float, float, float, float]]) -> tuple[float, ...]:
+    """Lag, scale error, their standard deviations and the information about the lag, from a weighted fit."""
+    signals = np.array(lessons)
+    weights = np.sqrt(signals[:, 2])
+    design = weights[:, None] * np.column_stack((signals[:, 0], signals[:, 1], np.ones(len(signals))))
+    measured = weights * signals[:, 3]
+    (lag, scale, _), *_ = solution = np.linalg.lstsq(design, measured, rcond=None)
+    left = measured - design @ solution[0]
+    variance = max(float(left @ left) / signals[:, 2].sum(), NOISE_RAD**2) * LASTS_S
+    inverse = np.linalg.inv(design.T @ design)
+    return lag, scale, math.sqrt(variance * inverse[0, 0]), math.sqrt(variance * inverse[1, 1]), 1.0 / inverse[0, 0]
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])

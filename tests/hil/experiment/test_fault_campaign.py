@@ -11,8 +11,8 @@ from benchmarks.fault_campaign.arms import MIXED, RATES, Setting, names, setting
 from benchmarks.fault_campaign.attack import Attack, Kind
 from benchmarks.fault_campaign.campaign import Outcome, inject_drawn, prepare
 from benchmarks.fault_campaign.draw import Drawn
-from benchmarks.fault_campaign.judge import acts_at, judge_words, received, since_again
-from benchmarks.fault_campaign.twin import has_healthy_twin
+from benchmarks.fault_campaign.judge import acts_at, addressed, judge_words, received, since_again
+from benchmarks.fault_campaign.twin import has_healthy_twin, lagging, wired_otherwise
 from benchmarks.fault_campaign.witness import CURRENT_MODE, PWM_MODE, Witness
 from benchmarks.faults import campaign, figures
 from hil.drivers.servo_model import Mode
@@ -147,6 +147,62 @@ def test_a_healthy_twin_is_found_for_a_healthy_arm_and_a_stuck_one_but_not_for_o
         heard, angle=np.where(moves, heard.angle, heard.angle[at]), velocity=np.where(moves, heard.velocity, 0.0)
     )
     assert has_healthy_twin(ready.config, frozen, 1.2) and not has_healthy_twin(ready.config, frozen, 1.3)
+
+
+def lags_from(since: float, lag: float) -> bool:
+    """Whether a healthy arm is found for one whose velocity lags by `lag` from `since` on [s]."""
+    ready = prepare(Setting("fake_pendulum", 100), 1.0)
+    heard = received(ready.config, ready.undisturbed)
+    late = np.where(heard.time < since, heard.velocity[:, 0], lagging(heard.velocity[:, 0], heard.time, lag))
+    return has_healthy_twin(ready.config, replace(heard, velocity=late[:, None]), 2.4)
+
+
+def test_a_healthy_servo_s_velocity_may_lag_but_neither_by_any_time_nor_more_than_before() -> None:
+    assert lags_from(0.0, 0.025)
+    assert not lags_from(0.0, 0.15), "more than the program accepts of any servo"
+    assert not lags_from(1.4, 0.1)
+
+
+def test_servos_wired_the_other_way_round_are_a_healthy_arm_unless_that_shows_in_the_replies() -> None:
+    """IDs swapped before the first reading leave no trace; swapped later, the readings jump."""
+    ready = prepare(Setting("fake_two_link", 100), 1.0)
+    heard = received(ready.config, ready.undisturbed)
+    swapped = wired_otherwise(ready.config, heard)
+    assert swapped is not None
+    back = wired_otherwise(ready.config, swapped)
+    assert back is not None and np.allclose(back.angle, heard.angle)
+    # What the program receives under the IDs that the file names, if each servo answers with the other one's.
+    other = replace(
+        heard,
+        angle=heard.angle[:, ::-1] + np.array([-np.pi / 2, np.pi / 2]),
+        velocity=heard.velocity[:, ::-1],
+        commands=heard.commands[:, ::-1],
+    )
+    assert has_healthy_twin(ready.config, other, 2.0)
+    later = heard.time[:, None] > 1.2
+    mixed = replace(
+        heard,
+        angle=np.where(later, other.angle, heard.angle),
+        velocity=np.where(later, other.velocity, heard.velocity),
+    )
+    assert not has_healthy_twin(ready.config, mixed, 2.0)
+
+
+def test_arms_of_different_servos_or_with_a_description_are_not_wired_the_other_way_round() -> None:
+    ready = prepare(Setting("fake_two_link", 100), 1.0)
+    config, heard = ready.config, received(ready.config, ready.undisturbed)
+    described = config.model_copy(update={"arm": config.arm.model_copy(update={"link_lengths": [0.147, 0.18]})})
+    assert wired_otherwise(config, heard) is not None and wired_otherwise(described, heard) is None
+    assert wired_otherwise(prepare(Setting(MIXED, 100), PERIOD_S).config, heard) is None
+
+
+def test_a_servo_that_has_taken_another_s_id_does_as_told_if_it_obeys_that_id() -> None:
+    ready = prepare(Setting("fake_two_link", 100), 1.0)
+    config, record = ready.config, ready.undisturbed.record[:3].copy()
+    record["id"] = [[1, 2], [2, 1], [1, 200]]
+    record["goal"] = [[10, 20], [30, 40], [50, 60]]
+    assert addressed(config, record, 0)["goal"].tolist() == [10, 40, 50]
+    assert addressed(config, record, 1)["goal"].tolist() == [20, 30, 60], "if none has the ID, its own servo counts"
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ class Bus:
         self.exchanges_per_sample = turns
         self.patience = 0.02
         self.read_back_at = math.inf
+        self.awaited_until = -math.inf
         self.heard_instead = self.commanded_by_another = ""
         self.is_watched = True
         self.modes_seen_ago = math.inf

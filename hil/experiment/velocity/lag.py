@@ -1,0 +1,129 @@
+"""Estimates by how much a servo's velocity lags behind its position and is off scale, and detects a lag that changes.
+
+Servos filter their velocities, so that any servo may have a lag. It is the slope of the difference `apart` (see
+`hil.experiment.consistency`) over the velocity less its mean in the short memory; a scale error is its slope over the
+distance covered. Both are estimated by least squares, together with a constant. An estimate is only as certain as the
+velocity has changed.
+
+Neither of them changes during a run. The lag in the last `BLOCKS` blocks of `BLOCK_S` is therefore compared with that
+in all blocks before: the difference must not exceed what their uncertainties and a filter explain, whose lag depends on
+the frequency of the motion.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+
+BLOCK_S, BLOCKS = 0.1, 4
+"""Duration of a block [s], and the number of blocks that are compared with the time before."""
+
+CHANGED_S, CHANGED_SHARE = 0.005, 0.35
+"""Change of the lag that is always accepted [s], and the fraction of the former lag that it may amount to."""
+
+TIMES = 4.0
+NOISE_RAD, LASTS_S = 0.0015, 0.1
+"""Standard deviation of `apart` that is always assumed [rad], and the time for which its errors last [s]."""
+
+LEAST_INFORMATION = 0.1
+"""Smallest integral of the squared change of velocity, without what a scale error explains [rad^2/s]."""
+
+ENOUGH_INFORMATION, ALL_INFORMATION = 0.3, 3.0
+"""That integral over the whole run from which lag and scale error are known, and after which they no longer change."""
+
+SEPARATE = 0.05
+"""Fraction of that integral which must remain, or lag and scale error cannot be told apart."""
+
+LONGEST_S = 0.015
+"""Longest interval between two samples between which the velocity is known well enough [s]."""
+
+_SUMS = 10
+_LAG_2, _FAR_2, _CROSSED, _LAG_APART, _FAR_APART, _APART_2, _SECONDS, _LAG, _FAR, _APART = range(_SUMS)
+
+LAGS = np.dtype(
+    [
+        *(("block", "f8", (_SUMS,)), ("recent", "f8", (BLOCKS, _SUMS)), ("before", "f8", (_SUMS,)), ("oldest", "i8")),
+        *((name, "f8") for name in ("information", "lag", "lag_std", "scale", "scale_std", "noise")),
+    ]
+)
+"""Sums of products over the present block, over the latest complete ones, and over all earlier ones. oldest: row of the
+oldest complete block. information: that about the lag [rad^2/s]; then lag and scale error with their standard
+deviations [s, 1], and the RMS of what they do not explain [rad], all 0 as long as it is less than `ENOUGH_INFORMATION`.
+"""
+
+
+def add(lags: Any, change: float, far: float, apart: float, seconds: float) -> bool:
+    """Process a sample, `seconds` after the previous one; return whether the lag has changed.
+
+    change: velocity less its mean [rad/s]. far, apart: distance covered, and its difference from the integral of the
+    velocity [rad].
+    """
+    if seconds > LONGEST_S:
+        return False
+    block = lags.block
+    block[_LAG_2] += seconds * change * change
+    block[_FAR_2] += seconds * far * far
+    block[_CROSSED] += seconds * change * far
+    block[_LAG_APART] += seconds * change * apart
+    block[_FAR_APART] += seconds * far * apart
+    block[_APART_2] += seconds * apart * apart
+    block[_SECONDS] += seconds
+    block[_LAG] += seconds * change
+    block[_FAR] += seconds * far
+    block[_APART] += seconds * apart
+    return bool(block[_SECONDS] >= BLOCK_S and _completes_block(lags))
+
+
+def forget(lags: Any) -> None:
+    """Discard the present block: nothing is known about the motion since the previous sample."""
+    for each in range(_SUMS):
+        lags.block[each] = 0.0
+
+
+def _completes_block(lags: Any) -> bool:
+    row, latest, every = lags.recent[lags.oldest], np.zeros(_SUMS), np.zeros(_SUMS)
+    for each in range(_SUMS):
+        lags.before[each] += row[each]
+        row[each] = lags.block[each]
+        lags.block[each] = 0.0
+        for number in range(BLOCKS):
+            latest[each] += lags.recent[number, each]
+        every[each] = lags.before[each] + latest[each]
+    lags.oldest = (lags.oldest + 1) % BLOCKS
+    if lags.information < ALL_INFORMATION:
+        lag, scale, information, variance, per_scale = _fitted(every)
+        if information >= ENOUGH_INFORMATION:
+            lags.lag, lags.scale, lags.information, lags.noise = lag, scale, information, np.sqrt(variance)
+            lags.lag_std = np.sqrt(variance * LASTS_S / information)
+            lags.scale_std = np.sqrt(variance * LASTS_S / per_scale)
+    lag, _, information, variance, _ = _fitted(latest)
+    former, _, informed, usual, _ = _fitted(lags.before)
+    if min(information, informed) < LEAST_INFORMATION:
+        return False
+    uncertain = np.sqrt(max(variance, usual) * LASTS_S * (1.0 / information + 1.0 / informed))
+    return bool(abs(lag - former) > CHANGED_S + CHANGED_SHARE * abs(former) + TIMES * uncertain)
+
+
+def _fitted(sums: Any) -> tuple[float, float, float, float, float]:
+    """Lag [s], scale error, the information about the lag [rad^2/s], the variance of what they leave [rad^2], and the
+    information about the scale error [rad^2 s]; all 0 if the two errors cannot be told apart.
+    """
+    seconds = max(sums[_SECONDS], 1e-9)
+    lag_2 = sums[_LAG_2] - sums[_LAG] * sums[_LAG] / seconds
+    far_2 = sums[_FAR_2] - sums[_FAR] * sums[_FAR] / seconds
+    crossed = sums[_CROSSED] - sums[_LAG] * sums[_FAR] / seconds
+    determinant = lag_2 * far_2 - crossed * crossed
+    if determinant <= SEPARATE * lag_2 * far_2:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    by_lag = sums[_LAG_APART] - sums[_LAG] * sums[_APART] / seconds
+    by_far = sums[_FAR_APART] - sums[_FAR] * sums[_APART] / seconds
+    lag = (by_lag * far_2 - by_far * crossed) / determinant
+    scale = (by_far * lag_2 - by_lag * crossed) / determinant
+    left = sums[_APART_2] - sums[_APART] * sums[_APART] / seconds - lag * by_lag - scale * by_far
+    return lag, scale, determinant / far_2, max(left / seconds, NOISE_RAD * NOISE_RAD), determinant / lag_2
+
+
+_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
+_fitted = _inner(_fitted)
+_completes_block = _inner(_completes_block)
+add, forget = map(_inner, (add, forget))
