@@ -113,7 +113,8 @@ class ServoModel:
     watchdog_firmware: first firmware with a Bus Watchdog.
     fast_sync_read_firmware: first firmware that supports Fast Sync Read; None if none does.
     senses_supply: whether Present Current is the supply current, that is, the motor current times the bridge's duty
-    cycle, which is far less than the commanded current while the joint is slow.
+    cycle, which is far less than the commanded current while the joint is slow. So it is in the 330 series (e-Manual,
+    Current Limit: the XL330 "measures current at its input power source").
     """
 
     name: str
@@ -249,6 +250,7 @@ _MODELS = (
         _no_load(5.0, 103.0),
         min_voltage=3.5,
         fast_sync_read_firmware=46,
+        senses_supply=True,
     ),
     ServoModel(
         "XL330-M077",
@@ -257,8 +259,8 @@ _MODELS = (
         _no_load(5.0, 383.0),
         min_voltage=3.5,
         fast_sync_read_firmware=46,
+        senses_supply=True,
     ),
-    # Its current sensor is in the supply line, not in a motor phase.
     ServoModel(
         "XC330-T288",
         1.0e-3,

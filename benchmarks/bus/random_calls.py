@@ -57,8 +57,8 @@ PROTECTED = (12, 98)  # a Secondary ID does not answer, and a Bus Watchdog trips
 
 
 def indirect_data(model: str, firmware: int) -> int:
-    """Address of the first byte of indirect data; ROBOTIS' hardware interface and SDK take 224 for early 330s."""
-    return 208 if model.startswith(("XL330", "XC330")) and firmware >= 52 else 224
+    """Address of the first byte of indirect data; 330 servos have it at 208 with firmware 52."""
+    return 208 if model.startswith(("XL330", "XC330")) and firmware == 52 else 224
 
 
 class Client:

@@ -136,7 +136,13 @@ class Term:
 
 
 _DECLARED = (
-    Term("inertia", "kg m^2", "total inertia driven by the joint", part="base", scale="inertia"),
+    Term(
+        "inertia",
+        "kg m^2",
+        "inertia of the joint's link about the joint; for joint 1, with its rotor and all mass at its end",
+        part="base",
+        scale="inertia",
+    ),
     Term(
         "coupling",
         "kg m^2",

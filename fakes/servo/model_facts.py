@@ -15,8 +15,11 @@ sensor is in the supply line.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
+
+Blocks = tuple[tuple[int, int, int], ...]
+"""Blocks of indirect addressing: address of the first address register and first data register, and their number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +68,9 @@ class ModelFacts:
     operating_modes: frozenset[int] = frozenset({0, 1, 3, 4, 5, 16})
     senses_supply: bool = False
     """Whether Present Current is the supply current instead of the motor current (330 series)."""
-    indirect: tuple[tuple[int, int, int], ...] = ((168, 224, 28), (578, 634, 28))
-    """Blocks of indirect addressing: address of the first address register and first data register, and their number.
-    """
-    older_indirect: tuple[tuple[int, int, int], ...] | None = None
-    """The blocks in firmware before `INDIRECT_MOVED_FIRMWARE`, if they differ."""
+    indirect: Blocks = ((168, 224, 28), (578, 634, 28))
+    indirect_of_firmware: tuple[int, Blocks] | None = None
+    """The one firmware version that has these blocks at other addresses, and its blocks."""
 
 
 _Facts = RegisterFacts
@@ -77,13 +78,6 @@ _GAIN = (0, 16_383)
 _READ_ONLY = _Facts(writable=False)
 NEVER = 256
 """A firmware version that no servo has, for features that no firmware supports."""
-
-INDIRECT_MOVED_FIRMWARE = 52
-"""First firmware with which the 330 series has its indirect data at address 208.
-
-Source: dynamixel-sdk 4.1 and ROBOTIS' dynamixel_hardware_interface (pull request 69) have one control table for older
-330 servos, with the data at 224, and a second one named fw52, with the data at 208. The e-Manual only mentions 208.
-"""
 
 REVERSES_ALL = ("XM540", "XH540", "XD540", "XW540", "XW430")
 """Series whose Reverse Mode inverts velocity, current and PWM as well as position (e-Manual, Drive Mode, by series)."""
@@ -172,6 +166,16 @@ def _x430(motor: Motor, velocity: int, current: int = 1193, p: int = 800) -> Mod
     return ModelFacts(motor, differs | _gains(p=p))
 
 
+_FIRMWARE_52 = (52, ((168, 208, 20),))
+"""Indirect data of the 330 series. Its sources contradict each other before firmware 52.
+
+dynamixel-sdk 4.1 and ROBOTIS' dynamixel_hardware_interface (pull request 69) have two control tables: one with the data
+at 224, and one named fw52, with the data at 208. The e-Manual (2026-09): "Firmware versions prior to V53 support up to
+20 Indirect Address/Data items [...] for Indirect Data is 208 ~ 227"; from then on, 28 at 224. All agree on 208 for
+firmware 52. Before 52, the fake takes the 224 of ROBOTIS' own programs, or they would read zeros.
+"""
+
+
 def _x330(motor: Motor, velocity: int, current: int, differs: Mapping[str, RegisterFacts]) -> ModelFacts:
     common = {
         "Baud Rate": _Facts(1, (0, 6)),
@@ -184,8 +188,9 @@ def _x330(motor: Motor, velocity: int, current: int, differs: Mapping[str, Regis
         {**common, **differs},
         current_unit_a=1.0e-3,
         fast_read_firmware=46,
-        indirect=((168, 208, 20),),
-        older_indirect=((168, 224, 20),),
+        senses_supply=True,
+        indirect=((168, 224, 28),),
+        indirect_of_firmware=_FIRMWARE_52,
     )
 
 
@@ -196,10 +201,8 @@ def _xl330(motor: Motor, velocity: int, gains: Mapping[str, RegisterFacts]) -> M
 def _xc330(motor: Motor, velocity: int, gains: Mapping[str, RegisterFacts]) -> ModelFacts:
     """M models for 5 V, T models for 12 V."""
     if motor.voltage_v < _LEAST_OF_T:
-        facts = _x330(motor, velocity, 2352, {**_volts(31, 35, 70), **gains})
-    else:
-        facts = _x330(motor, velocity, 910, {**_volts(55, 55, 140), "PWM Slope": _Facts(255, (1, 255)), **gains})
-    return replace(facts, senses_supply=True)
+        return _x330(motor, velocity, 2352, {**_volts(31, 35, 70), **gains})
+    return _x330(motor, velocity, 910, {**_volts(55, 55, 140), "PWM Slope": _Facts(255, (1, 255)), **gains})
 
 
 def _voltage_driven(motor: Motor, differs: Mapping[str, RegisterFacts]) -> ModelFacts:

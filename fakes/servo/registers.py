@@ -3,7 +3,7 @@
 Addresses, sizes and signs come from `hil.drivers.control_table`; area, access, factory values and ranges from
 `hil.fakes.servo.model_facts`. Indirect addresses and data, Startup Configuration and Backup Ready, which the SDK's
 tables leave out, are added here from the e-Manual (pages x/<model>). The address of the 330 series' indirect data
-depends on the firmware: see `hil.fakes.servo.model_facts.INDIRECT_MOVED_FIRMWARE`.
+depends on the firmware: see `ModelFacts.indirect_of_firmware`.
 
 A model outside the X series behaves according to its table in the SDK: its registers hold what is written to them,
 within their size, and its motor does not move.
@@ -16,11 +16,11 @@ from functools import cache
 from hil.drivers.control_table import load_control_table, model_names
 from hil.fakes.servo.model_facts import (
     FACTS,
-    INDIRECT_MOVED_FIRMWARE,
     NEVER,
     OTHER_SERIES,
     REVERSES_ALL,
     X_SERIES,
+    Blocks,
     ModelFacts,
     RegisterFacts,
 )
@@ -67,9 +67,7 @@ class EmulatedModel:
     back_emf_v_s: float
     """Voltage per velocity of the output shaft [V s/rad]."""
     senses_supply: bool
-    indirect: tuple[tuple[int, int, int], ...]
-    """Blocks of indirect addressing: address of the first address register and first data register, and their number.
-    """
+    indirect: Blocks
     reverses_all: bool
     """Whether Reverse Mode inverts velocity, current and PWM as well as position."""
     registers: Mapping[str, Register]
@@ -92,20 +90,23 @@ def load_model(name: str, firmware: int = DEFAULT_FIRMWARE) -> EmulatedModel:
 
     Raises KeyError if no table describes the model; see `all_model_names`.
     """
-    return _load_model(name, firmware < INDIRECT_MOVED_FIRMWARE)
+    facts = FACTS.get(name)
+    other = facts.indirect_of_firmware if facts is not None else None
+    return _load_model(name, other[1] if other is not None and other[0] == firmware else None)
 
 
 @cache
-def _load_model(name: str, older: bool) -> EmulatedModel:
+def _load_model(name: str, indirect: Blocks | None) -> EmulatedModel:
+    """indirect: its blocks of indirect addressing, if they are not the usual ones."""
     if name not in model_names().values():
         raise KeyError(name)
     facts = FACTS.get(name)
     if facts is None:
         return _unknown(name)
-    return _x_series(name, facts, (facts.older_indirect or facts.indirect) if older else facts.indirect)
+    return _x_series(name, facts, indirect or facts.indirect)
 
 
-def _x_series(name: str, facts: ModelFacts, indirect: tuple[tuple[int, int, int], ...]) -> EmulatedModel:
+def _x_series(name: str, facts: ModelFacts, indirect: Blocks) -> EmulatedModel:
     table = {**X_SERIES, **facts.differs}
     addresses = load_control_table(name)
     registers = [
@@ -132,7 +133,7 @@ def _x_series(name: str, facts: ModelFacts, indirect: tuple[tuple[int, int, int]
     )
 
 
-def _indirect_registers(blocks: tuple[tuple[int, int, int], ...]) -> Iterator[Register]:
+def _indirect_registers(blocks: Blocks) -> Iterator[Register]:
     last = max(data + count - 1 for _, data, count in blocks)
     number = 0
     for first_address, first_data, count in blocks:

@@ -5,7 +5,7 @@ bytes can declare any number of rows.
 """
 
 from pathlib import Path
-from zipfile import ZipFile
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
@@ -24,6 +24,10 @@ def check_archive(path: Path) -> None:
     """Raise RunFolderError if an .npz would expand to more than any real recording needs. Also raises OSError,
     BadZipFile.
     """
+    with path.open("rb") as file:
+        # What precedes the archive ZipFile skips, but numpy takes the file for a pickle, and advises to load it.
+        if file.read(2) != b"PK":
+            raise BadZipFile("it does not begin like an .npz file")
     with ZipFile(path) as archive:
         entries = archive.infolist()
     claimed, packed = sum(each.file_size for each in entries), sum(each.compress_size for each in entries)

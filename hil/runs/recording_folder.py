@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from hil import __version__
 from hil.errors import RunFolderError
 from hil.results.json_form import FormError, from_json, to_json
+from hil.runs.file_size import check_archive
 from hil.runs.run_folder import SCHEMA, taken, write_json
 
 KIND = "recordings"
@@ -124,13 +126,14 @@ def load_record(path: Path) -> RecordingRecord:
 def load_recordings(path: Path) -> tuple[Predicted, ...]:
     """The recordings of a folder; raises RunFolderError."""
     try:
+        check_archive(path / ARRAYS)
         with np.load(path / ARRAYS, allow_pickle=False) as kept:
             names = kept["names"].tolist()
             return tuple(
                 Predicted(str(name), *(kept[f"{k}_{part}"] for part in ("time", "torque", "position", "predicted")))
                 for k, name in enumerate(names)
             )
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise RunFolderError(f"{path / ARRAYS} cannot be read: {error}.") from error
 
 

@@ -164,6 +164,8 @@ class RunFolder:
         if steps := steps_of(path):
             raise RunFolderError(only_steps(path, steps))
         for needed in (run.config_path, run.run_path, run.samples_path):
+            if needed.is_symlink() and not needed.exists():
+                raise RunFolderError(f"{needed} is a link that leads nowhere.")
             if not needed.is_file():
                 raise RunFolderError(
                     f"{path} is not a run folder: it has no {needed.name}. To list existing runs: {command('runs')}"

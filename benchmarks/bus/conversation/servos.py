@@ -80,4 +80,4 @@ class Servo:
 
     @property
     def indirect_data(self) -> int:
-        return 208 if self.is_330 and self.firmware >= 52 else 224
+        return 208 if self.is_330 and self.firmware == 52 else 224

@@ -1,19 +1,19 @@
 """Section on friction versus speed: the model's curve with its interval, and the torque that remains after inertia and
-gravity are subtracted.
+gravity are subtracted, for the measured and for the model's motion.
 """
 
 import numpy as np
 
 from hil.arm_model import ArmModel
-from hil.estimator.data.fourier import cut_off, lines_of, motion_of
-from hil.report.chart import BLUE, GREY, Array, Chart, Series
+from hil.estimator.data.fourier import Lines, cut_off, lines_of, motion_of
+from hil.report.chart import BLUE, GREY, ORANGE, Array, Chart, Series
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section
 from hil.results.parts import Covariance
 from hil.runs.period_file import PlayedPeriod
 
 _CURVE = 401  # points on the curve
-_DOTS = 700
+_DOTS = 400  # of each motion
 _DRAWS = 200  # parameter draws for the interval
 
 
@@ -21,39 +21,49 @@ def friction(data: RunData) -> Section | None:
     """The section; None if the run has no settled period."""
     if data.fitted is None:
         return None
-    speed, torque = _left_to_friction(data.model, data.fitted)
-    pictures = [_curve(data, joint, name, speed[joint], torque[joint]) for joint, name in enumerate(data.names)]
+    period = data.fitted
+    measured = lines_of(np.where(np.isfinite(period.position), period.position, period.predicted))
+    harmonics = cut_off(measured)
+    measured_dots = _left_to_friction(data.model, period, measured, harmonics)
+    simulated_dots = _left_to_friction(data.model, period, lines_of(period.predicted), harmonics)
+    pictures = [_curve(data, joint, name, measured_dots, simulated_dots) for joint, name in enumerate(data.names)]
     words = (
-        "Dots: commanded torque minus the model's inertia and gravity torque for the measured motion. They scatter "
-        "because the acceleration is derived from a quantised position, and near standstill because static "
-        "friction takes any value that holds the joint.",
+        "Dots: commanded torque minus the model's inertia and gravity torque, once for the measured motion and once "
+        "for the model's own, from positions alone. The acceleration derived from positions smooths every reversal, so "
+        "near standstill both leave the curve alike; there static friction also takes any value that holds the joint. "
+        "If the friction model is right, the two sets of dots agree.",
     )
     return Section("friction", "Friction", words, pictures=tuple(pictures))
 
 
-def _left_to_friction(model: ArmModel, period: PlayedPeriod) -> tuple[Array, Array]:
-    """Speeds [rad/s] and friction torques [N m], both (joints, dots), from the Fourier lines of the measured motion."""
-    filled = np.where(np.isfinite(period.position), period.position, period.predicted)
-    lines = lines_of(filled)
-    samples = filled.shape[1]
-    motion = motion_of(lines, cut_off(lines), 2 * np.pi * period.rate / samples, samples)
+def _left_to_friction(model: ArmModel, period: PlayedPeriod, lines: Lines, harmonics: int) -> tuple[Array, Array]:
+    """Speeds [rad/s] and friction torques [N m], both (joints, dots), from the Fourier lines of a motion.
+
+    harmonics: the highest line that is used. That of the noisy motion smooths both motions alike.
+    """
+    samples = period.position.shape[1]
+    motion = motion_of(lines, harmonics, 2 * np.pi * period.rate / samples, samples)
     rigid = model.rigid_body_torque(motion.position.T, motion.velocity.T, motion.acceleration.T).T
-    offset = np.array([[model.values[f"offset_{joint + 1}"]] for joint in range(len(filled))])
+    offset = np.array([[model.values[f"offset_{joint + 1}"]] for joint in range(len(lines))])
     # Commands are held until the next one: the torque effective at a sample is the mean of two successive ones.
-    scale = np.array([[model.torque_scale(joint + 1)] for joint in range(len(filled))])
+    scale = np.array([[model.torque_scale(joint + 1)] for joint in range(len(lines))])
     held = 0.5 * scale * (period.torque + np.roll(period.torque, 1, axis=1))
     chosen = slice(None, None, max(1, samples // _DOTS))
     return motion.velocity[:, chosen], (held - rigid - offset)[:, chosen]
 
 
-def _curve(data: RunData, joint: int, name: str, speed: Array, torque: Array) -> Picture:
-    fastest = float(np.abs(speed).max())
+def _curve(
+    data: RunData, joint: int, name: str, measured: tuple[Array, Array], simulated: tuple[Array, Array]
+) -> Picture:
+    """measured, simulated: speeds and friction torques of both motions."""
+    fastest = float(np.abs(measured[0][joint]).max())
     # Cubes of an even grid are denser near zero speed, where the curve bends.
     at = fastest * np.linspace(-1, 1, _CURVE) ** 3
     curve = friction_curve(data.model, at)[:, joint]
     low, high = friction_interval(data.model, data.result.covariance, at, joint)
     series = (
-        Series("from the measured motion", speed, torque, GREY, "dots"),
+        Series("from the measured motion", measured[0][joint], measured[1][joint], GREY, "dots"),
+        Series("from the model's motion", simulated[0][joint], simulated[1][joint], ORANGE, "dots"),
         Series("95 % interval", at, high, BLUE, "area", low),
         Series("model", at, curve, BLUE),
     )

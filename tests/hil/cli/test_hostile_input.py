@@ -16,6 +16,8 @@ from hil.fakes.description import load_fake
 from hil.fakes.pty_server import LinkError, PtyServer
 from hil.runs.period_file import load_periods
 from hil.runs.recording import load_samples
+from hil.runs.recording_folder import load_recordings
+from hil.runs.run_folder import RunFolder
 from tests.support.command_line import hil
 
 ArmFile = Callable[..., Path]
@@ -98,6 +100,26 @@ def test_an_archive_that_bursts_is_not_read(identified: Path, capsys: pytest.Cap
     assert "not read" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("read", [load_periods, load_recordings])
+@pytest.mark.parametrize("content", [b"\xff\xfePK", b"", b"PK\x03\x04 cut off"])
+def test_a_damaged_archive_is_named_without_advice_to_unpickle_it(
+    read: Callable[[Path], object], content: bytes, tmp_path: Path
+) -> None:
+    for name in ("period.npz", "recordings.npz"):
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(RunFolderError, match=r"\.npz cannot be read: ") as caught:
+        read(tmp_path)
+    assert "pickle" not in str(caught.value)
+
+
+def test_a_link_to_nowhere_is_not_called_a_missing_file(tmp_path: Path) -> None:
+    for name in ("config.toml", "samples.npy"):
+        (tmp_path / name).touch()
+    (tmp_path / "run.json").symlink_to("run.json")
+    with pytest.raises(RunFolderError, match=r"run\.json is a link that leads nowhere"):
+        RunFolder.open(tmp_path)
+
+
 def test_an_array_that_promises_more_than_it_holds_is_not_read(identified: Path, tmp_path: Path) -> None:
     path = identified / "samples.npy"
     rows = load_samples(path, 2)
@@ -111,7 +133,7 @@ def test_an_array_that_promises_more_than_it_holds_is_not_read(identified: Path,
         np.lib.format.write_array_header_1_0(file, header)
         file.write(rows[:10].tobytes())
     shutil.copy(short, path)
-    with pytest.raises(RunFolderError, match="promises"):
+    with pytest.raises(RunFolderError, match="its header declares"):
         load_samples(path, 2)
 
 
