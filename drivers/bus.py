@@ -312,10 +312,10 @@ class ServoBus(TorqueSwitch):
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def first_hides_others(self, patience: float) -> bool:
-        """Whether the first servo is silent and only hides the replies of the others, which answer. Raises PortLost.
+        """Whether only the first servo is silent and hides the replies of the others, which do answer. Raises PortLost.
 
         In a group read, a servo that does not answer hides the replies of those after it. So the last servo and the
-        first one are asked in this order. patience: how long to wait for their replies [s].
+        first one are asked, in this order. patience: how long to wait for their replies [s].
         """
         drives = (self._drives[-1], self._drives[0])
         read = SyncRead([each.id for each in drives], Span.of([self._servos[each].table for each in drives], ["ID"]))
@@ -367,7 +367,7 @@ class ServoBus(TorqueSwitch):
         # A tripped watchdog or a reboot also leaves 0.
         who = ": another program is commanding it, or writes are being lost" if seen.value else ""
         return (
-            f"Just before, {seen.register} of {self._drives[seen.place].title} was {seen.value} although "
+            f"Shortly before this, {seen.register} of {self._drives[seen.place].title} was {seen.value} although "
             f"{seen.written} had been written{who}."
         )
 

@@ -463,7 +463,7 @@ class _Plan:
     span: the span that a Reply reports. reply_time: how long to wait for the replies. pack_behind: packs the goals' CRC
     and the request. wire_s: wire time of goals, request and replies [s]. soonest: time after the start of a cycle
     before which a complete reply may belong to an earlier request [s]. is_after_loss: whether a late reply may be on
-    the wire, and destroy the goals, when it is sent.
+    the wire when this read is sent, and destroy the goals.
     """
 
     read: GroupRead

@@ -108,9 +108,10 @@ class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 
 
 def _first_status(received: bytes) -> tuple[bytes, int]:
-    """The first intact status packet in what was received; b"" if there is none, and how many bytes to read for it.
+    """Return the first intact status packet in what was received, and 0.
 
-    Never more than belong to that packet, so that the next one stays whole.
+    If there is none, return b"" and how many more bytes to read: never more than the packet that has begun may have, so
+    that the next one stays whole.
     """
     missing = _SHORTEST - next(size for size in range(len(HEADER) - 1, -1, -1) if received.endswith(HEADER[:size]))
     at = received.find(HEADER)

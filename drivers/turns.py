@@ -1,4 +1,4 @@
-"""When a cycle reads another span than the usual one: slow registers, or the status."""
+"""When a cycle reads a span other than the usual one: slow registers, or the status."""
 
 __all__ = ["NEVER", "Turns"]
 
@@ -9,8 +9,8 @@ NEVER = 1 << 62
 class Turns:
     """Counts cycles until spans other than the usual one are due.
 
-    A cycle only decrements one counter, the number of usual cycles that `plan` has promised. `count` derives from it
-    what has passed.
+    A cycle only decrements one counter, the number of usual cycles that `plan` has promised. From this counter, `count`
+    derives how many cycles have passed.
 
     slow_spans: number of slow spans. slow_every: samples between two of them. status_every: cycles between two status
     reads.
@@ -51,7 +51,7 @@ class Turns:
         return self._slow
 
     def read_status_next(self) -> None:
-        """Let the status be due in the next cycle."""
+        """Make the status due in the next cycle."""
         if self._status_every < NEVER:
             self._until_status = min(self._until_status, 1)
 

@@ -74,7 +74,7 @@ def read_result(path: Path) -> Result:
 
 
 def read_settled_result(path: Path) -> SettledResult:
-    """Read a result that was estimated from settled periods. Raises ResultError, also for any other result."""
+    """Read a result that was estimated from settled periods. Raises ResultError for any other result, too."""
     result = read_result(path)
     if not isinstance(result, SettledResult):
         raise ResultError(

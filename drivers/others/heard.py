@@ -63,7 +63,7 @@ class Heard:
             self._was_late(now)
 
     def _was_late(self, now: float) -> None:
-        """A reply was late or repeated, which also brings the IDs of the replies before it out of order."""
+        """Record a late or repeated reply, which may also have mixed up the IDs of the replies before it."""
         self.late_at, self.mixed_up = now, 0
 
     def instead(self, read: GroupRead, received: bytes, answers: Sequence[Answer], now: float, *, echoes: bool) -> None:

@@ -70,7 +70,7 @@ def read_settings(servo: Servo) -> dict[str, int]:
 
 
 def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
-    """Return the settings with goals clamped to the limits, which another program may have lowered meanwhile.
+    """Return the settings with goals clamped to the limits, which another program may have lowered since.
 
     A limit that is among the settings is restored before its goal; for any other limit, the servo's present value
     applies. Raises the same errors as `Servo.read`.

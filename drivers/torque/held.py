@@ -26,7 +26,7 @@ def is_held(servo: Servo) -> bool:
     """Return whether the servo's torque is on and holds or drives its joint. Raises the same errors as `Servo.read`.
 
     A tripped Bus Watchdog has zeroed the goal, so that in current and PWM mode the joint moves freely. Torque Enable is
-    read twice, because a reply does not tell which register it is about.
+    read twice, because a reply does not say which register it is for.
     """
     if not (servo.read("Torque Enable") and servo.read("Torque Enable")):
         return False

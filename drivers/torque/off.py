@@ -66,7 +66,7 @@ class TorqueOff:
     def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
         """The report after another program has switched torque on again.
 
-        on: joints whose servos still have torque on, however often it is cut. silent: joints whose servos have not
+        on: joints whose servos have torque on again each time it is cut. silent: joints whose servos have not
         answered since.
         """
         why = "Another program had switched its torque on again, and it has not answered since."
@@ -152,7 +152,7 @@ def cut_torque(
 
     silent: servos that did not answer the last exchange.
     watchdog: the servos' Bus Watchdog [s].
-    interrupts: receives every interrupt that arrives meanwhile.
+    interrupts: receives every interrupt that arrives in the meantime.
     """
     left = dict(servos)
     why: dict[Joint, Exception] = {}
@@ -304,7 +304,7 @@ def by_reason(failures: Iterable[tuple[Joint, str]]) -> dict[str, list[Joint]]:
 
 
 def _of_it(why: str) -> str:
-    """The reason without the name in front of a colon: "It: reading failed" is said as "Reading failed"."""
+    """The reason without the name in front of a colon: "It: reading failed" becomes "Reading failed"."""
     rest = why.removeprefix("It: ")
     return rest[:1].upper() + rest[1:]
 

@@ -67,9 +67,9 @@ class ChainEstimate(FittedParameters):
     reached: bool
     """Whether the fit has reached its minimum; if not, the standard errors include the remaining distance."""
     from_prior: tuple[str, ...]
-    """Base parameters that the data hardly determine, whose values therefore come from the prior."""
+    """Base parameters that the data barely constrain, whose values therefore come from the prior."""
     unseen: tuple[str, ...]
-    """Encoder zero errors and base tilts that the data hardly determine, which are therefore taken as zero."""
+    """Encoder zero errors and base tilts that the data barely constrain, which are therefore taken as zero."""
     doubtful_zeros: tuple[tuple[int, float], ...]
     """Joints, from 1, whose encoder zeros the model holds fixed although the recording contradicts them, and their
     errors (true minus measured angle) [rad]. Empty if they were not tested.
@@ -104,7 +104,7 @@ def identify_chain(
 ) -> ChainEstimate:
     """Estimate the parameters of `model` from settled periods: regression on their lines, then maximum likelihood.
 
-    `prior` supplies what the data hardly determine (`ChainEstimate.from_prior`). `added`: see `fit_lines`; for a
+    `prior` supplies what the data barely constrain (`ChainEstimate.from_prior`). `added`: see `fit_lines`; for a
     model with `added_mass`. test_zeros: whether to test the encoder zeros that `model` holds fixed
     (`ChainEstimate.doubtful_zeros`), which takes a tenth longer. Raises ModelError if `model` and a period differ in
     their number of joints, ConvergenceError if no minimum is found.

@@ -85,7 +85,7 @@ class RecordedChain:
     cutoff: float
     """Cut-off frequency of the regression [Hz]."""
     from_prior: tuple[str, ...]
-    """Base parameters that the data hardly determine."""
+    """Base parameters that the data barely constrain."""
     reached: bool = True
     """Whether the fit has reached its minimum; always so for a regression."""
     systematic: float = 1.0
@@ -181,8 +181,8 @@ def _regression(recordings: Sequence[Recording], model: ChainModel, prior: Prior
 def _repeated(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> float:
     """Return the factor by which correlation of the torque residual increases the variance of the parameters.
 
-    The sum of the autocorrelation up to its first negative value, of the worst joint. Errors of the regressor itself
-    are not included.
+    It is the sum of the autocorrelation up to its first negative value, for the worst joint. Errors of the regressor
+    itself are not included.
     """
     most = 1.0
     for recording in recordings:

@@ -211,8 +211,8 @@ def _check_motion(recording: Recording) -> None:
         speed = float(np.abs(np.diff(row) / np.diff(recording.time)).max())
         if swing > MOST_ANGLE:
             raise RecordingError(
-                f"joint {joint + 1} moves over {swing:.4g} rad, more than {MOST_ANGLE:g}: are these degrees or encoder "
-                "steps? Set the column's unit"
+                f"joint {joint + 1} moves through {swing:.4g} rad, more than {MOST_ANGLE:g}: are these degrees or "
+                "encoder steps? Set the column's unit"
             )
         if speed > MOST_SPEED:
             k = int(np.argmax(np.abs(np.diff(row) / np.diff(recording.time))))

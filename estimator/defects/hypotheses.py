@@ -111,14 +111,14 @@ def _changes(
 
 
 def _load(joints: int) -> tuple[Direction, ...]:
-    """A mass anywhere on the last link; of two joints, the second feels its first and second moment."""
+    """A mass anywhere on the last link. With two joints, its first and second moments act on the second joint."""
     if joints == 1:
         return ({"inertia_1": 1.0}, {"gravity_1": 1.0})
     return ({"inertia_1": 1.0}, {"gravity_1": 1.0}, {"gravity_2": 1.0, "coupling": 1.0}, {"inertia_2": 1.0})
 
 
 def _torque_gain(joint: int, values: Mapping[str, float]) -> Direction:
-    """More torque of the first joint than its column states is less of everything else."""
+    """More torque on the first joint than its column states has the effect of smaller values of everything else."""
     if joint > 1:
         return {"torque_scale_2": 1.0}
     less = [name for name in values if term_of(name).unit in TORQUE_UNITS or name == "torque_scale_2"]

@@ -1,4 +1,4 @@
-"""Compares the mean torque of the last tenths of a second with that of the model as it was before them.
+"""Compares the mean torque of the last few tenths of a second with that of the model as it was before them.
 
 A push or grip that begins while the arm is still being learnt changes what is learnt: sample by sample, parameters and
 noise follow it, and no residual stands out. The model from before the disturbance does not follow. Its prediction for

@@ -24,8 +24,8 @@ the gear's presliding softens every reversal, dry friction looks viscous, and ye
 stopped.
 
 While little is known about an arm, the updates of the parameters follow a disturbance as if it were a property of the
-arm. Therefore the mean torque over the last tenths of a second is then also compared with an earlier state of the model
-(`earlier_model`).
+arm. Therefore the mean torque over the last few tenths of a second is then also compared with an earlier state of the
+model (`earlier_model`).
 
 Errors of the model last longer than the interval between two updates, and so does the rounding of a velocity that stays
 below one tick: they are not new information each time. Therefore each update counts only as a fraction of one.

@@ -1,4 +1,4 @@
-"""What the calls of the front door accept as a configuration; by itself, so that few modules are imported for it."""
+"""What the public functions accept as a configuration; a module of its own, so that importing it loads few others."""
 
 from os import PathLike
 from pathlib import Path

@@ -111,7 +111,7 @@ def _from_files(paths: list[Path], config: Path | None, out: PathLikeStr | None)
 
 
 def _discard(folder: Path) -> None:
-    """Remove a folder without a result. If it has been deleted meanwhile, the error that led here says so."""
+    """Remove a folder without a result. If it has been deleted by now, the error that led here says so."""
     if not (folder / "result.json").is_file():
         with suppress(FileNotFoundError):
             for path in folder.iterdir():

@@ -73,7 +73,7 @@ def _how_to_compare(config: Config) -> str:
 
 
 def _weak(joint: JointConfig) -> str:
-    """Say that a joint's limit gives less torque than its servos' friction typically holds; "" if it gives more."""
+    """Say that a joint's limit allows less torque than the typical friction of its servos; "" if it allows more."""
     friction = len(joint.ids) * servo_prior(joint.joint.servo).coulomb.median
     torque = joint.goal_limit * joint.torque_per_goal
     if torque > friction:

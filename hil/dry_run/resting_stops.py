@@ -62,9 +62,9 @@ def said_of_stops(config: Config, side: Array) -> str:
     if not found:
         return ""
     return (
-        f"Nothing described supports these joints in the rest pose, so each is assumed to lie on its own mechanical "
-        f"stop: {', '.join(found)}. If something else supports them, name it in [clearance] (floor, boxes). Otherwise "
-        "they may sag by up to the angle in brackets before position_limit stops the arm."
+        "Nothing in the description supports these joints in the rest pose, so each is assumed to lie on its own "
+        f"mechanical stop: {', '.join(found)}. If something else supports them, name it in [clearance] (floor, boxes). "
+        "Otherwise they may sag by up to the angle in brackets before position_limit stops the arm."
     )
 
 

@@ -173,9 +173,9 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     planned, passed = run.stopping.planned, run.stopping.passed
     stopped = np.maximum(planned[Way.BRAKED], planned[Way.CUT])
     lines = [
-        "99 %: in 99 of 100 arms, all peaks stay within these values. Chance: probability that this one quantity of an "
-        "arm exceeds its limit; at a position or velocity limit the guard stops the arm, whereas "
-        "current is only clamped.",
+        "99 %: in 99 of 100 arms, all peaks stay within these values. Chance: probability that this quantity, taken "
+        "alone, exceeds its limit; at a position or velocity limit the guard stops the arm, whereas current is only "
+        "clamped.",
         settling_text(config, shown),
         f"If stopped at any moment, the arms overshoot their limits by up to {_each(config, stopped)}; if the program "
         f"is killed or the cable unplugged, by up to {_each(config, planned[Way.SILENT])}.",

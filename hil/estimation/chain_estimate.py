@@ -226,7 +226,7 @@ def _verdict(
     if estimate.from_prior:
         trust = lowered(trust, "with care")
         sentences.append(
-            f"The recording hardly determines {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
+            f"The recording says little about {', '.join(estimate.from_prior)}: these values come from the URDF. Use "
             "wider and faster motion ([joint_path]) to identify them, or accept them: they hardly affect the motion."
         )
     if said := vague(known.prior, known.base.names, estimate.std, estimate.from_prior):

@@ -106,7 +106,7 @@ samples per period, the fastest that is used, needs 0.27.
 ROUGH_TIMES = 2.0
 """Allowance of the slow memory for a velocity that jumps between samples, as when teeth change sides: multiple of the
 root of the sum of squares of `CURVED` times the difference between successive changes, times the interval. A jump
-anywhere within an interval makes an error whose RMS is 0.29 of it, times the interval, and counts twice.
+anywhere within an interval causes an error whose RMS is 0.29 of it, times the interval, and counts twice.
 """
 
 CURVED_AT_FIRST = 0.3
@@ -163,7 +163,7 @@ MEMORY = np.dtype(
 position, velocity, turn: latest ones, and the latest change of velocity [rad, rad/s]; the position is NaN before the
 first one and after a long gap. seconds, moved, difference, unknown, most_curved: sums (for the last one, the maximum)
 since the long memory was last updated. seen: that difference without motion that the velocity's register cannot show.
-headed: time of motion in positive less in negative direction since then [s]. rough: sum of squares of what jumps of the
+headed: time of motion in the positive minus that in the negative direction since then [s]. rough: sum of squares of what jumps of the
 velocity may add in each interval since then [rad^2]. heading, roughness: the same two, in the slow memory. moving: time
 of motion in it [s]. learnt: information from which lag and scale error were learnt [rad^2/s]. lag, scale: their largest
 accepted values [s, 1]. Then the range of the bias, and the sums from which lag and scale error are estimated.

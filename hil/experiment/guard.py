@@ -143,7 +143,7 @@ class Guard:
         self._silence.woke_up(now, late)
 
     def others_answer(self) -> None:
-        """Record that of the servos that are not heard, some do answer: a silent one hides their replies."""
+        """Record that some of the servos that are not heard do answer: a silent one hides their replies."""
         self._silence.others_answer = True
 
     def late(self, seconds: float = 0.0) -> None:
@@ -315,7 +315,7 @@ class Guard:
         # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
         shared = f"{NONE_HEARD}: check the adapter, the cables and the supply"
         if self._silence.is_busy:
-            return f"{shared}, and whether other programs keep this computer busy: this program was late just before."
+            return f"{shared}, and whether other programs keep this computer busy: this program had just been late."
         return f"{shared}."
 
     def _jumped(self, index: int, _: State) -> NoReturn:

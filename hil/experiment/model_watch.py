@@ -103,7 +103,7 @@ class Jolts:
     therefore needs no knowledge of the arm. Changes of velocity over `JOLT_S` are compared with ordinary ones.
 
     Where the joint turns round in both changes, the teeth of a gear with backlash have changed sides at two successive
-    reversals: the motor crosses the gap much faster than it drives the arm, which is no jolt.
+    reversals: the motor crosses the gap much faster than it drives the arm, which is not a jolt.
 
     count: number of joints. interval: time between two exchanges [s].
     """

@@ -114,7 +114,7 @@ def run_experiment(
 
 @contextmanager
 def _with_torque(torque: str) -> Iterator[None]:
-    """Append the torque state to an error while the recording is closed, and to a stop request during cut-off."""
+    """Append the torque state to an error raised while the recording is closed, or to a stop request during cut-off."""
     try:
         yield
     except (RunFolderError, StopRequested) as error:
@@ -137,8 +137,8 @@ def _play(
 
     lay: where the servos were when the arm's pose was checked.
 
-    Returns sentences about settings that another program changed meanwhile, and about an arm that does not stay in its
-    rest pose without torque; "" if there are none.
+    Returns sentences about settings that another program changed during the run, and about an arm that does not stay in
+    its rest pose without torque; "" if there are none.
     """
     stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
     settings: Settings = {}
@@ -184,7 +184,7 @@ def _play(
 
 
 def _moved_without_torque(config: Config, bus: ServoBus, recorder: Recorder) -> str:
-    """What an arm has done without torque since the last sample, before which it had torque; "" if nothing is known."""
+    """What the arm has done since the last sample, after which its torque was cut; "" if nothing is known."""
     samples = recorder.samples
     if not len(samples) or bus.torque_off_report is None:
         return ""
@@ -192,7 +192,7 @@ def _moved_without_torque(config: Config, bus: ServoBus, recorder: Recorder) -> 
 
 
 def _try_again(bus: ServoBus, note: Note) -> None:
-    """Cut the torque of servos that did not answer, again and again in the time in which a servo boots.
+    """Cut the torque of servos that did not answer, again and again for the time that a servo takes to boot.
 
     Their watchdogs have acted by now, if they were still armed, so that packets cannot delay them any more.
     """
@@ -237,7 +237,7 @@ def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> 
 
 
 def _check_unchanged(bus: ServoBus) -> Settings:
-    """Check that the servos' settings are those of the start, by which the arm's pose was judged; return them."""
+    """Check that the servos' settings are still those with which the arm's pose was checked; return them."""
     before = {each: value for each, value in settings_at_start().items() if each[1] not in WRITTEN}
     now = settings_now(bus)
     if changed := changed_settings(before, now):

@@ -197,8 +197,9 @@ class Stream:
     def _false_velocity(self, state: State, window: int) -> str:
         """Which joint reports a velocity although its position has not changed in the last `window` samples.
 
-        The last sample does not show it: at a low rate, a joint may have begun to move right before it. Either the one
-        before has a velocity too, or earlier ones have some that would add up to several encoder steps.
+        The last sample alone does not prove this: at a low rate, a joint may have begun to move right before it.
+        Therefore the sample before it must report a velocity too, or earlier ones velocities that would add up to
+        several encoder steps.
         """
         moved = np.ptp(self._recorder.samples["position"][-window:], axis=0)
         speed = np.abs(self._recorder.samples["velocity"][-window:])
@@ -312,7 +313,7 @@ class Stream:
         self._note(f"still moving at {told} rad/s after {self._config.safety.rest_time:g} s without current")
 
     def _balance(self, stabiliser: Stabiliser) -> None:
-        """Bring an upright arm as close to balance as friction allows, or it falls over when torque is cut."""
+        """Bring an upright arm as close to balance as friction allows; otherwise it falls over when torque is cut."""
         window = rest_window(self._plan.rate)
         state = self._play(self._silence(window), Phase.COMING_TO_REST)
         stabiliser.balance()

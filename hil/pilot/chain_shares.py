@@ -273,8 +273,8 @@ class SafeShares:
 
 
 def _round_rate(rate: float, period: float) -> float:
-    """Return the next rate of whole tens [Hz] with a whole number of samples per period, if there is one, or as good a
-    rate.
+    """Return the next multiple of 10 Hz, if it gives a whole number of samples per period, otherwise the next rate [Hz]
+    that does.
     """
     tens = 10.0 * np.ceil(rate / 10.0)
     return float(tens if (tens * period).is_integer() else np.ceil(rate * period) / period)

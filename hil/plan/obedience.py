@@ -3,9 +3,9 @@
 As long as the torque does not change, a reversed motor and something that pushes the joint look alike: the arm moves as
 if an additional torque acted on the joint. So the goal of such a joint is removed for a moment, while the others are
 held. Unexplained torque that comes from the joint's own motor falls in proportion to its goal; torque from a push does
-not. It falls along with the motor's own torque, through the same filter: what falls earlier or later is something else,
-such as a push that has just ended, and the joint is tested again. The test is short: in that time a limp joint gains
-less speed from gravity than a reversed motor would give it.
+not. The former falls along with the motor's own torque, through the same filter. What falls earlier or later has
+another cause, such as a push that has just ended, and the joint is tested again. The test is short: in that time a limp
+joint gains less speed from gravity than a reversed motor would give it.
 """
 
 from collections.abc import Sequence
@@ -45,8 +45,8 @@ nevertheless.
 
 MOVES_RAD_S = 0.1
 DOUBT_S = 0.1
-"""How long after an undecided test a joint that speeds up is blamed without another one [s]: its motor may have become
-reversed right before that test.
+"""How long after an inconclusive test a joint that speeds up is blamed without another one [s]: its motor may have
+become reversed right before that test.
 """
 
 PAUSE_S, PUSHED_PAUSE_S = 0.01, 0.25
@@ -70,7 +70,10 @@ class Residual(NamedTuple):
 
 @dataclass
 class _Test:
-    """A joint without goal. since: its beginning [s]. drives: whether the unexplained torque made the joint faster."""
+    """A test of a joint, whose goal is removed for a moment.
+
+    since: its beginning [s]. drives: whether the unexplained torque made the joint faster.
+    """
 
     since: float
     drives: bool
@@ -113,7 +116,7 @@ class Obedience:
     def question(self, joint: int, now: float) -> bool:
         """Begin a test of a joint that speeds up although its torque opposes the motion. now: time [s].
 
-        Returns False if one has just been undecided, in which case its motor is to blame.
+        Returns False if one has just been inconclusive, in which case its motor is to blame.
         """
         if now < self._doubted_until[joint]:
             return False

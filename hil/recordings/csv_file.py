@@ -63,7 +63,10 @@ def _text(path: Path) -> str:
 
 
 def _delimiter(lines: list[str]) -> str | None:
-    """Find the delimiter that splits the first lines into equally many fields, and most; None for white space."""
+    """Find the delimiter that splits each of the first lines into the same number of fields, the largest one.
+
+    Returns None for white space.
+    """
     some = lines[: min(len(lines), 20)]
     best: tuple[int, str | None] = (0, None)
     for each in (";", "\t", ",", "|"):

@@ -44,7 +44,7 @@ def refuse_degrees(source: str, names: Sequence[str], time: Values, position: Va
         if speed > fastest:
             what = f"its speed, {speed:.4g} rad/s, is more than {TIMES_NO_LOAD:g} times that of any servo"
         elif high - low > MOST_RANGE_RAD and not rotates:
-            what = f"it swings over {(high - low) / (2 * math.pi):.2g} turns"
+            what = f"it swings through {(high - low) / (2 * math.pi):.2g} turns"
         else:
             continue
         raise CsvError(

@@ -119,7 +119,7 @@ def _rate(column: str, time: Values, position: Values, velocity: Values) -> Rate
 
 
 def _increase(at: Values, time: Values, values: Values) -> Values:
-    """Increase of `values` over a window around each time, averaged over as much."""
+    """Increase of `values` over a window around each time, averaged over shifts of up to half the window's length."""
     fine = np.linspace(-0.5 * WINDOW, 0.5 * WINDOW, 9)
     mean = sum(
         np.interp(at + shift + 0.5 * WINDOW, time, values) - np.interp(at + shift - 0.5 * WINDOW, time, values)

@@ -95,7 +95,7 @@ def render(title: str, started: str, shown: Sequence[Section], kind: str = "Iden
 
 
 def _prose(text: str) -> Markup:
-    """Text as on a terminal, set for a page: what stands in backticks as code, and a plus-minus sign."""
+    """Convert text for the terminal to HTML: text in backticks becomes code, "+-" a plus-minus sign."""
     return Markup(_CODE.sub(r"<code>\1</code>", str(escape(text)).replace("+-", "±")))
 
 

@@ -276,7 +276,7 @@ class ChainFacts:
 
     urdf: file name, relative to the configuration. rotation, translation [m]: pose of each joint's frame in the
     previous link's frame. axis: joint axis in its own frame. gravity: gravity in the base frame [m/s^2]. groups: linear
-    combination that each base parameter represents. from_prior: parameters that the recording hardly determines, taken
+    combination that each base parameter represents. from_prior: parameters that the recording barely constrains, taken
     from the URDF. held: joints of the URDF that are treated as fixed. doubts: warnings about implausible inertias.
     """
 

@@ -88,7 +88,7 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
 
 
 def _swapped(before: Settings, after: Settings) -> tuple[Joint, Joint] | None:
-    """A servo with all the settings of another, which were different before, and that one; None if there are none."""
+    """A servo that now has all the settings that another one had, and that one; None if there is no such pair."""
     old, new = _by_joint(before), _by_joint(after)
     for first, second in permutations(old, 2):
         if old[first] != old[second] == new.get(first):

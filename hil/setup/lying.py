@@ -44,7 +44,7 @@ def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
     """Wait at most `longest` [s] for an arm that is still swinging or falling after an earlier run.
 
     Returns a sentence about a joint that is still moving after that time; "" if all are at rest. Raises BusShared if
-    another program switches torque on meanwhile.
+    another program switches torque on in the meantime.
     """
     clock = bus.port.clock
     former, end = bus.read_positions(), clock.now() + longest
@@ -67,7 +67,7 @@ def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float])
 
     The message says how far each joint has moved and which rest pose to configure. It is "" if the arm has not moved,
     was not in its rest pose, or does not answer. before: pose when torque was cut (joints,) [rad]. Raises BusShared if
-    another program switches torque on meanwhile.
+    another program switches torque on in the meantime.
     """
     at, rest = np.array(before), np.array(config.arm.rest_pose)
     if not config.is_chain or not np.abs(at - rest).max() < FROM_REST_RAD:

@@ -46,7 +46,7 @@ def refuse_moved(before: Lies, now: Lies, bus: ServoBus) -> None:
             if abs(again) <= MOST_RAD < abs(turned - again):
                 raise ExperimentError(
                     f"{drive.title} reported an angle {turned:+.3f} rad from the first one, and {again:+.3f} rad when "
-                    "it was read again: its replies come one request late, or it was moved and is back. Unplug the "
+                    "it was read again: its replies come one request late, or it was moved and moved back. Unplug the "
                     "adapter, plug it in and start again; if this recurs, replace the adapter or its cable."
                 )
             raise ExperimentError(

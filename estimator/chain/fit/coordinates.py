@@ -79,7 +79,7 @@ class ChainCoordinates:
     def moved(self, x: Array, step: Array) -> Array:
         """Return the point reached by `step` from `x`; other coordinates may follow in both arrays.
 
-        If a recording hardly determines the torque of some joints relative to that of the first, their torque scales
+        If a recording barely constrains the torque of some joints relative to that of the first, their torque scales
         and all parameters of their links can change by a common factor. The scales are exponentials of their
         coordinates. Unless the parameters change exponentially with them, a step does not follow this common change,
         and only tiny steps reduce the sum of squares.

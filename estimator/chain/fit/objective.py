@@ -335,7 +335,7 @@ class ChainProblem:
         return self.added[index] if self.added else None
 
     def _of_period(self, index: int, parameters: dict[str, float]) -> dict[str, float]:
-        """Return the parameters of the equivalent arm (`as_moving`) in a period, with what had been added to it."""
+        """Return the parameters of the equivalent arm (`as_moving`) in a period, including the mass added in it."""
         parameters, added = as_moving(self.model.base, parameters), self._added(index)
         if added is None:
             return parameters

@@ -201,7 +201,7 @@ def _minimised(problem: ChainProblem, x: Array, ftol: float) -> tuple[Minimum, C
 def towards_prior(problem: ChainProblem, x: Array, options: ChainOptions) -> Array:
     """Return stage 1's estimate, moved towards the prior until the arm can be simulated.
 
-    If the data hardly determine some inertias, the estimates may be unphysical, with an indefinite mass matrix.
+    If the data barely constrain some inertias, the estimates may be unphysical, with an indefinite mass matrix.
     """
     count = problem.model.base.count
     likely = problem.prior.value / problem.coordinates.scales[:count]

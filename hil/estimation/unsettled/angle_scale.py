@@ -34,7 +34,7 @@ RESTS = 0.2  # largest torque of the spring where the joint would hang, relative
 class _Scale:
     """Angles of joint 1 that seem to be `factor` times the true ones.
 
-    by_zero: whether the encoder zero says the same.
+    by_zero: whether the encoder zero indicates the same.
     """
 
     factor: float
@@ -78,7 +78,7 @@ def _candidate(recordings: Sequence[Recording], estimate: ShootingEstimate, abou
 
 
 def _rests_hanging(recordings: Sequence[Recording], estimate: ShootingEstimate) -> bool:
-    """Whether the spring is slack where the joint hangs, as far as the offset tells."""
+    """Whether the spring is slack where the joint hangs, judging by the offset."""
     value = estimate.parameters
     stiffness, offset = value[SPRING], value["offset_1"]
     moved = max(float(np.ptp(each.filled()[0])) for each in recordings)
@@ -88,7 +88,7 @@ def _rests_hanging(recordings: Sequence[Recording], estimate: ShootingEstimate) 
 def _without_spring(
     recordings: Sequence[Recording], estimate: ShootingEstimate, scale: _Scale, about: Array
 ) -> tuple[_Scale, ShootingEstimate] | None:
-    """The fit in this scale without springs and with the zeros as given, if it explains the motion as well."""
+    """The fit with this scale, without springs and with the zeros as given, if it explains the motion as well."""
     limit = AS_WELL * estimate.residual_over_noise
     if not scale.by_zero:  # a scale is not exactly a spring: what is left of the spring corrects it
         refined = _fitted(recordings, estimate, scale, about, spring=True)

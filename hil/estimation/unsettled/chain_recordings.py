@@ -197,7 +197,7 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     if found.from_prior:
         trust = lowered(trust, "with care")
         sentences.append(
-            f"The recordings hardly determine {', '.join(found.from_prior)}: these values come from the URDF."
+            f"The recordings say little about {', '.join(found.from_prior)}: these values come from the URDF."
         )
     if said := vague(prior, names, found.std, found.from_prior):
         trust = lowered(trust, "with care")

@@ -32,7 +32,7 @@ SHOWN = 3
 
 @dataclass(frozen=True)
 class _Joint:
-    """One joint of a recording, with the residual of the fit. name: for sentences."""
+    """One joint of a recording, with the residual of the fit. name: as used in messages."""
 
     name: str
     time: Array
@@ -184,7 +184,7 @@ def _departs(time: Array, values: Array, doubtful: Mask, least: float) -> Mask:
 
 
 def _stop(joint: _Joint) -> list[str]:
-    """Impacts at the same angle, beyond which the joint never gets."""
+    """Impacts at the same angle, which the joint never passes."""
     known = np.isfinite(joint.position)
     time, position = joint.time[known], joint.position[known]
     lag = max(1, round(IMPACT_TIME / float(np.median(np.diff(time)))))
@@ -236,6 +236,6 @@ def _from_to(time: Array, part: slice) -> str:
 
 
 def _at(times: Array) -> str:
-    """The first of some times."""
+    """Text that lists the times, or only the first ones."""
     shown = ", ".join(f"{each:.3f}" for each in times[:SHOWN])
     return f"at {shown} s" if len(times) <= SHOWN else f"the first at {shown} s"

@@ -208,7 +208,7 @@ class Lowering:
         pushed = self._obedience.is_pushed(joint)
         self.needs_another_path = pushed and self._paths < MOST_PATHS
         if not self.needs_another_path:
-            why = ": something pushes it, and its motor is too weak." if pushed else "."
+            why = ": something is pushing it, and its motor is too weak to resist." if pushed else "."
             title = self._config.joints[joint].joint.title
             raise SafetyStop(f"{title} is {away:.2f} rad off its lowering path{why}", Cause.UNEXPECTED)
 
@@ -252,7 +252,7 @@ class Lowering:
         )
 
     def others_answer(self) -> None:
-        """Record that of the servos that are not heard, some do answer: a silent one hides their replies."""
+        """Record that some of the servos that are not heard do answer: a silent one hides their replies."""
         self._guard.others_answer()
 
     def late(self, seconds: float) -> None:

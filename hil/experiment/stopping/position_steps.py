@@ -58,7 +58,7 @@ class PositionSteps:
 
 
 def _is_step(seen: _Seen, position: float, now: _Seen) -> bool:
-    """Whether a position is out of reach, whether the joint has moved at its velocities or stood still."""
+    """Whether a position is out of reach for a joint that moved at its velocities, and for one that stood still."""
     seconds = now.time - seen.time
     way = 0.5 * seconds * (seen.velocity + now.velocity)
     unsure = STEP_RAD + 0.5 * BENDS_RAD_S2 * seconds**2

@@ -16,7 +16,7 @@ def stabiliser(data: RunData) -> Section | None:
             data.names, share.rms, share.peak, share.commanded_rms, share.share, strict=True
         )
     ]
-    head = ("joint", "stabiliser RMS [N m]", "stabiliser peak [N m]", "all torque RMS [N m]", "share of RMS")
+    head = ("joint", "stabiliser RMS [N m]", "stabiliser peak [N m]", "total torque RMS [N m]", "share of RMS")
     words = (
         share.said(data.names),
         "The software spring and damper held the arm at its pose during the periods. The estimate uses the total "

@@ -57,9 +57,9 @@ class SavedSettings:
             self._keep(joint, settings, changed)
 
     def _take_over(self, joint: Joint, left: Left, changed: dict[str, int]) -> None:
-        """Save what an earlier run left, and say what of it will be restored.
+        """Save the settings that an earlier run left, and say which of them will be restored.
 
-        What another program has changed is the servo's own value from now on, unless it prevents this run.
+        A value that another program has set counts as the servo's own from now on, unless it prevents this run.
         """
         if said := left.told(joint.title):
             self._say(said)
@@ -100,7 +100,7 @@ class SavedSettings:
     def verify(self, failed: dict[Joint, DriverError]) -> None:
         """Read the settings of all servos again once the last one has been restored, and restore those that differ.
 
-        Replies that belong to earlier requests, or IDs that are swapped meanwhile, make a servo seem restored that was
+        Replies that belong to earlier requests, or IDs that are swapped in between, make a servo seem restored that was
         never reached. failed: receives the errors of the servos whose settings still differ.
         """
         for attempt in range(_MOST_CHECKS):

@@ -132,7 +132,7 @@ class ServoSession:
     def end(self) -> list[str]:
         """Restore every servo's settings; return one message per reason for which some could not be restored.
 
-        Torque is read last of all, and cut again where another program has switched it on meanwhile; the settings are
+        Torque is read last of all, and cut again where another program has switched it on since; the settings are
         restored again after that. Never raises DriverError.
         """
         saved = self.saved
@@ -172,7 +172,7 @@ class ServoSession:
         return True
 
     def _switched_on_by_another(self) -> Iterator[str]:
-        """Say at which servos another program switched torque on after it had been cut, unless it still is on."""
+        """Say at which servos another program switched torque on after it had been cut, unless it is still on."""
         on = [joint for joint, is_on in self._torque.items() if is_on]
         silent = [joint for joint in self._on_again if self._torque.get(joint, True) is None]
         if on or silent:

@@ -68,7 +68,7 @@ def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
 
 
 def _changed_delays(saved: SavedSettings, delays: Mapping[Joint, int], silent: Collection[Joint]) -> Iterator[str]:
-    """Say which Return Delay Times were changed meanwhile, by another program or a factory reset."""
+    """Say which Return Delay Times were changed during the session, by another program or a factory reset."""
     for joint, before in delays.items():
         now = before
         if joint not in silent:
@@ -83,7 +83,7 @@ def _changed_delays(saved: SavedSettings, delays: Mapping[Joint, int], silent: C
 
 
 def _lowered_limits(saved: SavedSettings, settings: Settings, silent: Collection[Joint]) -> Iterator[str]:
-    """Say which PWM Limits were lowered meanwhile, and which goals they keep from being restored."""
+    """Say which PWM Limits were lowered during the session, and which goals they keep from being restored."""
     for joint, servo in saved.bus.drives.items():
         before = settings.get((joint, _PWM_LIMIT))
         if before is None or joint in silent:
@@ -107,8 +107,8 @@ def _lowered_limits(saved: SavedSettings, settings: Settings, silent: Collection
 
 
 def _changed_meaning(saved: SavedSettings, settings: Settings, silent: Collection[Joint]) -> Iterator[str]:
-    """Say which settings were changed meanwhile that give angles or goals another meaning: the next start takes them as
-    they are.
+    """Say which settings that give angles or goals another meaning were changed during the session: the next start
+    takes them as they are.
     """
     for joint, servo in saved.bus.drives.items():
         for name in (_OFFSET, _DRIVE_MODE):

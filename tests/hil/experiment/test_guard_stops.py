@@ -309,7 +309,9 @@ def test_an_arm_that_is_elsewhere_once_torque_is_on_has_moved_before_the_start(
     assert_stopped(ports[0])
 
 
-@pytest.mark.parametrize("said", ["Just before, Goal Current of joint 'elbow' was -9 although 3 had been written.", ""])
+@pytest.mark.parametrize(
+    "said", ["Shortly before this, Goal Current of joint 'elbow' was -9 although 3 had been written.", ""]
+)
 def test_a_foreign_goal_just_before_a_stop_is_noted(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

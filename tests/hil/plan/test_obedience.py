@@ -70,7 +70,7 @@ def test_what_falls_otherwise_than_the_motors_own_torque_is_something_else() -> 
     assert found == -1 and obedience.is_pushed(0) and obedience.question(0, 0.03) and not obedience.is_limp(0)
 
 
-def test_a_joint_that_runs_away_after_an_undecided_test_is_blamed() -> None:
+def test_a_joint_that_runs_away_after_an_inconclusive_test_is_blamed() -> None:
     """Its motor may have become reversed right before the test."""
     found, obedience = falling(OWN, OWN)
     assert found == -1 and not obedience.question(0, 0.03)
