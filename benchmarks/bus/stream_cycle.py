@@ -16,13 +16,14 @@ rustypot is optional (`pip install ".[bench]"`).
 
 import argparse
 import json
+import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,7 +40,7 @@ from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Stream
 from hil.plan.plan import make_plan
 from hil.runs.recording import Phase, Recorder
-from hil.setup.realtime import real_time
+from hil.setup.realtime import PRIORITY, real_time
 
 CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link.toml"
 REST_S = 1.5
@@ -65,11 +66,17 @@ Player = Callable[[int], Round]
 
 
 @contextmanager
-def fake_pty(config: Path) -> Iterator[str]:
-    """Name of a terminal on which `hil fake` serves the arm."""
+def fake_pty(config: Path, *, real_time: bool = False) -> Iterator[str]:
+    """Name of a terminal on which `hil fake` serves the arm. real_time: with priority over ordinary programs, and on
+    the first core, if that is permitted.
+    """
     command = [sys.executable, "-m", "hil", "fake", str(config), "--pty", "--quiet"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
+        if real_time:
+            with suppress(OSError):
+                os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
+                os.sched_setaffinity(process.pid, {min(os.sched_getaffinity(0))})
         try:
             yield process.stdout.readline().strip()
         finally:

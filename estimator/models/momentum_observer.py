@@ -39,7 +39,7 @@ import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled, only_version
+from hil.estimator.compiled import compiled
 from hil.estimator.models import earlier_model, standstill
 
 NAMES = (
@@ -79,6 +79,10 @@ _LONGEST_GAP = 3.0  # number of intervals between two samples after which the ob
 # parameters, a row of scalars, and the parameters' covariance.
 _MOMENTUM, _REST, _FORMER, _THETA, _SINGLE, _COVARIANCE = 0, 2, 4, 6, 7, 8
 _PENDING = _COVARIANCE + _COUNT
+# Behind them, work space that would otherwise be allocated in every call: both joints' regressors, the row of a joint's
+# equation, and the covariance times that row. Each regressor is zero in the same columns of every sample.
+_OF_MOMENTUM = _PENDING + 1
+_OF_REST, _ROW, _GAIN = _OF_MOMENTUM + 2, _OF_MOMENTUM + 4, _OF_MOMENTUM + 5
 # Scalars: per joint filtered torque, noise variance, fraction of time at standstill, duration and sample count of a
 # possible alarm, residual torque; then the time since the last parameter update and since the start.
 _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
@@ -119,7 +123,7 @@ class MomentumObserver:
                 f"{joints} joints and a covariance of shape {covariance.shape}: 1 or 2 joints and (14, 14) are needed"
             )
         self._joints = joints
-        self._memory = np.zeros((_PENDING + 1, _COUNT))
+        self._memory = np.zeros((_GAIN + 1, _COUNT))
         self._memory[_THETA] = [mean.get(name, 0.0) for name in NAMES]
         self._memory[_COVARIANCE:_PENDING] = covariance
         expected = frictions * np.array([mean.get(f"coulomb_{number}", 0.0) for number in (1, 2)][:joints])
@@ -134,11 +138,11 @@ class MomentumObserver:
         further = (drift, least_noise, highest, friction, [float(hardly_known)])
         self._constants = np.concatenate(([joints, interval, *floor], *further))
         self._past = earlier_model.memory(_COUNT)
-        self._loop: Callable[..., int] = _observe
+        self.memory = self._memory, self._rests, self._past, self._constants
+        """What `observe`, the compiled loop, is given before the sample."""
         self.observe(
             (0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf
         )  # compiles the loop and initialises the memory
-        self._loop = only_version(_observe)
 
     def observe(self, position: Any, velocity: Any, torque: Any, seconds: float) -> int:
         """Process one sample; return the joint (from 0) whose motion is inconsistent, or -1.
@@ -148,8 +152,7 @@ class MomentumObserver:
         """
         if self._joints == 1:
             position, velocity, torque = (position[0], 0.0), (velocity[0], 0.0), (torque[0], 0.0)
-        constants = self._constants
-        return self._loop(self._memory, self._rests, self._past, constants, *position, *velocity, *torque, seconds)
+        return int(observe(*self.memory, *position, *velocity, *torque, seconds))
 
     @property
     def lacking(self) -> list[float]:
@@ -211,20 +214,27 @@ def _filter(m: Any, j: int, momentum: Any, rest: Any, torque: float, fallen: flo
     single[_STANDS + j] += fallen * (1.0 - abs(rest[j, 8 + j]) - single[_STANDS + j])
 
 
-def _lacks(m: Any, j: int, row: Any, gain: Any) -> tuple[float, float]:
-    """Return the residual torque, and its variance due to the parameters; set `gain` to covariance times `row`."""
+def _lacks(m: Any, j: int, row: Any) -> tuple[float, float]:
+    """Return the residual torque, and its variance due to the parameters. Most terms are zero, and are left out."""
     lacking = m[_SINGLE, _TORQUE + j]
     left_open = 0.0
     for i in range(_COUNT):
-        lacking -= row[i] * m[_THETA, i]
-        gain[i] = 0.0
-        for n in range(_COUNT):
-            gain[i] += m[_COVARIANCE + i, n] * row[n]
-        left_open += row[i] * gain[i]
+        if row[i] != 0.0:
+            lacking -= row[i] * m[_THETA, i]
+            left_open += row[i] * _gain(m, i, row)
     return lacking, left_open
 
 
-def _learn(m: Any, gain: Any, lacking: float, spread: float) -> None:
+def _gain(m: Any, i: int, row: Any) -> float:
+    gain = 0.0
+    for n in range(_COUNT):
+        gain += m[_COVARIANCE + i, n] * row[n]
+    return gain
+
+
+def _learn(m: Any, row: Any, gain: Any, lacking: float, spread: float) -> None:
+    for i in range(_COUNT):
+        gain[i] = _gain(m, i, row)
     for i in range(_COUNT):
         m[_THETA, i] += gain[i] * lacking / spread
         for n in range(_COUNT):
@@ -373,7 +383,7 @@ def _look_back(
 def _observe_loop(
     m: Any, rests: Any, past: Any, k: Any, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float, dt: float
 ) -> int:
-    momentum, rest = np.zeros((2, _COUNT)), np.zeros((2, _COUNT))
+    momentum, rest, row = m[_OF_MOMENTUM:_OF_REST], m[_OF_REST:_ROW], m[_ROW]
     _regressors(momentum, rest, q1, q2, v1, v2)
     if dt > _LONGEST_GAP * k[1]:
         _begin_anew(m, momentum, rest, t1, t2)
@@ -394,13 +404,12 @@ def _observe_loop(
             m[_COVARIANCE + i, i] += (k[4 + i] + (_DRIFT * m[_THETA, i]) ** 2) * single[_LESSON]
         single[_LESSON] = 0.0
     alarm = -1
-    row, gain = np.empty(_COUNT), np.empty(_COUNT)
     for j in range(int(k[0])):
         _filter(m, j, momentum, rest, t1 if j == 0 else t2, fallen, slope, row)
         if not is_warm:
             continue
         _remember_speed(m, j, v1 if j == 0 else v2, dt)
-        lacking, left_open = _lacks(m, j, row, gain)
+        lacking, left_open = _lacks(m, j, row)
         single[_LACKING + j] = lacking
         stands = min(max(single[_STANDS + j], 0.0), 1.0)
         static, rounding = _static_friction(m, rests[j], j), _of_rounding(m, j, slope, math.cos(q2))
@@ -424,13 +433,14 @@ def _observe_loop(
         _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), dt * (1.0 - stands), single[_SAMPLES + j] > 0.0)
         if lesson and not is_beyond and not _is_suspect(rests[j]):
             taught_by = _LESSONS * (spread - left_open) + _STANDING_LESSONS * (1.0 - quiet) * rounding
-            _learn(m, gain, lacking, left_open + taught_by + holds * holds)
+            _learn(m, row, m[_GAIN], lacking, left_open + taught_by + holds * holds)
             _keep_dissipative(m)
     return alarm
 
 
 _inner: Any = numba.njit(nogil=True, error_model="numpy")
-_regressors, _begin_anew, _filter, _lacks, _learn = map(_inner, (_regressors, _begin_anew, _filter, _lacks, _learn))
+_regressors, _begin_anew, _filter = map(_inner, (_regressors, _begin_anew, _filter))
+_gain, _lacks, _learn = map(_inner, (_gain, _lacks, _learn))
 _keep_dissipative = _inner(_keep_dissipative)
 _withstood, _forget, _look_at_rest = standstill.withstood, standstill.forget, standstill.look
 _variance, _blocked, _is_suspect = standstill.variance, standstill.blocked, standstill.is_suspect
@@ -441,4 +451,4 @@ _static_friction, _is_blocked = map(_inner, (_static_friction, _is_blocked))
 _second_moment, _of_rounding = map(_inner, (_second_moment, _of_rounding))
 _alarms, _teach_noise, _floor, _remember_speed = map(_inner, (_alarms, _teach_noise, _floor, _remember_speed))
 _look_back = _inner(_look_back)
-_observe: Callable[..., int] = compiled(_observe_loop)
+observe: Callable[..., int] = compiled(_observe_loop)

@@ -163,10 +163,11 @@ MEMORY = np.dtype(
 position, velocity, turn: latest ones, and the latest change of velocity [rad, rad/s]; the position is NaN before the
 first one and after a long gap. seconds, moved, difference, unknown, most_curved: sums (for the last one, the maximum)
 since the long memory was last updated. seen: that difference without motion that the velocity's register cannot show.
-headed: time of motion in the positive minus that in the negative direction since then [s]. rough: sum of squares of what jumps of the
-velocity may add in each interval since then [rad^2]. heading, roughness: the same two, in the slow memory. moving: time
-of motion in it [s]. learnt: information from which lag and scale error were learnt [rad^2/s]. lag, scale: their largest
-accepted values [s, 1]. Then the range of the bias, and the sums from which lag and scale error are estimated.
+headed: time of motion in the positive minus that in the negative direction since then [s]. rough: sum of squares of
+what jumps of the velocity may add in each interval since then [rad^2]. heading, roughness: the same two, in the slow
+memory. moving: time of motion in it [s]. learnt: information from which lag and scale error were learnt [rad^2/s]. lag,
+scale: their largest accepted values [s, 1]. Then the range of the bias, and the sums from which lag and scale error are
+estimated.
 """
 
 

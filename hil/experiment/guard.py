@@ -104,7 +104,11 @@ class Guard:
             else f" Lower experiment.peak_torque. {how_to_find_torque(config)}"
         )
         self._lower_torque = lower
-        self._commands = CommandLimits(config)
+        commands = CommandLimits(config)
+        self.clamp = commands.clamp
+        """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""
+        self.holding = commands.holding
+        """Set the goals that the servos have now [A or V], from which `clamp` continues."""
         planned = planned or _planned(config)
         interval = 1.0 / rate if interval is None else interval
         self.recent = RecentMotion(config, interval) if recent is None else recent
@@ -129,14 +133,6 @@ class Guard:
         self._shortest = float("inf")
         self._supply = [float("nan")] * len(config.joints)
         """Lowest measured supply voltage of each joint [V]; NaN before the first reading."""
-
-    def clamp(self, goals: Sequence[float]) -> list[float]:
-        """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""
-        return self._commands.clamp(goals)
-
-    def holding(self, goals: Sequence[float]) -> None:
-        """Set the goals that the servos have now [A or V], from which `clamp` continues."""
-        self._commands.holding(goals)
 
     def woke_up(self, now: float, late: float) -> None:
         """Record that this program woke up at `now` [s], `late` [s] after the intended time (negative: earlier)."""

@@ -6,13 +6,12 @@ needs too, only the planned torque is known: the first motion then trains the mo
 """
 
 import math
-import operator
 from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from struct import Struct
 from typing import Any, NoReturn
 
+import numba
 import numpy as np
 
 from hil.config.schema import Config
@@ -22,7 +21,7 @@ from hil.dry_run.ensemble import Ensemble, prior_ensemble
 from hil.errors import Cause, SafetyStop
 from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled, only_version
-from hil.estimator.models.momentum_observer import NAMES, MomentumObserver
+from hil.estimator.models.momentum_observer import NAMES, MomentumObserver, observe
 from hil.estimator.models.parameters import CONSTANTS
 from hil.experiment.apart import causes_of_standstill
 from hil.experiment.consistency import check_standstill
@@ -83,11 +82,11 @@ zero.
 """
 
 
-_JOLT = np.dtype(
+JOLT = np.dtype(
     [(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun")]
     + [("count", "i8"), ("oldest", "i8"), ("reversed", "i8")]
 )
-"""Statistics of a joint's changes of velocity.
+"""Statistics of a joint's changes of velocity; zero-filled at first, but for `begun`, which is minus infinity.
 
 square: mean square of ordinary ones [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may still
 turn out to belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s]. begun: its time
@@ -96,8 +95,9 @@ round in the first change of a possible jolt.
 """
 
 
-class Jolts:
-    """Detects a joint whose velocity jumps and returns a moment later, as when its horn slips.
+def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float, least: float) -> int:
+    """Process velocities [rad/s], `seconds` after the previous ones [s]; return a joint whose velocity jumped and
+    returned a moment later, as when its horn slips, or -1.
 
     No motor can do this on any arm: it would have to accelerate and brake much harder than ever before. The check
     therefore needs no knowledge of the arm. Changes of velocity over `JOLT_S` are compared with ordinary ones.
@@ -105,46 +105,9 @@ class Jolts:
     Where the joint turns round in both changes, the teeth of a gear with backlash have changed sides at two successive
     reversals: the motor crosses the gap much faster than it drives the arm, which is not a jolt.
 
-    count: number of joints. interval: time between two exchanges [s].
+    joints: records of the type JOLT. former: the latest velocities (samples within `JOLT_S`, joints) [rad/s]. least:
+    smallest change that counts as a jolt [rad/s].
     """
-
-    def __init__(self, count: int, interval: float) -> None:
-        back = max(1, round(JOLT_S / interval))
-        self._interval = interval
-        self._least = JOLT_RAD_S * max(1.0, interval / JOLT_S)
-        self._joints = np.zeros(count, _JOLT)
-        self._joints["begun"] = -np.inf
-        self._former = np.zeros((back, count))
-        self._velocity = np.zeros(count)
-        self._pack = Struct(f"{count}d").pack_into
-        self._bytes = memoryview(self._velocity.data).cast("B")
-        self._jolting: Callable[..., int] = _jolting
-        self.look([0.0] * count, 0.0, 0.0)  # compile
-        self._jolting = only_version(_jolting)
-        self.forget()
-
-    def look(self, velocity: Sequence[float], seconds: float, now: float) -> tuple[int, float] | None:
-        """Process velocities [rad/s], `seconds` after the previous ones [s]; return the joint that jolted and its
-        change of velocity [rad/s], or None.
-        """
-        self._pack(self._bytes, 0, *velocity)
-        joint = self._jolting(self._joints, self._former, self._velocity, seconds, now, self._least)
-        return None if joint < 0 else (joint, float(self._joints["change"][joint]))
-
-    def began(self, joint: int) -> float:
-        """Return a time [s] before which a joint's latest jolt cannot have begun."""
-        return float(self._joints["begun"][joint]) - len(self._former) * self._interval
-
-    def usual(self, joint: int) -> float:
-        """Return the RMS of a joint's ordinary changes of velocity [rad/s]."""
-        return math.sqrt(float(self._joints["square"][joint]))
-
-    def forget(self) -> None:
-        """Start over: nothing is known about the motion since the previous sample."""
-        self._joints["count"] = 0
-
-
-def _jolting_loop(joints: Any, former: Any, velocity: Any, seconds: float, now: float, least: float) -> int:
     back = former.shape[0]
     found = -1
     for index in range(len(joints)):
@@ -178,7 +141,75 @@ def _jolting_loop(joints: Any, former: Any, velocity: Any, seconds: float, now: 
     return found
 
 
-_jolting: Callable[..., int] = compiled(_jolting_loop)
+_jolting = numba.njit(nogil=True, error_model="numpy")(_jolting)
+
+
+_TIMES = np.dtype(
+    [(name, "f8") for name in ("seen_at", "shortest", "seconds", "vague", "longest_gap", "follows", "least")]
+)
+"""What depends on the times of the samples.
+
+seen_at, seconds: time of the latest sample, and since the one before [s]; seconds is infinite if the motion in between
+is not judged. shortest: duration of the shortest exchange [s]. vague: by how much longer an exchange may take [s], and
+longest_gap: the largest `seconds` over which changes of velocity are judged [s]. follows: share of a step of the torque
+that the motor has followed by the next sample. least: smallest change of velocity that counts as a jolt [rad/s].
+"""
+
+_DRIVE = np.dtype([(name, "f8") for name in ("constant", "goal", "felt")])
+"""A joint's torque: the constant [N m/A or N m/V], the latest goal [A or V], NaN before the first one, and the torque
+that the motor has reached [N m].
+"""
+
+
+def _watch_loop(
+    times: Any,
+    drives: Any,
+    jolts: Any,
+    velocities: Any,
+    m: Any,
+    rests: Any,
+    past: Any,
+    k: Any,
+    before: float,
+    after: float,
+    q1: float,
+    q2: float,
+    v1: float,
+    v2: float,
+    goal_1: float,
+    goal_2: float,
+) -> int:
+    """Process a sample: both checks in one call, since entering compiled code costs as much as a check itself.
+
+    Returns 0, or _JOLTED times the number of the joint that jolted (from 1) plus that of the joint whose motion is
+    inconsistent.
+
+    velocities: the latest ones, as `_jolting` needs them. m, rests, past, k: the observer's arrays. before, after:
+    times of the exchange [s].
+    """
+    at = times[0]
+    seconds, at.seen_at = before - at.seen_at, before
+    at.shortest = min(at.shortest, after - before)
+    # During a long exchange the time of the measurement is unknown, so the motion up to it is not judged.
+    is_known = not (np.isnan(drives[0].goal) or after - before - at.shortest > at.vague)
+    at.seconds = seconds = seconds if is_known else np.inf
+    for index in range(len(drives)):
+        drive = drives[index]
+        goal = goal_1 if index == 0 else goal_2
+        torque = drive.constant * (drive.goal if is_known else goal)
+        drive.felt = drive.felt + at.follows * (torque - drive.felt) if at.follows < 1.0 else torque
+        drive.goal = goal
+    if seconds > at.longest_gap:
+        for index in range(len(jolts)):
+            jolts[index].count = 0
+    jolted = _jolting(jolts, velocities, (v1, v2), seconds, before, at.least)
+    second = drives[1].felt if len(drives) > 1 else 0.0
+    unlike = observe(m, rests, past, k, q1, q2, v1, v2, drives[0].felt, second, seconds)
+    return int(_JOLTED * (jolted + 1) + unlike + 1)
+
+
+_JOLTED = 4
+_watch: Callable[..., int] = compiled(_watch_loop)
 
 
 class ModelWatch:
@@ -201,64 +232,70 @@ class ModelWatch:
         self._observer = MomentumObserver(mean, covariance, largest, interval, frictions, hardly_known=not is_described)
         self._names = [joint.joint.title for joint in config.joints]
         self._blocked_by = [causes_of_standstill(joint.joint) for joint in config.joints]
-        self._goal: Sequence[float] | None = None
-        self._seen_at = 0.0
-        self._shortest = float("inf")
         # Goals held over several exchanges are steps, which the current and the velocity follow with a delay.
-        held = interval < 0.99 / config.experiment.rate
-        self._follows = 1.0 - math.exp(-interval / _LAG_S) if held else 1.0
-        self._felt = [0.0] * len(largest)
+        self._is_held = interval < 0.99 / config.experiment.rate
         self._recent: deque[State] = deque(maxlen=math.ceil(_WINDOW_S / interval) + 1)
         self._stands_for = 0.0
         self._long = max(interval, _VAGUE_S)
-        self._jolts = Jolts(len(largest), interval)
-        self._longest_gap = _GAP * interval
+        back = max(1, round(JOLT_S / interval))
+        self._jolt_s = back * interval
+        """Time over which a change of velocity is taken [s]."""
+        self._jolts = np.zeros(len(largest), JOLT)
+        self._jolts["begun"] = -np.inf
+        self._times = np.zeros(1, _TIMES)
+        self._times["shortest"] = np.inf
+        self._times["vague"], self._times["longest_gap"] = self._long, _GAP * interval
+        self._times["follows"] = 1.0 - math.exp(-interval / _LAG_S) if self._is_held else 1.0
+        self._times["least"] = JOLT_RAD_S * max(1.0, interval / JOLT_S)
+        drives = np.zeros(len(largest), _DRIVE)
+        drives["constant"], drives["goal"] = self._constants, np.nan
+        velocities = np.zeros((back, len(largest)))
+        self._memory = (self._times, drives, self._jolts, velocities, *self._observer.memory)
+        _watch(*map(np.copy, self._memory), *(0.0,) * 8)  # compile
+        self._watch: Callable[..., int] = only_version(_watch)
 
     def look(self, state: State) -> None:
         """Process the latest sample. Raises SafetyStop if no arm of the ensemble could have moved like this."""
-        now, after, sent, _, velocity, position, _, missing, _, _, _ = state
+        now, after, goal, _, velocity, position, _, missing, _, _, _ = state
         if True in missing:
             return
-        goal, self._goal = self._goal, sent
-        seconds, self._seen_at = now - self._seen_at, now
-        # During a long exchange the time of the measurement is unknown, so the motion up to it is not judged.
-        took = after - now
-        if took < self._shortest:
-            self._shortest = took
-        if goal is None or took - self._shortest > self._long:
-            goal, seconds = sent, float("inf")
-        torque = list(map(operator.mul, self._constants, goal))
-        if self._follows < 1.0:
-            follows = self._follows
-            torque = self._felt = [felt + follows * (to - felt) for felt, to in zip(self._felt, torque, strict=True)]
-        if seconds > self._longest_gap:
-            self._jolts.forget()
-        if (found := self._jolts.look(velocity, seconds, now)) is not None:
-            self._check_displacement(*found, state)
+        if len(goal) == 1:
+            position, velocity, goal = (*position, 0.0), (*velocity, 0.0), (*goal, 0.0)
+        found = self._watch(*self._memory, now, after, *position, *velocity, *goal)
+        if found:
+            self._judge(*divmod(found, _JOLTED), state)
+            return
+        self._stands_for = 0.0
         self._recent.append(state)
-        joint = self._observer.observe(position, velocity, torque, seconds)
-        if joint < 0:
+
+    def _judge(self, jolted: int, unlike: int, state: State) -> None:
+        """Decide on the joint that jolted and the one whose motion is inconsistent; both from 1, 0 if there is none."""
+        if jolted:
+            self._check_displacement(jolted - 1, state)
+        self._recent.append(state)
+        if not unlike:
             self._stands_for = 0.0
             return
         # After a step, a heavy joint takes a while to reach the smallest velocity that the register shows.
-        if self._follows < 1.0 and abs(velocity[joint]) < _STILL_RAD_S:
-            self._stands_for += min(seconds, self._long)
+        if self._is_held and abs(state.velocity[unlike - 1]) < _STILL_RAD_S:
+            self._stands_for += min(float(self._times["seconds"][0]), self._long)
             if self._stands_for < _STEP_S:
                 return
-        self._raise(joint, state)
+        self._raise(unlike - 1, state)
 
-    def _check_displacement(self, joint: int, change: float, state: State) -> None:
+    def _check_displacement(self, joint: int, state: State) -> None:
         """Raise SafetyStop for a jolt that moved the joint farther than backlash, in which its teeth change sides."""
-        began = self._jolts.began(joint)
+        jolt = self._jolts[joint]
+        began = float(jolt["begun"]) - self._jolt_s
         before = next((each for each in reversed(self._recent) if each.time_before_write < began + 1e-3), None)
         if before is not None:
             seconds = state.time_before_write - before.time_before_write
             expected = 0.5 * seconds * (before.velocity[joint] + state.velocity[joint])
             displaced = abs(state.position[joint] - before.position[joint] - expected)
-            if displaced <= PLAY_RAD + CURVED * seconds * self._jolts.usual(joint):
+            if displaced <= PLAY_RAD + CURVED * seconds * math.sqrt(float(jolt["square"])):
                 return
         raise SafetyStop(
-            f"{self._names[joint]} jerked: its velocity changed by {change:+.1f} rad/s and back within "
+            f"{self._names[joint]} jerked: its velocity changed by {jolt['change']:+.1f} rad/s and back within "
             f"{1e3 * JOLT_BACK_S:.0f} ms, which the commanded torques cannot cause. Its horn slips on the shaft, its "
             "gear is worn, something hit it, its encoder is wrong, or another program sent it a goal.",
             Cause.UNEXPECTED,
@@ -269,7 +306,7 @@ class ModelWatch:
         name, velocity = self._names[joint], state.velocity[joint]
         check_standstill(name, reversed(self._recent), joint, _STILL_RAD_S)
         if abs(velocity) < _STILL_RAD_S:
-            since, constant = self._seen_at - _WINDOW_S, self._constants[joint]
+            since, constant = state.time_before_write - _WINDOW_S, self._constants[joint]
             # What was sent with one sample acts until the next.
             recent = [
                 constant * before.goal_current[joint]

@@ -82,8 +82,11 @@ class Recorder:
 
     def __init__(self, path: Path, joints: int, capacity: int) -> None:
         self._path = path
-        self._row = struct.Struct(f"<dddBBh{4 * joints}d{2 * joints}B{3 * joints}f")
-        self._nothing_slow = (float("nan"),) * (3 * joints)
+        front = f"<dddBBh{4 * joints}d{2 * joints}B"
+        self._row = struct.Struct(f"{front}{3 * joints}f")
+        # In most rows the last values are NaN: packed once, they are copied.
+        self._row_without_slow = struct.Struct(f"{front}{12 * joints}s")
+        self._nothing_slow = (struct.pack(f"<{3 * joints}f", *[float("nan")] * (3 * joints)),)
         dtype = sample_type(joints)
         assert self._row.size == dtype.itemsize
         try:
@@ -126,9 +129,10 @@ class Recorder:
             self._next_chunk += self._rows_a_chunk
             self._touched.put(self._next_chunk)
         before, after, goal_current, current, velocity, position, error, missing, slow, _, _ = state
-        self._row.pack_into(
+        row = self._row_without_slow if slow is None else self._row
+        row.pack_into(
             self._bytes,
-            count * self._row.size,
+            count * row.size,
             deadline,
             before,
             after,

@@ -12,9 +12,10 @@ from hil.dry_run.ensemble import prior_ensemble
 from hil.errors import Cause, SafetyStop
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.closed_loop import Feedback, respond, resting
-from hil.experiment.model_watch import JOLT_BACK_S, JOLT_RAD_S, JOLT_TIMES, Jolts, ModelWatch
+from hil.experiment.model_watch import JOLT_BACK_S, JOLT_RAD_S, JOLT_TIMES, ModelWatch
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.plant import Plant, make_plant
+from tests.support.jolts import Jolts
 from tests.support.paths import CONFIGS
 
 RATE = 400.0

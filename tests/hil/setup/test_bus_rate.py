@@ -9,31 +9,11 @@ from typing import cast
 import pytest
 
 import hil
+from benchmarks.bus.held_rate import six_servos
 from hil.drivers.bus import ServoBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.setup import bus_rate
 from hil.setup.bus_rate import ExchangeMode, check_rate
-from tests.support.paths import CONFIGS
-
-SERVOS = ((1, 1), (2, 2), (3, 2), (4, 3), (5, 3), (6, 4))  # ID, joint
-
-
-def six_servos(folder: Path, baud: str) -> Path:
-    """An arm of four joints, two of them with a second servo, at 400 Hz."""
-    text = (CONFIGS / "open_manipulator_x.toml").read_text(encoding="utf-8")
-    text = text.replace('urdf = "', f'urdf = "{CONFIGS}/').replace("baud = 1_000_000", f"baud = {baud}")
-    text = re.sub(r"^rate = .*$", "rate = 400.0", text, flags=re.MULTILINE)
-    real, fake = text.split("[fake]")
-    ids = iter(("1", "[2, 3]", "[4, 5]", "6"))
-    real = re.sub(r"^id = .*$", lambda _: f"id = {next(ids)}", real, flags=re.MULTILINE)
-    before, after = fake.split("[[fake.servos]]")[0], fake[fake.index("[fake.chain]") :]
-    servos = "".join(
-        f'[[fake.servos]]\nid = {number}\njoint = {joint}\nmodel = "XM430-W350"\nbaud = {baud}\nzero_ticks = 2048\n'
-        for number, joint in SERVOS
-    )
-    path = folder / "arm.toml"
-    path.write_text(f"{real}[fake]{before}{servos}{after}", encoding="utf-8")
-    return path
 
 
 def rate_of(path: Path) -> tuple[int, bool]:

@@ -1,0 +1,151 @@
+"""Do six servos on four joints, two of them with a second servo, hold 400 Hz at 1 Mbaud?
+
+    python benchmarks/bus/held_rate.py [--seconds 20] [--rounds 3] [--fast | --plain] [--json]
+
+The arm is held at rest with torque on, with the work of an experiment's stream: deadlines, read-backs, exchanges with
+slow and status reads, checks, recording. `hil fake --pty` serves the servos in another process and takes as long for
+each byte as the wire. Both processes ask for real-time scheduling, each on a core of its own. But the kernel passes on
+the bytes of a pty in a thread of ordinary priority, and virtual machines stall: run it on a quiet machine only. The load
+is printed; `benchmarks/fixed_rate.py` shows how many deadlines are missed without a bus.
+
+missed: deadlines that were missed. lost: samples in which a reply is missing. late: 99 % and the largest of the times
+from a deadline to the write [ms]. took: median, 99 % and the largest round trip [ms].
+"""
+
+import argparse
+import json
+import os
+import re
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+import numpy as np
+
+from benchmarks.bus.stream_cycle import fake_pty
+from benchmarks.machine import machine
+from hil.config.schema import Config, load_config
+from hil.drivers.bus import ServoBus
+from hil.errors import SafetyStop
+from hil.experiment.chain_watch import ChainWatch
+from hil.experiment.guard import Guard
+from hil.experiment.pace import Pace
+from hil.runs.recording import Phase, Recorder, missed
+from hil.setup.realtime import real_time
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+SERVOS = ((1, 1), (2, 2), (3, 2), (4, 3), (5, 3), (6, 4))  # ID, joint
+RATE = 400.0
+SMALL_A = 0.02
+"""Planned peak current for the checks; the arm is at rest all the time."""
+
+
+def six_servos(folder: Path, baud: str = "1_000_000") -> Path:
+    """Write the configuration of an arm of four joints, two of them with a second servo, at 400 Hz."""
+    text = (CONFIGS / "open_manipulator_x.toml").read_text(encoding="utf-8")
+    text = text.replace('urdf = "', f'urdf = "{CONFIGS}/').replace("baud = 1_000_000", f"baud = {baud}")
+    text = re.sub(r"^rate = .*$", f"rate = {RATE}", text, flags=re.MULTILINE)
+    real, fake = text.split("[fake]")
+    ids = iter(("1", "[2, 3]", "[4, 5]", "6"))
+    real = re.sub(r"^id = .*$", lambda _: f"id = {next(ids)}", real, flags=re.MULTILINE)
+    before, after = fake.split("[[fake.servos]]")[0], fake[fake.index("[fake.chain]") :]
+    servos = "".join(
+        f'[[fake.servos]]\nid = {number}\njoint = {joint}\nmodel = "XM430-W350"\nbaud = {baud}\nzero_ticks = 2048\n'
+        for number, joint in SERVOS
+    )
+    path = folder / "arm.toml"
+    path.write_text(f"{real}[fake]{before}{servos}{after}", encoding="utf-8")
+    return path
+
+
+def held(device: str, config: Config, seconds: float, folder: Path) -> dict[str, Any]:
+    """Hold the arm at rest once; return what was missed, lost and late."""
+    config = config.model_copy(update={"port": config.port.model_copy(update={"url": device})})
+    samples, count = round(seconds * RATE), len(config.joints)
+    with ServoBus.open(config.bus) as bus, Recorder(folder / "samples.npy", count, samples) as recorder:
+        exchange = bus.prepared
+        guard = Guard(config, [SMALL_A] * count, patience=exchange.patience, heard_instead=lambda: bus.heard_instead)
+        model = ChainWatch(config, [SMALL_A] * count)
+        stopped = ""
+        with real_time(), bus.torque(config.safety.watchdog):
+            try:
+                play(bus, guard, model, recorder, samples)
+            except SafetyStop as error:
+                stopped = str(error)
+        rows = recorder.samples.copy()
+    is_missed = rows["time_before_write"] == rows["time_after_read"]
+    sent = rows[~is_missed]
+    late = 1e3 * (sent["time_before_write"] - sent["deadline"])
+    took = 1e3 * (sent["time_after_read"] - sent["time_before_write"])
+    return {
+        "fast": exchange.fast,
+        "wire_ms": round(1e3 * exchange.longest, 3),
+        "samples": len(rows),
+        "missed": int(is_missed.sum()),
+        "lost": int(sent["missing"].any(axis=1).sum()),
+        "late_ms": [round(float(each), 3) for each in (np.quantile(late, 0.99), late.max())],
+        "took_ms": [round(float(each), 3) for each in (*np.quantile(took, (0.5, 0.99)), took.max())],
+        "load": round(os.getloadavg()[0], 1),
+        "stopped": stopped,
+    }
+
+
+def play(bus: ServoBus, guard: Guard, model: ChainWatch, recorder: Recorder, samples: int) -> None:
+    """The work of `hil.experiment.stream` for samples at rest."""
+    pace, goal, sent_at = Pace(bus, RATE, guard), [0.0] * len(bus.joints), None
+    for _ in range(samples):
+        deadline, now, late = pace.wait()
+        state = missed(goal, now) if late else pace.send(guard.clamp(goal))
+        recorder.keep(deadline, Phase.REST, 0, -1, state)
+        if late:
+            guard.late(now - (deadline if pace.sent_at is None else pace.sent_at))
+            continue
+        guard.look(state, 0.0 if sent_at is None else state.time_before_write - sent_at)
+        sent_at = state.time_before_write
+        if state.status is not None and guard.wants_status:
+            bus.read_status_next()
+        model.look(state)
+
+
+def configured(path: Path, *, fast: bool) -> Config:
+    config = load_config(path)
+    return config.model_copy(update={"port": config.port.model_copy(update={"fast_sync_read": fast})})
+
+
+def measure(seconds: float, rounds: int, reads: tuple[bool, ...]) -> list[dict[str, Any]]:
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        path = six_servos(folder)
+        device = stack.enter_context(fake_pty(path, real_time=True))
+        return [held(device, configured(path, fast=fast), seconds, folder) for _ in range(rounds) for fast in reads]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="one JSON object and nothing else")
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--rounds", type=int, default=3)
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument("--fast", dest="reads", action="store_const", const=(True,), default=(True, False))
+    kind.add_argument("--plain", dest="reads", action="store_const", const=(False,))
+    options = parser.parse_args()
+    figures = measure(options.seconds, options.rounds, options.reads)
+    if options.json:
+        print(json.dumps({"machine": machine(), "rounds": figures}))
+        return
+    print(f"Six servos at {RATE:g} Hz and 1 Mbaud, fake bus on a pty. {machine()}.")
+    for each in figures:
+        read = "Fast Sync Read" if each["fast"] else "Sync Read"
+        print(
+            f"{read:15s} longest exchange on the wire {each['wire_ms']:.2f} ms: missed {each['missed']} of "
+            f"{each['samples']}, lost {each['lost']}, late {each['late_ms']}, took {each['took_ms']}, "
+            f"load {each['load']}{each['stopped'] and '; stopped: '}{each['stopped']}"
+        )
+
+
+if __name__ == "__main__":
+    main()
