@@ -42,6 +42,7 @@ import numpy as np
 
 from benchmarks.machine import machine
 from benchmarks.spatial.mujoco_chain import fit_chain_with_mujoco
+from benchmarks.spatial.remembered import remembered
 from hil.description.urdf import read_urdf
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
 from hil.estimator.chain.excitation.fourier_path import design_path
@@ -160,11 +161,13 @@ def set_up(bench: Bench, seed: int) -> Setup:
     return Setup(arm, base, Prior.of(base, description.parameters), described)
 
 
+@remembered
 def path_of(bench: Bench, setup: Setup, seed: int) -> Motion:
     centre, swing, speed = (np.array(each, dtype=float) for each in (bench.centre, bench.swing, bench.speed))
     return design_path(setup.base, setup.prior, RATE, PERIOD, HIGHEST, centre, swing, speed, seed)
 
 
+@remembered
 def record(bench: Bench, setup: Setup, path: Motion, noise: float | np.ndarray = 0.0) -> SettledPeriod:
     """Simulate the true arm on `path` and return its second period.
 

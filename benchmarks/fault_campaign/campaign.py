@@ -26,12 +26,15 @@ from benchmarks.fault_campaign.middle import Middle, Traffic
 from benchmarks.fault_campaign.protocol_campaign import Bench
 from benchmarks.fault_campaign.touch import Killed
 from benchmarks.fault_campaign.witness import Witness
+from benchmarks.spatial.remembered import remembered
 from hil.cli.app import main
 from hil.config.schema import Config, parse_config
 from hil.dry_run.ensemble import prior_ensemble
 from hil.dry_run.stopping_distance import stopping_distance
 from hil.errors import HilError
+from hil.estimator.chain.excitation.fourier_path import design_path
 from hil.estimator.excitation.multisine import Multisine, design_multisine
+from hil.plan import chain_plan
 from hil.plan import plan as plan_module
 from hil.plan.plan import make_plan
 from hil.plan.stabiliser import must_balance
@@ -255,17 +258,21 @@ def _designed(rate: float, period: float, lines: Any, peaks: Any, seed: int) -> 
     return design_multisine(rate, period, lines, peaks, seed)
 
 
+_designed_path = remembered(design_path)
+
+
 @contextlib.contextmanager
 def _quick() -> Iterator[None]:
-    """Run with cached waves, whose design takes as long as the run, and with a short measurement of the bus."""
+    """Run with cached waves and paths, whose design takes as long as the run, and measure the bus only briefly."""
 
-    def remembered(
+    def recalled(
         rate: float, period: float, lines: Sequence[Sequence[int]], peak_torque: Sequence[float], seed: int
     ) -> Multisine:
         return _designed(rate, period, tuple(map(tuple, lines)), tuple(peak_torque), seed)
 
     with (
-        mock.patch.object(plan_module, "design_multisine", remembered),
+        mock.patch.object(plan_module, "design_multisine", recalled),
+        mock.patch.object(chain_plan, "design_path", _designed_path),
         mock.patch.object(bus_rate, "CYCLES", _CHECKED_CYCLES),
     ):
         yield

@@ -203,7 +203,7 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
         bound,
         lower_ms,
         cut_ms,
-        _clearance(config, record, drawn) - min(0.0, _clearance(config, ready.undisturbed.record)) + SAME_M,
+        _clearance(config, record, drawn) - min(0.0, _undisturbed_clearance(ready.setting)) + SAME_M,
         float(np.maximum(low - moved.min(axis=0), moved.max(axis=0) - high).max()),
         overruled_ms(config, story, told),
         stopped,
@@ -261,6 +261,12 @@ def _clearance(config: Config, record: NDArray[Any], drawn: Drawn | None = None)
     if not position.shape[1]:
         return 1.0
     return float(min(space.nearest(position, on_the_way=True).distance, 1.0))
+
+
+@cache
+def _undisturbed_clearance(setting: Setting) -> float:
+    ready = prepare(setting, PERIOD_S, make_document)
+    return _clearance(ready.config, ready.undisturbed.record)
 
 
 def _without_held(

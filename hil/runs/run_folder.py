@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from datetime import datetime
+from functools import cache
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
@@ -279,7 +280,7 @@ class RunFolder:
         record = RunRecord(
             **{each.name: getattr(facts, each.name) for each in fields(RunFacts)},
             started=datetime.now().astimezone().isoformat(timespec="seconds"),
-            versions={"hil": __version__, **{name: version(name) for name in _PACKAGES}},
+            versions={"hil": __version__, **_versions()},
             python=platform.python_version(),
             machine=platform.platform(),
             excitation=[
@@ -364,6 +365,12 @@ def _has_samples(path: Path) -> bool:
     except (OSError, ValueError, IndexError, EOFError):
         return True
     return bool((phases != Phase.NOT_RECORDED).any())
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Return the versions of the packages that a result depends on; reading them takes as long as 100 exchanges."""
+    return {name: version(name) for name in _PACKAGES}
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
