@@ -5,8 +5,8 @@
 The arm is held at rest with torque on, with the work of an experiment's stream: deadlines, read-backs, exchanges with
 slow and status reads, checks, recording. `hil fake --pty` serves the servos in another process and takes as long for
 each byte as the wire. Both processes ask for real-time scheduling, each on a core of its own. But the kernel passes on
-the bytes of a pty in a thread of ordinary priority, and virtual machines stall: run it on a quiet machine only. The load
-is printed; `benchmarks/fixed_rate.py` shows how many deadlines are missed without a bus.
+the bytes of a pty in a thread of ordinary priority, and virtual machines stall: run it on a quiet machine only. The
+load is printed; `benchmarks/fixed_rate.py` shows how many deadlines are missed without a bus.
 
 missed: deadlines that were missed. lost: samples in which a reply is missing. late: 99 % and the largest of the times
 from a deadline to the write [ms]. took: median, 99 % and the largest round trip [ms].
