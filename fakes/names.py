@@ -9,9 +9,8 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def configs_folder() -> Path:
-    """Return the folder of hil's own configurations: in the installed package, or next to it in a checkout."""
-    installed = _PACKAGE / "configs"
-    return installed if installed.is_dir() else _PACKAGE.parent / "configs"
+    """Return the folder of hil's own configurations; in a checkout, hil/configs is a link to configs/."""
+    return (_PACKAGE / "configs").resolve()
 
 
 def arm_names() -> tuple[str, ...]:
