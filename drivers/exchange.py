@@ -152,6 +152,8 @@ class Exchange:
         self._read_back: ReadBack | None = None
         self._longest_again = _AGAIN_SHARE * interval
         self._asked_again_at = -math.inf
+        self._damaged = False
+        """Whether anything arrived in reply to the latest read-back."""
         self.awaited_until = -math.inf
         """Until when the reply to the latest second read-back was awaited, even if it delayed the next cycle [s on the
         port's clock].
@@ -275,7 +277,13 @@ class Exchange:
             return None
         servos = self._ask_back(read, before, due - before)
         now = self._now()
-        if None in servos and takes < self._longest_again and now > self._asked_again_at + TRY_AGAIN_S:
+        # Where nothing at all arrived, the reply may be late, and another one would be mistaken for it.
+        if (
+            None in servos
+            and self._damaged
+            and takes < self._longest_again
+            and now > self._asked_again_at + TRY_AGAIN_S
+        ):
             # The packet of another master may have destroyed the reply, and the next cycle overwrites what it wrote.
             self._asked_again_at, self.awaited_until = now, now + takes + self._wire_s[read]
             servos = self._ask_back(read, now, self.awaited_until - now)
@@ -302,6 +310,7 @@ class Exchange:
             received = port.ask(read.request, read.reply_size, expected, start)
         if port.overheard:
             self._overhear()
+        self._damaged = bool(received)
         servos = read.unpack(received)
         if servos is None:
             # A master that writes between two cycles is heard here, and nowhere else if the next reply is complete.
