@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hil.clearance.space import Nearest, Space
 from hil.config.schema import Config
 from hil.dry_run.prediction import Prediction, limits_of, peaks_of
-from hil.dry_run.resting_stops import resting_stops
+from hil.dry_run.resting_stops import planned_paths, resting_stops
 from hil.estimator.chain.simulation.rollout import ChainArms, Loop, Motions, roll_out
 from hil.estimator.progress import Tell, counted
 from hil.plan.chain_model import torque_limits
@@ -72,7 +72,7 @@ def predict_chain(
     """
     space = Space.of(config)
     limits, rest = limits_of(config), np.array(config.arm.rest_pose)
-    stops = resting_stops(config, arms, passed)
+    stops = resting_stops(config, arms, planned_paths(plan), passed)
     values = np.zeros((arms.size, *limits.shape))
     rooms = np.full(arms.size, np.inf)
     worst: tuple[float, Nearest, str, float] | None = None

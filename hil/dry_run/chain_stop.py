@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hil.clearance.space import LYING_RAD, Nearest, Space
 from hil.config.schema import Config
-from hil.dry_run.resting_stops import resting_stops
+from hil.dry_run.resting_stops import planned_paths, resting_stops
 from hil.estimator.chain.simulation.rollout import COULOMB, SCALE, ChainArms, Loop, Pull, roll_out, weights
 from hil.estimator.progress import Tell, counted
 from hil.plan.chain_model import torque_limits
@@ -111,7 +111,7 @@ def foreseen_stops(
     told = counted(tell, 2 * len(starts) * few.size)
     return ChainStops(
         _hardest(config, plan.rate, few, starts, told),
-        _lowered(config, plan, few, starts, told, resting_stops(config, few, passed)),
+        _lowered(config, plan, few, starts, told, resting_stops(config, few, planned_paths(plan), passed)),
     )
 
 

@@ -5,6 +5,8 @@ In the rest pose an arm lies without torque. It is supported by a surface (floor
 joints' own stops. Moving the arm can lift it off a surface; a stop holds its joint whatever the angles of the others.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,8 @@ from hil.config.chain import described_arm
 from hil.config.schema import Config
 from hil.estimator.chain.simulation.rollout import PRESSED_SHARE, ChainArms, weights
 from hil.plan.chain_model import torque_limits
+from hil.plan.chain_plan import PathSegment
+from hil.plan.plan import Plan
 
 Array = NDArray[np.float64]
 
@@ -24,13 +28,16 @@ PASSED_RAD = 0.05
 """A joint that has been this far [rad] beyond its rest pose does not lie on a stop there: no stop yields that much."""
 
 
-def resting_stops(config: Config, arms: ChainArms, passed: NDArray[np.bool_] | None = None) -> Array:
+def resting_stops(
+    config: Config, arms: ChainArms, planned: Sequence[Array] = (), passed: NDArray[np.bool_] | None = None
+) -> Array:
     """Side on which each joint lies on its stop (joints,): -1 at its smallest angle, 1 at its largest, 0 if on neither.
 
     A joint is assumed to lie on its stop if its rest pose is near the end of its range, nothing else touches the part
     of the arm that it moves, and gravity does not pull it away from there. If the description lacks a support, the
-    joint is taken to lie on its stop until a recording shows it beyond its rest pose. passed: whether each joint has
-    been below and above its rest pose, as returned by `passed_rest` (2, joints). Raises ArmFileError.
+    joint is taken to lie on its stop until a recording shows it beyond its rest pose, or a planned path takes it there,
+    within its configured limits. planned: positions of these paths, each (joints, samples) [rad]. passed: whether each
+    joint has been below and above its rest pose, as returned by `passed_rest` (2, joints). Raises ArmFileError.
     """
     rest = np.array(config.arm.rest_pose)
     low, high = _ends(config, rest)
@@ -39,8 +46,9 @@ def resting_stops(config: Config, arms: ChainArms, passed: NDArray[np.bool_] | N
     side[Space.of(config).is_touched] = 0.0
     pulled = side * weights(arms, rest).mean(axis=0)
     side[pulled > PRESSED_SHARE * torque_limits(config)] = 0.0
-    if passed is not None:
-        side[np.where(side < 0.0, passed[0], passed[1])] = 0.0
+    for beyond in (passed, *(passed_rest(config, path.T) for path in planned)):
+        if beyond is not None:
+            side[np.where(side < 0.0, beyond[0], beyond[1])] = 0.0
     return side
 
 
@@ -50,6 +58,11 @@ def passed_rest(config: Config, position: Array) -> NDArray[np.bool_]:
     away = np.where(np.isfinite(away), away, 0.0)
     found: NDArray[np.bool_] = np.stack((away.min(axis=0) < -PASSED_RAD, away.max(axis=0) > PASSED_RAD))
     return found
+
+
+def planned_paths(plan: Plan) -> list[Array]:
+    """Positions of all paths of a plan, with their transitions, each (joints, samples) [rad]."""
+    return [path.position for each in plan.segments if isinstance(each, PathSegment) for path in each.paths]
 
 
 def said_of_stops(config: Config, side: Array) -> str:

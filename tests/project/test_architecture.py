@@ -65,7 +65,7 @@ LEAVES = {"hil.unit_hints", "hil.toml_errors", "hil.toml_file", "hil.description
 
 def _is_code(name: str) -> bool:
     path = ROOT / "hil" / name.removeprefix("hil.")
-    return path.is_dir() or path.with_suffix(".py").is_file()
+    return any(path.glob("*.py")) or path.with_suffix(".py").is_file()
 
 
 def test_leaves_import_nothing_of_hil() -> None:
@@ -91,11 +91,10 @@ def blocks(title: str) -> list[tuple[str, str]]:
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
     """A copy of the code that may be modified, with the compiled loops, so that only what changes is recompiled."""
-    unwanted = shutil.ignore_patterns("*.pyc", *FOLDERS)
+    unwanted = shutil.ignore_patterns("*.pyc", "configs", *FOLDERS)
     shutil.copytree(ROOT / "hil", tmp_path / "hil", ignore=unwanted)
     for folder in FOLDERS:
         shutil.copytree(ROOT / folder, tmp_path / "hil" / folder, ignore=shutil.ignore_patterns("*.pyc"))
-    (tmp_path / "hil" / "configs").unlink(missing_ok=True)
     return tmp_path
 
 

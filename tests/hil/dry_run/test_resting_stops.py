@@ -47,7 +47,16 @@ def test_a_joint_that_was_beyond_its_rest_pose_was_carried_by_something_else() -
         motion = np.tile(rest, (3, 1))
         motion[1, 2] += sagged
         motion[2] = np.nan
-        assert resting_stops(config, arms, passed_rest(config, motion))[2] == side
+        assert resting_stops(config, arms, passed=passed_rest(config, motion))[2] == side
+
+
+def test_a_joint_that_the_plan_takes_beyond_its_rest_pose_has_no_stop_there() -> None:
+    config = load_config(CONFIGS / "wx250s.toml")
+    arms, rest = prior_arms(config, known_chain(config), 6), np.array(config.arm.rest_pose)
+    for planned, side in ((0.1, 0.0), (0.02, 1.0), (-0.5, 1.0)):
+        path = np.tile(rest[:, None], 3)
+        path[2, 1] += planned
+        assert resting_stops(config, arms, [path])[2] == side
 
 
 def test_what_is_assumed_is_said_with_how_far_a_joint_may_sag_if_it_is_wrong() -> None:
