@@ -6,8 +6,8 @@ chooses the behaviour that demands more of a client:
 - A write that covers several registers is applied to each writable one, and the status carries the error of the first
   that refused. ROBOTIS' own example indirect_address writes Goal Position and an LED of 255 together and waits until
   the servo moves.
-- A write must begin and end on register boundaries. Inside a register it is a Data Length error, at an undefined
-  address an Access error. A read may begin inside a register; undefined bytes between two registers read as 0. A read
+- A write must begin and end on register boundaries. Inside a writable register it is a Data Length error, elsewhere
+  an Access error. A read may begin inside a register; undefined bytes between two registers read as 0. A read
   that begins or ends at an undefined address is an Access error.
 - A goal beyond its limit register is refused with Data Limit (some firmware may clamp instead).
 - When the Bus Watchdog trips, Goal Current, Goal PWM and Goal Velocity become 0, Goal Position becomes Present

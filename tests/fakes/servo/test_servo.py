@@ -52,6 +52,8 @@ def test_write_of_several_registers_asks_each_of_them(bench: Any) -> None:
         (116, 4096, 4, StatusError.DATA_LIMIT),  # the factory's mode is position control
         (0, 1, 2, StatusError.ACCESS),
         (132, 1, 4, StatusError.ACCESS),
+        (132, 1, 1, StatusError.ACCESS),  # a quarter of Present Position
+        (134, 1, 2, StatusError.ACCESS),
         (66, 1, 1, StatusError.ACCESS),  # no register there
         (700, 1, 1, StatusError.ACCESS),
     ],
