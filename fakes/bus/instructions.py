@@ -8,8 +8,8 @@ Where the manual is silent, the fake behaves as follows:
 - Servos reply to a broadcast Ping one directly after the other, in ascending order of ID.
 - If two servos have the same ID and reply at once, the host receives nothing; both execute the instruction.
 - The status of a write to ID or Baud Rate, and of a Factory Reset, is still sent with the old ID at the old baud rate.
-- The status of a Reboot no longer carries the Alert bit, which the reboot clears: ROBOTIS' easy SDK and hardware
-  interface reboot servos because of alerts, yet treat any error in this status as a failed reboot.
+- The status of a Reboot never carries the Alert bit: ROBOTIS' easy SDK and hardware interface reboot servos because of
+  alerts, yet treat any error in this status as a failed reboot.
 - A servo executes what is addressed to its Secondary ID but does not reply to it; its EEPROM is not written.
 - In a fast read, a servo that refuses sends its error and zeros.
 """
@@ -154,7 +154,9 @@ class Instructions:
                 delay_s, sender = servo.return_delay_s, servo.id
                 error, data = act(servo)
                 if wanted:
-                    answers.append((sender, error | servo.alert, data, delay_s))
+                    # A reboot clears its Alert bit, and what is still wrong is found when it has booted.
+                    error |= servo.alert if now >= servo.ready_at else 0
+                    answers.append((sender, error, data, delay_s))
         if len(answers) == 1:
             sender, error, data, delay_s = answers[0]
             self._line.send([(sender, delay_s, encode_status(sender, error, data))], now)

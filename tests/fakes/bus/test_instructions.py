@@ -219,6 +219,13 @@ def test_indirect_writes_obey_the_registers_they_reach(bench: Any) -> None:
     assert bench.read(1, 168, 2) == 224
 
 
+def test_indirect_addresses_are_in_the_ram_and_so_not_locked(bench: Any) -> None:
+    bench.write(1, 64, 1)
+    assert bench.write(1, 168, 65, 2) == 0
+    bench.write(1, 224, 1)
+    assert bench.servo().value("LED") == 1
+
+
 # Models that are only half known
 
 

@@ -310,6 +310,14 @@ def test_unmasked_error_raises_the_alert_and_leaves_torque(bench: Any) -> None:
     assert bench.ask(1, Instruction.PING).error == ALERT  # stays until Reboot
 
 
+def test_reboot_of_a_servo_that_is_still_hot_brings_its_alert_back(bench: Any) -> None:
+    bench.servo().temperature_c = 81
+    assert bench.ask(1, Instruction.PING).error == ALERT
+    assert bench.ask(1, Instruction.REBOOT).error == 0
+    bench.wait(BOOT_S)
+    assert bench.ask(1, Instruction.PING).error == ALERT
+
+
 def test_overheating_shuts_down(bench: Any) -> None:
     bench.arm(goal_ticks=100)
     bench.servo().temperature_c = 81.0
