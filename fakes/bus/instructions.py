@@ -1,19 +1,7 @@
 """Which servos act on an instruction packet, which reply, and in which order.
 
-Where the manual is silent, the fake behaves as follows:
-
-- A Sync Read samples the registers of all servos when the last byte of its instruction arrives.
-- In a group read each servo waits for the one listed before it. After one that does not reply, all others stay silent,
-  and the reply to a fast read ends in the middle (source: ROBOTIS in DynamixelSDK issue 364).
-- Servos reply to a broadcast Ping one directly after the other, in ascending order of ID.
-- Servos with the same ID all execute the instruction and reply, each after its own Return Delay. Where replies overlap,
-  a low bit wins: equal ones merge, different ones are garbled. In a group read, unless they merge, all others then stay
-  silent.
-- The status of a write to ID or Baud Rate, and of a Factory Reset, is still sent with the old ID at the old baud rate.
-- The status of a Reboot never carries the Alert bit: ROBOTIS' easy SDK and hardware interface reboot servos because of
-  alerts, yet treat any error in this status as a failed reboot.
-- A servo executes what is addressed to its Secondary ID but does not reply to it; its EEPROM is not written.
-- In a fast read, a servo that refuses sends its error and zeros.
+docs/fake-bus.md, "Conformance", states what is chosen where the manual is silent. In a group read each servo waits for
+the whole status of the one listed before it (source: ROBOTIS in DynamixelSDK issue 364).
 """
 
 from collections.abc import Callable, Iterator, Sequence
