@@ -136,8 +136,6 @@ class FakeArm(Described):
     @model_validator(mode="after")
     def _a_servo_for_each_joint(self) -> Self:
         ids = [servo.id for servo in self.servos]
-        if len(set(ids)) < len(ids):
-            raise ValueError(f"servos: IDs {', '.join(map(str, ids))}: each servo on a bus needs its own ID")
         if sum(each is not None for each in (self.arm, self.chain, self.plant)) != 1:
             raise ValueError('give exactly one of the table arm, the table chain and plant = "module:factory"')
         count = max(self.joints) + 1

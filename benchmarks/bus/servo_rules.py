@@ -213,10 +213,10 @@ class Rules:
         """Every reason to refuse a write of one register; the manual does not say which of several is answered."""
         row = self.rows.get(address)
         if row is None:
-            inside = any(address in other.span for other in self.rows.values())
+            inside = any(address in other.span and other.low is not None for other in self.rows.values())
             return {ACCESS, DATA_LENGTH} if inside else {ACCESS}
         if row.low is None or row.high is None:
-            return {ACCESS} | ({DATA_LENGTH} if len(data) < row.size else set())
+            return {ACCESS}
         reasons = set()
         if len(data) < row.size:
             reasons.add(DATA_LENGTH)

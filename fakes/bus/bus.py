@@ -6,8 +6,8 @@ reach the host `adapter_latency_us` later. When the host writes, everything up t
 computed, even if it lies ahead of the clock. Between two packets only Bus Watchdogs, the servos' own loops and faults
 can act, and the plant's advance is split at the moments when they do.
 
-When host and servo, or two servos, transmit at once, the later packet and the rest of the earlier one are lost. Which
-servos act and reply is decided in `hil.fakes.bus.instructions`.
+When host and servo, or two servos with different IDs, transmit at once, the later packet and the rest of the earlier
+one are lost. Which servos act and reply is decided in `hil.fakes.bus.instructions`.
 """
 
 import math
@@ -102,7 +102,7 @@ class FakeBus:
 
     @property
     def servos(self) -> dict[int, EmulatedServo]:
-        """The servos by current ID, in their state at the clock's current time."""
+        """The servos by current ID (of several with one ID, the last), in their state at the clock's current time."""
         self.advance(self.clock.now())
         return {servo.id: servo for servo in self._servos}
 
@@ -387,5 +387,5 @@ class FakeBus:
         return self.faults.error(servo.id, now - self._origin)
 
     def count_collision(self) -> None:
-        """Count a collision of two servos with the same ID that have replied at once."""
+        """Count a collision of servos with the same ID."""
         self._wire.collisions += 1

@@ -147,7 +147,7 @@ class Hand:
         start = self._plant.position[joint]
         end = move.to
         if end is None:
-            (servo,) = (servo for servo in self._joints.of_joint(joint) if servo.id == move.servo)
+            servo = next(servo for servo in self._joints.of_joint(joint) if servo.id == move.servo)
             end = servo.present.angle(move.ticks or 0)
         self._grips[joint] = _Grip(joint, start, end, now, move.duration, now + move.duration + move.hold)
 

@@ -1,17 +1,7 @@
 """Which servos act on an instruction packet, which reply, and in which order.
 
-Where the manual is silent, the fake behaves as follows:
-
-- A Sync Read samples the registers of all servos when the last byte of its instruction arrives.
-- In a group read each servo waits for the one listed before it. After one that does not reply, all others stay silent,
-  and the reply to a fast read ends in the middle (source: ROBOTIS in DynamixelSDK issue 364).
-- Servos reply to a broadcast Ping one directly after the other, in ascending order of ID.
-- If two servos have the same ID and reply at once, the host receives nothing; both execute the instruction.
-- The status of a write to ID or Baud Rate, and of a Factory Reset, is still sent with the old ID at the old baud rate.
-- The status of a Reboot no longer carries the Alert bit, which the reboot clears: ROBOTIS' easy SDK and hardware
-  interface reboot servos because of alerts, yet treat any error in this status as a failed reboot.
-- A servo executes what is addressed to its Secondary ID but does not reply to it; its EEPROM is not written.
-- In a fast read, a servo that refuses sends its error and zeros.
+docs/fake-bus.md, "Conformance", states what is chosen where the manual is silent. In a group read each servo waits for
+the whole status of the one listed before it (source: ROBOTIS in DynamixelSDK issue 364).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -29,6 +19,8 @@ from hil.drivers.packet import (
     encode_status,
 )
 from hil.fakes.bus.sync_reads import GroupReads, Reply
+from hil.fakes.bus.uart import overlaid
+from hil.fakes.bus.wire import BITS_PER_BYTE
 from hil.fakes.servo.backup import RESET_ALL
 from hil.fakes.servo.servo import EmulatedServo
 
@@ -146,20 +138,30 @@ class Instructions:
     def _address(
         self, servo_id: int, act: Callable[[EmulatedServo], tuple[int, bytes]], now: float, least_level: int = 2
     ) -> None:
-        """Let the servo with this ID act, and reply if its Status Return Level is at least `least_level`."""
-        answers = []
+        """Let the servos with this ID act, and reply if their Status Return Level is at least `least_level`."""
+        answers: list[Reply] = []
         for servo in self._by_id.get(servo_id, ()):
             if servo.hears(now, self._line.baud):
                 wanted = servo.status_return_level >= least_level
                 delay_s, sender = servo.return_delay_s, servo.id
                 error, data = act(servo)
                 if wanted:
-                    answers.append((sender, error | servo.alert, data, delay_s))
-        if len(answers) == 1:
-            sender, error, data, delay_s = answers[0]
-            self._line.send([(sender, delay_s, encode_status(sender, error, data))], now)
-        elif answers:
+                    # A reboot clears its Alert bit, and what is still wrong is found when it has booted.
+                    error |= servo.alert if now >= servo.ready_at else 0
+                    answers.append((sender, delay_s, encode_status(sender, error, data)))
+        self._line.send(self._overlaid(answers), now)
+
+    def _overlaid(self, answers: list[Reply]) -> list[Reply]:
+        """Return what the line carries, piece by piece, when servos with the same ID answer."""
+        if len(answers) < 2:
+            return answers
+        baud, end, pieces = self._line.baud, 0, []
+        for start, data in overlaid((round(delay_s * baud), data) for _, delay_s, data in answers):
+            pieces.append((answers[0][0], (start - end) / baud, data))
+            end = start + BITS_PER_BYTE * len(data)
+        if len(pieces) < len(answers):
             self._line.count_collision()
+        return pieces
 
     def _execute(
         self, servo: EmulatedServo, instruction: int, body: bytes, now: float, *, shadow: bool = False
@@ -187,10 +189,15 @@ class Instructions:
     # All servos, or several
 
     def _broadcast_ping(self, _body: bytes, now: float) -> None:
-        replies = []
-        for servo in sorted(self._listening(now), key=lambda servo: servo.id):
-            error, data = servo.execute(Instruction.PING, b"", now, False)
-            replies.append((servo.id, servo.return_delay_s, encode_status(servo.id, error | servo.alert, data)))
+        replies: list[Reply] = []
+        for _, servos in sorted(self._by_id.items()):
+            answers = []
+            for servo in servos:
+                if servo.heard_at == now:
+                    error, data = servo.execute(Instruction.PING, b"", now, False)
+                    status = encode_status(servo.id, error | servo.alert, data)
+                    answers.append((servo.id, servo.return_delay_s, status))
+            replies += self._overlaid(answers)
         self._line.send(replies, now)
 
     def _sync_write(self, body: bytes, now: float) -> None:
@@ -245,15 +252,17 @@ class Instructions:
         self._fast_read(list(_bulk_parts(body)), now)
 
     def _group_read(self, parts: Sequence[Part], now: float) -> None:
-        replies = []
+        replies: list[Reply] = []
         for servo_id, address, length in parts:
-            servo = self._answering(servo_id, now)
-            if servo is None:
+            answers = []
+            for servo in self._answering(servo_id, now):
+                error, data = self._read(servo, address, length, now)
+                answers.append((servo_id, servo.return_delay_s, encode_status(servo_id, error | servo.alert, data)))
+            pieces = self._overlaid(answers)
+            replies += pieces
+            if len(pieces) != 1 or pieces[0][2] != answers[0][2]:
                 break
-            error, data = self._read(servo, address, length, now)
-            replies.append((servo_id, servo.return_delay_s, encode_status(servo_id, error | servo.alert, data)))
-        if replies:
-            self._line.send(replies, now)
+        self._line.send(replies, now)
 
     def _fast_read(self, parts: Sequence[Part], now: float) -> None:
         """Send one packet from all servos, to which each appends its part and a CRC over everything so far."""
@@ -261,25 +270,28 @@ class Instructions:
         if not parts or size > MAX_LENGTH:
             return
         whole = HEADER + bytes((BROADCAST_ID, size & 0xFF, size >> 8, Instruction.STATUS))
-        replies = []
+        replies: list[Reply] = []
         sent = 0
         for servo_id, address, length in parts:
-            servo = self._answering(servo_id, now)
-            if servo is None or not servo.has_fast_reads:
+            answers = []
+            for servo in self._answering(servo_id, now):
+                if servo.has_fast_reads:
+                    error, data = self._read(servo, address, length, now)
+                    part = whole + bytes((error | servo.alert, servo_id)) + data.ljust(length, b"\0")
+                    part += crc(part).to_bytes(2, "little")
+                    answers.append((servo_id, servo.return_delay_s, part[sent:]))
+            pieces = self._overlaid(answers)
+            replies += pieces
+            if len(pieces) != 1 or pieces[0][2] != answers[0][2]:
                 break
-            error, data = self._read(servo, address, length, now)
-            whole = b"".join((whole, bytes((error | servo.alert, servo_id)), data.ljust(length, b"\0")))
-            whole += crc(whole).to_bytes(2, "little")
-            replies.append((servo_id, servo.return_delay_s, whole[sent:]))
+            whole = part
             sent = len(whole)
         self._line.send(replies, now)
 
-    def _answering(self, servo_id: int, now: float) -> EmulatedServo | None:
-        """Return the servo that answers a group read at this ID; None if there is none or more than one."""
+    def _answering(self, servo_id: int, now: float) -> list[EmulatedServo]:
+        """Return the servos that answer a group read at this ID."""
         servos = self._by_id.get(servo_id, ())
-        if len(servos) != 1 or servos[0].heard_at != now or servos[0].status_return_level == 0:
-            return None
-        return servos[0]
+        return [servo for servo in servos if servo.heard_at == now and servo.status_return_level]
 
     def _listening(self, now: float) -> list[EmulatedServo]:
         return [servo for servo in self._servos if servo.hears(now, self._line.baud)]

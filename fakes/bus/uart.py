@@ -1,4 +1,6 @@
-"""The bytes that a serial receiver reads when data are sent at a different baud rate."""
+"""The bytes that a serial receiver reads from data sent at a different baud rate, or by several senders at once."""
+
+from collections.abc import Iterable
 
 _IDLE = 1
 _STOP = 9  # index of the stop bit among the ten bits of a byte: start, eight data bits, stop
@@ -11,9 +13,33 @@ def heard(data: bytes, sent_baud: int, heard_baud: int) -> list[tuple[int, float
     waits for a falling edge, samples the middle of each bit, and passes on bytes with a wrong stop bit, as USB adapters
     do.
     """
-    line = [bit for byte in data for bit in (0, *(byte >> index & 1 for index in range(8)), 1)]
-    ratio = sent_baud / heard_baud
-    """Number of bits sent per bit of the receiver."""
+    return [(byte, bits / sent_baud) for byte, bits in _received(_line(data), sent_baud / heard_baud)]
+
+
+def overlaid(sent: Iterable[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    """Return what is read from a line on which several send at the same baud rate, each from a time on [bits].
+
+    Data that overlap in time become one piece, in which a low bit wins.
+    """
+    pieces: list[tuple[int, list[int]]] = []
+    for start, data in sorted(sent):
+        bits = _line(data)
+        if pieces and start < pieces[-1][0] + len(pieces[-1][1]):
+            first, line = pieces[-1]
+            line += [_IDLE] * (start - first + len(bits) - len(line))
+            for at, bit in enumerate(bits, start - first):
+                line[at] &= bit
+        else:
+            pieces.append((start, bits))
+    return [(start, bytes(byte for byte, _ in _received(line, 1.0))) for start, line in pieces]
+
+
+def _line(data: bytes) -> list[int]:
+    return [bit for byte in data for bit in (0, *(byte >> index & 1 for index in range(8)), 1)]
+
+
+def _received(line: list[int], ratio: float) -> list[tuple[int, float]]:
+    """Return the bytes read from a line, and when each is complete [bits]. ratio: bits per bit of the receiver."""
     received: list[tuple[int, float]] = []
     at = 0.0
     while (start := _falling_edge(line, at)) is not None:
@@ -22,7 +48,7 @@ def heard(data: bytes, sent_baud: int, heard_baud: int) -> list[tuple[int, float
             continue
         bits = [_level(line, start + (1.5 + index) * ratio) for index in range(8)]
         at = start + (_STOP + 0.5) * ratio
-        received.append((sum(bit << index for index, bit in enumerate(bits)), (start + 10 * ratio) / sent_baud))
+        received.append((sum(bit << index for index, bit in enumerate(bits)), start + 10 * ratio))
     return received
 
 

@@ -12,8 +12,7 @@ class Memory:
     def __init__(self, model: EmulatedModel) -> None:
         self.registers = model.registers
         self.data = bytearray(max(r.address + r.size for r in model.registers.values()))
-        self._starting_at = {register.address: register for register in model.registers.values()}
-        self._defined = {a for r in model.registers.values() for a in range(r.address, r.address + r.size)}
+        self._defined = {a: r for r in model.registers.values() for a in range(r.address, r.address + r.size)}
         self._readable: set[tuple[int, int]] = set()
         self._blocks = model.indirect
         self._points: dict[int, int] = {}
@@ -104,11 +103,11 @@ class Memory:
         writes: list[tuple[Register, int]] = []
         at, end = address, address + len(data)
         while at < end:
-            register = self._starting_at.get(at)
+            register = self._defined.get(at)
             if register is None:
-                return writes, StatusError.DATA_LENGTH if at in self._defined else StatusError.ACCESS
-            if at + register.size > end:
-                return writes, StatusError.DATA_LENGTH
+                return writes, StatusError.ACCESS
+            if at != register.address or at + register.size > end:
+                return writes, StatusError.DATA_LENGTH if register.writable else StatusError.ACCESS
             raw = data[at - address : at - address + register.size]
             writes.append((register, int.from_bytes(raw, "little", signed=register.signed)))
             at += register.size

@@ -1,25 +1,15 @@
 """One fake servo: a control table as a state machine, independent of bus and plant (see `hil.fakes.bus.bus`).
 
-The behaviour follows the ROBOTIS e-Manual (protocol2 and x/<model> pages). Where the manual is silent, this module
-chooses the behaviour that demands more of a client:
+The behaviour follows the ROBOTIS e-Manual (protocol2 and x/<model> pages). Where the manual is silent, the fake chooses
+the behaviour that demands more of a client: see "Conformance" in docs/fake-bus.md, and:
 
-- A write that covers several registers is applied to each writable one, and the status carries the error of the first
-  that refused. ROBOTIS' own example indirect_address writes Goal Position and an LED of 255 together and waits until
-  the servo moves.
-- A write must begin and end on register boundaries. Inside a register it is a Data Length error, at an undefined
-  address an Access error. A read may begin inside a register; undefined bytes between two registers read as 0. A read
+- A write must begin and end on register boundaries. Inside a writable register it is a Data Length error, elsewhere
+  an Access error. A read may begin inside a register; undefined bytes between two registers read as 0. A read
   that begins or ends at an undefined address is an Access error.
-- A goal beyond its limit register is refused with Data Limit (some firmware may clamp instead).
 - When the Bus Watchdog trips, Goal Current, Goal PWM and Goal Velocity become 0, Goal Position becomes Present
   Position, and torque stays enabled. While tripped, only 0 may be written to it.
-- After a shutdown, writing 1 to Torque Enable is answered without an error number but leaves torque off.
 - At power-up, and after a change of Operating Mode, Goal Current and Goal PWM are at their limits: if a client enables
   torque in current mode without first writing a goal, full current flows. Goal Velocity is 0.
-- When torque is switched on, Goal Position becomes Present Position.
-- Reverse mode (Drive Mode bit 0) mirrors positions about half a turn; on the 540 series and the XW430 it also inverts
-  velocity, current and PWM.
-- Nothing in the EEPROM can be changed through the Secondary ID (e-Manual): writes, Factory Reset and Restore are
-  ignored.
 
 A model without a current sensor (XL430-W250) has no current mode and reports a Present Load of 0.
 """

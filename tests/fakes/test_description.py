@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+from hil.drivers.packet import Instruction, encode, encode_status
 from hil.fakes.bus.clock import VirtualClock
 from hil.fakes.description import DescriptionError, FakeArm, load_fake, make_bus
 from tests.support.paths import CONFIGS
@@ -52,6 +53,13 @@ def test_bus_as_described(tmp_path: Path) -> None:
     assert servo.hardware_error == 0
 
 
+def test_servos_may_have_the_same_id(tmp_path: Path) -> None:
+    bus = make_bus(load_fake(edited(tmp_path, FIRST, FIRST.replace("id = 1", "id = 2"))), VirtualClock())
+    bus.write(encode(2, Instruction.PING))
+    assert bus.read(100, 1.0) == encode_status(2, 0, b"\xfc\x03\x30")
+    assert bus.collisions == 1
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -71,7 +79,6 @@ def test_bus_as_described(tmp_path: Path) -> None:
         (FIRST, FIRST.replace("W350", "W351"), ["fake.servos[1].model = 'XM430-W351'", "did you mean XM430-W350?"]),
         (FIRST, FIRST.replace("XM430-W350", "motor"), ["fake.servos[1].model = 'motor'", "XM430-W350, XM430-W210"]),
         (FIRST, FIRST.replace("id = 1", "id = 253"), ["fake.servos[1].id = 253", "252"]),
-        (FIRST, FIRST.replace("id = 1", "id = 2"), ["IDs 2, 2", "needs its own ID"]),
         (FIRST, "", ["1 servos for 2 drives"]),
         (FIRST, FIRST + 'registers = { "Goal Current" = 1 }\n', ["Goal Current", "not an EEPROM register"]),
         (FIRST, FIRST + 'registers = { "Shutdown" = 256 }\n', ["Shutdown", "0 to 255 is allowed"]),

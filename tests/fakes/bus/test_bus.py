@@ -269,13 +269,69 @@ def test_new_id_is_the_one_that_counts(bench: Any) -> None:
     assert set(bench.bus.servos) == {9, 2}
 
 
-def test_two_servos_of_one_id_cannot_be_understood(bench: Any) -> None:
-    bench.write(2, 7, 1)
-    assert bench.exchange(PING) == []
-    assert bench.exchange(sync_read(126, 10, 1)) == []
-    assert bench.bus.collisions == 1
-    bench.exchange(encode(1, Instruction.WRITE, b"\x41\0\x01"))
-    assert [servo.value("LED") for servo in bench.bus._servos] == [1, 1]
+@pytest.fixture
+def twins(make_bench: Make) -> Any:
+    """A bench with the IDs 1, 1 and 2."""
+    return make_bench({}, {"servo_id": 1}, {"servo_id": 2})
+
+
+def heard(bench: Any, raw: bytes) -> bytes:
+    bench.bus.write(raw)
+    return bytes(bench.bus.read(1000, 0.01))
+
+
+def status(servo_id: int, position: int) -> bytes:
+    return encode_status(servo_id, 0, position.to_bytes(4, "little"))
+
+
+READ_POSITION = encode(1, Instruction.READ, b"\x84\0\4\0")
+
+
+def test_equal_replies_of_two_servos_with_one_id_merge(twins: Any) -> None:
+    pongs = [encode_status(servo_id, 0, b"\xfc\x03\x30") for servo_id in (1, 2)]
+    assert heard(twins, PING) == pongs[0]
+    assert heard(twins, encode(BROADCAST_ID, Instruction.PING)) == b"".join(pongs)
+    assert heard(twins, READ_POSITION) == status(1, 0)
+    assert heard(twins, sync_read(132, 4, 1, 2)) == status(1, 0) + status(2, 0)
+    fast = heard(twins, sync_read(132, 4, 2, 1, fast=True))
+    assert fast[8:14] + fast[16:22] == b"\0\2\0\0\0\0\0\1\0\0\0\0"
+    assert crc(fast[:-2]) == int.from_bytes(fast[-2:], "little")
+    assert twins.write(1, 65, 1) == 0
+    assert [servo.value("LED") for servo in twins.bus._servos] == [1, 1, 0]
+    assert twins.bus.collisions == 6
+
+
+def test_different_replies_of_two_servos_with_one_id_are_garbled(twins: Any) -> None:
+    twins.plant.position[:2] = [0.5, 1.0]
+    garbled = bytes(a & b for a, b in zip(status(1, 326), status(1, 652), strict=True))
+    assert list(Framer().feed(garbled)) == []
+    assert heard(twins, READ_POSITION) == garbled
+    # In a group read, the last one waits for a whole status.
+    assert heard(twins, sync_read(132, 4, 2, 1, 2)) == status(2, 0) + garbled
+    fast = heard(twins, sync_read(132, 4, 1, 2, fast=True))
+    assert (len(fast), fast[8:12]) == (8 + 8, b"\0\1\x04\0")
+    assert crc(fast[:-2]) != int.from_bytes(fast[-2:], "little")
+
+
+def test_replies_of_two_servos_with_one_id_that_do_not_overlap_both_arrive(make_bench: Make) -> None:
+    twins = make_bench({"return_delay_us": 200}, {"servo_id": 1}, {"servo_id": 2})
+    twins.plant.position[1] = 1.0
+    assert heard(twins, READ_POSITION) == status(1, 652) + status(1, 0)
+    assert twins.bus.collisions == 0
+    assert heard(twins, sync_read(132, 4, 1, 2)) == status(1, 652) + status(1, 0)
+    start = twins.clock.now()
+    twins.bus.write(READ_POSITION)
+    twins.bus.read(30, 1.0)
+    assert twins.clock.now() - start == pytest.approx((14 + 15) * BYTE_S + 200e-6)
+
+
+def test_replies_of_two_servos_with_one_id_that_overlap_in_part_are_garbled(make_bench: Make) -> None:
+    twins = make_bench({"return_delay_us": 100}, {"servo_id": 1})
+    twins.plant.position[1] = 1.0
+    early, late = status(1, 652), status(1, 0)
+    both = bytes(a & b for a, b in zip(early[10:], late, strict=False))
+    assert heard(twins, READ_POSITION) == early[:10] + both + late[5:]
+    assert twins.bus.collisions == 1
 
 
 def test_wrong_baud_is_silence(bench: Any) -> None:

@@ -208,7 +208,7 @@ def test_present_values_can_be_read_indirectly(bench: Any) -> None:
 
 def test_indirect_writes_obey_the_registers_they_reach(bench: Any) -> None:
     bench.write(1, 168, 132, 2)  # Present Position
-    assert bench.write(1, 224, 1) == StatusError.DATA_LENGTH  # a quarter of it
+    assert bench.write(1, 224, 1) == StatusError.ACCESS  # a quarter of it
     bench.write(1, 168, 65, 2)
     assert bench.write(1, 224, 7) == StatusError.DATA_RANGE
     assert bench.write(1, 168, 63, 2) == StatusError.DATA_RANGE  # EEPROM cannot be reached
@@ -217,6 +217,13 @@ def test_indirect_writes_obey_the_registers_they_reach(bench: Any) -> None:
     bench.ask(1, Instruction.REBOOT)
     bench.wait(BOOT_S)
     assert bench.read(1, 168, 2) == 224
+
+
+def test_indirect_addresses_are_in_the_ram_and_so_not_locked(bench: Any) -> None:
+    bench.write(1, 64, 1)
+    assert bench.write(1, 168, 65, 2) == 0
+    bench.write(1, 224, 1)
+    assert bench.servo().value("LED") == 1
 
 
 # Models that are only half known

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hil.drivers.packet import Framer, Instruction, encode
-from hil.fakes.bus.uart import heard
+from hil.fakes.bus.uart import heard, overlaid
 
 RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 
@@ -53,3 +53,8 @@ def test_the_baud_asked_for_is_set_behind_the_status_at_the_old_one(bench: Any) 
     assert bench.write(1, 8, 2) == 0
     bench.bus.baud = 115_200
     assert bench.ask(1, Instruction.PING).error == 0
+
+
+def test_what_overlaps_is_one_piece_and_a_low_bit_wins() -> None:
+    assert overlaid([(0, b"\x0f\xff"), (20, b"\x01"), (0, b"\x3c")]) == [(0, b"\x0c\xff"), (20, b"\x01")]
+    assert overlaid([(0, b"\xff"), (5, b"\xff")]) == [(0, b"\xef")]  # the second start bit falls into the data

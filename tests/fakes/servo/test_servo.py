@@ -52,6 +52,8 @@ def test_write_of_several_registers_asks_each_of_them(bench: Any) -> None:
         (116, 4096, 4, StatusError.DATA_LIMIT),  # the factory's mode is position control
         (0, 1, 2, StatusError.ACCESS),
         (132, 1, 4, StatusError.ACCESS),
+        (132, 1, 1, StatusError.ACCESS),  # a quarter of Present Position
+        (134, 1, 2, StatusError.ACCESS),
         (66, 1, 1, StatusError.ACCESS),  # no register there
         (700, 1, 1, StatusError.ACCESS),
     ],
@@ -306,6 +308,14 @@ def test_unmasked_error_raises_the_alert_and_leaves_torque(bench: Any) -> None:
     assert bench.ask(1, Instruction.PING).error == ALERT
     bench.servo().input_voltage_v = 12.0
     assert bench.ask(1, Instruction.PING).error == ALERT  # stays until Reboot
+
+
+def test_reboot_of_a_servo_that_is_still_hot_brings_its_alert_back(bench: Any) -> None:
+    bench.servo().temperature_c = 81
+    assert bench.ask(1, Instruction.PING).error == ALERT
+    assert bench.ask(1, Instruction.REBOOT).error == 0
+    bench.wait(BOOT_S)
+    assert bench.ask(1, Instruction.PING).error == ALERT
 
 
 def test_overheating_shuts_down(bench: Any) -> None:

@@ -1,7 +1,6 @@
 """scan, check and setup on the fake bus: findings, changes, and what must stay unchanged."""
 
 import json
-import operator
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,7 +18,7 @@ from hil.drivers.port import Port, open_port
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.faults import Fault
 from hil.fakes.description import load_fake
-from hil.fakes.protocol_fake import FakeSerial, open_fake
+from hil.fakes.protocol_fake import open_fake
 from hil.setup import preflight
 from hil.setup.preflight import Finding, Level, check_arm
 from hil.setup.scan import Asking, listen, scan
@@ -77,38 +76,13 @@ def test_scan_hears_that_answers_are_damaged(port: Callable[..., Port], monkeypa
     assert "same ID" in heard.trouble
 
 
-class Twins:
-    """Two buses on one wire, each with a servo of ID 1: bits that differ between their replies read 0."""
-
-    def __init__(self, first: FakeSerial, second: FakeSerial) -> None:
-        self._both = first, second
-        self.clock, self.timeout, self.in_waiting = first.clock, 0.0, 0
-
-    def write(self, data: bytes) -> None:
-        for each in self._both:
-            each.clock.wait_until(self.clock.now())
-            each.write(data)
-
-    def read(self, count: int) -> bytes:
-        for each in self._both:
-            each.timeout = self.timeout
-        received = [each.read(count) for each in self._both]
-        return bytes(map(operator.and_, *received))
-
-    def reset_input_buffer(self) -> None:
-        for each in self._both:
-            each.reset_input_buffer()
-
-
-@pytest.mark.parametrize("turned", [0.0, 0.5])
-def test_scan_sees_two_servos_with_one_id_although_their_pings_are_alike(turned: float) -> None:
+@pytest.mark.parametrize("turned", [0, 300])
+def test_scan_sees_two_servos_with_one_id_although_their_pings_are_alike(turned: int) -> None:
     """As with two new servos, both of ID 1; those that have just been switched on differ in their positions only."""
     description = load_fake(CONFIGS / "fake_pendulum.toml")
-    assert description.arm is not None
-    other = description.model_copy(
-        update={"arm": description.arm.model_copy(update={"start": [description.arm.start[0] + turned]})}
-    )
-    twins = Twins(open_fake(description), open_fake(other))
+    (servo,) = description.servos
+    other = servo.model_copy(update={"joint": 1, "zero_ticks": servo.zero_ticks + turned})
+    twins = open_fake(description.model_copy(update={"servos": (servo, other)}))
     (found,) = listen(Port("fake://", 1_000_000, twins), 0.01).servos
     assert ("second servo with ID 1" in found.trouble) == bool(turned)
 
