@@ -326,6 +326,21 @@ def contents(folder: Path) -> dict[str, str]:
     }
 
 
+LONG = "x" * 5000
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("check", "identify", "dry-run", "estimate", "report", "runs", "note", "export --format urdf", "fake", "scan"),
+        *("init", "pose", "compare", f"diff {LONG}", "fake koch --pty --link", "schema --out"),
+    ],
+)
+def test_a_name_too_long_for_a_file_is_said_briefly(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil(*line.split(), LONG) == 2
+    assert capsys.readouterr().err == f"hil: {LONG[:80]}...: File name too long.\n"
+
+
 @pytest.mark.parametrize(("line", "code", "said"), CASES, ids=[case[0] for case in CASES])
 def test_bad_input_is_named(line: str, code: int, said: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = contents(folder)
