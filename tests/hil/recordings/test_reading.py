@@ -142,7 +142,9 @@ def test_rows_that_can_be_put_right_are_and_it_is_said(
     [
         (lambda rows: rows[::-1], "time goes back"),
         (lambda rows: [row.replace(row.split(",")[0], row.split(",")[0][:3], 1) for row in rows], "too coarse"),
-        (lambda rows: ["x" + row for row in rows], "column 'time' is not a number.*ISO 8601"),
+        (lambda rows: ["x" + row for row in rows], r"line 2: column 'time' is 'x\S+'; it must be a finite number\.$"),
+        (lambda rows: [f"1.3.2026,{row.partition(',')[2]}" for row in rows], "'time' is '1.3.2026'; .*ISO 8601"),
+        (lambda rows: [f"-inf,{row.partition(',')[2]}" for row in rows], "'time' is '-inf'; it .* finite number\\.$"),
         (lambda rows: [*rows[:9], "1,2,3", *rows[9:]], "line 11: 3 fields for 5 columns"),
         (lambda rows: [], "is empty"),
     ],
