@@ -259,6 +259,11 @@ CASES: list[tuple[str, int, str]] = [
     ("hand arm.toml 1:to=2", 2, "no fake arm is served here"),
     ("note nowhere", 2, "nowhere is not a run folder"),
     ("note . --name x", 2, "is not a run folder"),
+    (
+        "estimate good.csv",
+        2,
+        "good.csv: no recording has two segments of 1 s, one to fit and one to check; the longest",
+    ),
     ("estimate short.csv", 2, "short.csv: the recording has 2 samples"),
     ("estimate run list.csv", 2, "give either one run folder or recordings"),
     ("estimate arm.toml", 2, "give the folder of a run"),
