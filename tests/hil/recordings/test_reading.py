@@ -436,6 +436,13 @@ def test_the_example_of_a_file_of_one_joint_has_its_own_names() -> None:
         read(Path("a.csv"))
 
 
+def test_three_joints_need_a_urdf() -> None:
+    Path("a.csv").write_text("t,q1,q2,q3,tau1,tau2,tau3\n0,1,2,3,4,5,6\n", encoding="utf-8")
+    with pytest.raises(CsvError, match=r"q1, q2, q3 seem to be the positions of 3 joints; .* arm\.urdf") as caught:
+        read(Path("a.csv"))
+    assert "torque" not in str(caught.value)
+
+
 def test_an_angle_that_wraps_is_to_be_unwrapped() -> None:
     def wrapped(rows: list[str]) -> list[str]:
         return [*rows[:9], *(f"{t},{float(q) + 6.28},{r}" for t, q, r in (row.split(",", 2) for row in rows[9:]))]
