@@ -97,8 +97,7 @@ def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[Re
     if not segments:
         raise RecordingError(
             f"no segment of {length:g} s holds {FEWEST} samples: the median rate is {1 / recording.interval:.3g} Hz; "
-            f"record at more than {FEWEST / length:g} Hz, or choose longer segments (columns.segment; the first fit "
-            "uses a quarter of it)"
+            f"record at more than {FEWEST / length:g} Hz, or choose longer segments (columns.segment)"
         )
     return segments
 

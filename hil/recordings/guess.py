@@ -111,8 +111,7 @@ def _group(table: Table, kind: str, columns: Columns, needed: bool = True) -> li
         many = max(named.values(), key=len)
         raise CsvError(
             f"{table.source}: {', '.join(many)} seem to be the positions of {len(many)} joints; three or more joints "
-            "need --config ARM.toml (in Python: config=) with arm.urdf, columns.position, and one [[joints]] table each "
-            "with its name. If only one or two of them are joints, set columns.position."
+            "need arm.urdf, columns.position and [[joints]] with names in --config ARM.toml (in Python: config=)."
         )
     if kind != "position" and columns.position is not None:
         groups = [names for names in groups if len(names) == len(columns.position)]
