@@ -37,6 +37,10 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
         raise TomlFileError(_not_toml(path, error, text)) from error
     except RecursionError:
         raise TomlFileError(f"{path}: not valid TOML: a value has too many nested brackets.") from None
+    except ValueError as error:  # Python's limit for integers
+        found = re.search(r"\d[\d_]{4300,}", text)
+        line = text.count("\n", 0, found.start()) + 1 if found else "?"
+        raise TomlFileError(f"{path}: not valid TOML: a number has too many digits (at line {line}).") from error
 
 
 def _encoding_of(path: Path, error: UnicodeDecodeError) -> str:

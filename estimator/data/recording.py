@@ -208,15 +208,23 @@ def _check_motion(recording: Recording) -> None:
                 f"joint {joint + 1} moved by {swing:.2g} rad; at least {least:.2g} rad are needed: check the column "
                 "and its unit, or drive the joint harder"
             )
-        speed = float(np.abs(np.diff(row) / np.diff(recording.time)).max())
+        step = np.abs(np.diff(row))
+        speed = step / np.diff(recording.time)
+        k = int(np.argmax(speed))
         if swing > MOST_ANGLE:
             raise RecordingError(
                 f"joint {joint + 1} moves through {swing:.4g} rad, more than {MOST_ANGLE:g}: are these degrees or "
                 "encoder steps? Set the column's unit"
             )
-        if speed > MOST_SPEED:
-            k = int(np.argmax(np.abs(np.diff(row) / np.diff(recording.time))))
+        if speed[k] > MOST_SPEED:
+            is_turn = abs(step[k] - 2.0 * np.pi) < 0.5  # even if it is taken back: the angle wraps
+            for at in () if is_turn else {k, k + 1} - {0, row.size - 1}:
+                if abs(row[at + 1] - row[at - 1]) < 0.2 * min(step[at - 1], step[at]):
+                    raise RecordingError(
+                        f"joint {joint + 1}: sample {at + 1} at {recording.time[at]:g} s is {step[k]:.3g} rad away "
+                        "from both its neighbours: single samples are wrong. Leave such positions empty (NaN)"
+                    )
             raise RecordingError(
-                f"joint {joint + 1} jumps by {abs(row[k + 1] - row[k]):.3g} rad, {speed:.3g} rad/s, after sample "
-                f"{k + 1} at {recording.time[k]:g} s: unwrap the angle, or check its unit"
+                f"joint {joint + 1} jumps by {step[k]:.3g} rad, {speed[k]:.3g} rad/s, after sample {k + 1} at "
+                f"{recording.time[k]:g} s: unwrap the angle, or check its unit"
             )

@@ -96,7 +96,8 @@ def cut(recording: Recording, number: int, grid: Grid, length: float) -> list[Re
         )
     if not segments:
         raise RecordingError(
-            f"no piece of {length:g} s holds {FEWEST} samples: raise the sample rate, or choose longer segments"
+            f"no segment of {length:g} s holds {FEWEST} samples: the median rate is {1 / recording.interval:.3g} Hz; "
+            f"record at more than {FEWEST / length:g} Hz, or choose longer segments (columns.segment)"
         )
     return segments
 

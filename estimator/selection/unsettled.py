@@ -87,9 +87,11 @@ def choose_by_shooting(
     Raises RecordingError if no recording has two segments, ConvergenceError if no model can be fitted.
     """
     if not any(len(cut(each, 0, Grid.of(each), length)) > 1 for each in recordings):
+        longest = max(float(np.ptp(each.time)) for each in recordings)
         raise RecordingError(
-            f"no recording has two segments of {length:g} s, one to fit and one to check: set model.friction to a "
-            "specific model, record for longer, or choose shorter segments (columns.segment)"
+            f"no recording has two segments of {length:g} s, one to fit and one to check; the longest recording lasts "
+            f"{longest:.3g} s: record for longer, choose shorter segments (columns.segment), or set model.friction to "
+            "a specific model"
         )
     joints = recordings[0].joints
     unknown: tuple[Option, ...] = ("torque_scale",) if joints == 2 else ()

@@ -5,6 +5,10 @@ import errno
 _OF_THE_MACHINE = frozenset({errno.EMFILE, errno.ENFILE})
 """Errors of the operating system that no input causes: no more files can be opened."""
 
+_OF_A_PATH = frozenset({errno.ENAMETOOLONG, errno.EACCES})
+"""Errors that even asking whether a file exists may raise."""
+_LONGEST = 80  # characters of a path in their message
+
 
 def exit_code(error: Exception) -> int | None:
     """Return the exit code for an expected error; None for any other exception, which is a bug in the program."""
@@ -15,6 +19,8 @@ def exit_code(error: Exception) -> int | None:
 
     if any(isinstance(each, OSError) and each.errno in _OF_THE_MACHINE for each in (error, error.__cause__)):
         return 1
+    if _is_of_a_path(error):
+        return 2
     if isinstance(error, HilError):
         return error.exit_code
     if isinstance(
@@ -24,17 +30,26 @@ def exit_code(error: Exception) -> int | None:
     return 1 if isinstance(error, driver.DriverError | EstimationError) else None
 
 
+def _is_of_a_path(error: Exception) -> bool:
+    return isinstance(error, OSError) and error.errno in _OF_A_PATH and bool(error.filename)
+
+
 def message(error: Exception) -> str:
     """Return the text to print for an error: its message and its notes.
 
     If the error occurred while another expected error was being handled, the message of that error is included. If the
-    notes name a command to type next, they end with it.
+    notes name a command to type next, they end with it. Control characters, as of a path, are escaped.
     """
-    lines = [f"hil: {error}"]
+    said = str(error)
+    if isinstance(error, OSError) and _is_of_a_path(error):
+        path = str(error.filename)
+        said = f"{path[:_LONGEST]}{'...' * (len(path) > _LONGEST)}: {error.strerror}."
+    lines = [f"hil: {said}"]
     cause = None if error.__suppress_context__ else error.__context__
     if isinstance(cause, Exception) and exit_code(cause) is not None:
         lines.append(f"Preceded by: {cause}")
-    return "\n".join([*lines, *getattr(error, "__notes__", [])])
+    text = "\n".join([*lines, *getattr(error, "__notes__", [])])
+    return "".join(each if each.isprintable() or each in "\n\t" else ascii(each)[1:-1] for each in text)
 
 
 def stop_behind(error: BaseException) -> Exception | None:

@@ -326,8 +326,10 @@ def load_config(path: str | PathLike[str]) -> Config:
     """Read and check a TOML file, or the bundled one with that name. Raises ConfigError."""
     path = find_config(Path(path))
     if path.is_dir():
-        within = next(iter(sorted(path.glob("*.toml"))), None)
-        hint = "." if within is None else f"; did you mean {within}?"
+        if path == Path():
+            raise ConfigError(". cannot be read: it is the current folder (as is an empty name). Name a TOML file.")
+        within = [*path.glob("*.toml")]
+        hint = f"; did you mean {within[0]}?" if len(within) == 1 else ". Name a TOML file."
         raise ConfigError(f"{path} cannot be read: it is a folder{hint}")
     try:
         text = read_toml_text(path)

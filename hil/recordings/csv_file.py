@@ -42,7 +42,9 @@ def read_csv_table(path: Path) -> Table:
             raise CsvError(f"{path}, line {number}: {len(row)} fields for {wide} columns.")
     comma = delimiter != ","
     columns = {name: _numbers([row[k] for _, row in fields], comma) for k, name in enumerate(header)}
-    return Table(str(path), columns, units, fields[0][0], "line")
+    odd = {name: np.isinf(values) for name, values in columns.items()}
+    texts = {name: fields[int(where.argmax())][1][header.index(name)] for name, where in odd.items() if where.any()}
+    return Table(str(path), columns, units, fields[0][0], "line", texts)
 
 
 def _text(path: Path) -> str:

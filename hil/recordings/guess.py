@@ -5,7 +5,7 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
-from hil.config.csv_columns import TORQUE_UNITS, Columns
+from hil.config.csv_columns import PLANAR, TORQUE_UNITS, Columns
 from hil.errors import CsvError
 from hil.recordings.table import Table
 from hil.recordings.units import UNITS, split_head, unit_of
@@ -106,7 +106,13 @@ def _group(table: Table, kind: str, columns: Columns, needed: bool = True) -> li
         if wrong or (kind == "voltage" and _SUPPLY.search(words)):
             continue
         named[_stem(bare)].append(name)
-    groups = [names for names in named.values() if len(names) <= 2]
+    groups = [names for names in named.values() if len(names) <= PLANAR]
+    if needed and not groups and named:
+        many = max(named.values(), key=len)
+        raise CsvError(
+            f"{table.source}: {', '.join(many)} seem to be the positions of {len(many)} joints; three or more joints "
+            "need arm.urdf, columns.position and [[joints]] with names in --config ARM.toml (in Python: config=)."
+        )
     if kind != "position" and columns.position is not None:
         groups = [names for names in groups if len(names) == len(columns.position)]
     if len(groups) == 1:

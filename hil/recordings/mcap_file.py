@@ -6,7 +6,6 @@ has a list `name` in addition to lists of numbers, as sensor_msgs/JointState doe
 """
 
 import json
-import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -89,7 +88,7 @@ def _table(source: str, files: list[Path]) -> Table:
 def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
     """Yield (topic, time [ns since 1970], message) of each decodable message. Raises CsvError if there is none."""
     try:
-        from mcap.exceptions import McapError
+        from mcap.exceptions import UnsupportedCompressionError
         from mcap.reader import make_reader
     except ImportError as error:
         raise CsvError("MCAP needs the package mcap: pip install 'hil[recordings]'.") from error
@@ -108,8 +107,10 @@ def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
                 found = True
                 decoded = decode(message.data)
                 yield channel.topic, _stamp(decoded, message.log_time), decoded
-    except (OSError, McapError, ValueError, KeyError, struct.error) as error:
-        raise CsvError(f"{path} cannot be read: {str(error).rstrip('.') or type(error).__name__}.") from error
+    except Exception as error:  # of mcap, its decompressors and decoders
+        is_plain = isinstance(error, UnsupportedCompressionError) or getattr(error, "filename", None)
+        why = error if is_plain else "it is not an MCAP file, or incomplete or damaged"
+        raise CsvError(f"{path} cannot be read: {why}.") from error
     if not found:
         what = ", ".join(sorted(refused)) or "no messages"
         raise CsvError(

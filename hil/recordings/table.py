@@ -1,5 +1,6 @@
 """A table of named numeric columns, independent of the file format."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -19,7 +20,7 @@ class Table:
 
     columns: values (rows,) by name, NaN where a value is missing and infinite where it is not a number. units: units
     stated in the file, by column. first_row: number of the first row, for messages (a CSV file's header is
-    line 1).
+    line 1). texts: of columns with such values, the first one as written in the file.
     """
 
     source: str
@@ -27,6 +28,7 @@ class Table:
     units: Mapping[str, str] = field(default_factory=dict)
     first_row: int = 1
     row_word: str = "row"
+    texts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def rows(self) -> int:
@@ -42,9 +44,11 @@ class Table:
         values = self.columns[full]
         bad = np.nonzero(np.isinf(values))[0]
         if bad.size:
+            text = self.texts.get(full, str(values[bad[0]]))
+            dates = " Dates and times are read in the form 2026-03-01T12:00:00.008 (ISO 8601)."
             raise CsvError(
-                f"{self.source}, {self.row_word} {bad[0] + self.first_row}: column {full!r} is not a number. "
-                "Dates and times are read in the form 2026-03-01T12:00:00.008 (ISO 8601)."
+                f"{self.source}, {self.row_word} {bad[0] + self.first_row}: column {full!r} is {text!r}; it must be a "
+                f"finite number.{dates if re.search('[0-9][-:/.][0-9]', text) else ''}"
             )
         return full, values, self.units.get(full) or split_head(full)[1]
 

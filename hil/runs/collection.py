@@ -105,6 +105,9 @@ def write_note(path: Path, note: Note) -> None:
         raise _no_run(path)
     if len(note.name) > _LONGEST or len(note.text) > _LONGEST:
         raise RunFolderError(f"A name or note may have at most {_LONGEST} characters.")
+    for key, value in asdict(note).items():
+        if bad := [each for each in value if not each.isprintable()]:
+            raise RunFolderError(f"--{key} {value!a}: {bad[0]!a} is not a printable character.")
     write_json(path / NOTE_FILE, asdict(note))
 
 

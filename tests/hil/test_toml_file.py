@@ -30,6 +30,7 @@ def test_a_byte_order_mark_is_no_part_of_the_file(read: Callable[[Path], object]
     ("content", "said"),
     [
         (b"a = " + 3000 * b"[" + 3000 * b"]", "too many nested brackets"),
+        (b"a = 1\nb = " + 5000 * b"9", r"arm\.toml: not valid TOML: a number has too many digits \(at line 2\)"),
         ("a = 1\n# Länge".encode("latin-1"), "not UTF-8 text, from line 2 on:\n  # Länge"),
         (b"[port]\nbaud = 1\n# again\nbaud = 2\n", r"baud is given twice in \[port\], on lines 2 and 4\."),
     ],

@@ -20,6 +20,7 @@ from hil.estimation.unsettled.estimate import Estimated, Given, estimate_any
 from hil.estimation.unsettled.slips import refuse_slips
 from hil.estimator.baselines.zero import turned_zeros
 from hil.estimator.data.recording import Recording
+from hil.estimator.errors import RecordingError
 from hil.recordings.convert import Converted, convert
 from hil.recordings.files import read_tables
 from hil.recordings.periodic import mean_period
@@ -53,8 +54,15 @@ def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder:
     Raises HilError, EstimationError.
     """
     config = RecordingConfig() if config_path is None else load_recording_config(config_path)
-    if config.arm.urdf is not None:
-        return _estimate_chain(paths, config_path, config, folder)
+    try:
+        return (_estimate_planar if config.arm.urdf is None else _estimate_chain)(paths, config_path, config, folder)
+    except RecordingError as error:
+        raise CsvError(f"{', '.join(map(str, paths))}: {error}.") from error
+
+
+def _estimate_planar(
+    paths: Sequence[Path], config_path: Path | None, config: RecordingConfig, folder: Path | None
+) -> ShootingResult:
     whole = _zeroed(_read(paths, config.columns), config.arm.gravity)
     read = _averaged(whole)
     columns, gravity = read.columns, config.arm.gravity

@@ -96,8 +96,12 @@ def test_friction_is_chosen_by_segments_left_out(pendulum: Arm) -> None:
     assert choice.chosen.model.friction == "stribeck" and choice.gained > 1.5
     assert choice.estimate.parameters["stribeck_rise_1"] == pytest.approx(0.6, rel=0.1)
     assert {trial.model.friction for trial in choice.trials} == {"coulomb", "stribeck"}
-    with pytest.raises(RecordingError, match="two segments"):
+    with pytest.raises(
+        RecordingError, match=r"two segments of 6 s, .*; the longest recording lasts \S+ s: record for longer"
+    ):
         choose_by_shooting([recorded], "delay", start(recorded), length=6.0)
+    with pytest.raises(RecordingError, match=r"no segment of \S+ s holds 8 samples: the median rate is \S+ Hz; record"):
+        choose_by_shooting([recorded], "delay", start(recorded), length=0.02)
 
 
 def test_a_segment_with_a_gap_is_left_out(pendulum: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,6 +154,12 @@ def test_mean_torque_is_the_integral_of_what_was_held_or_drawn() -> None:
         (lambda r: {"time": np.where(r.time > 1.0, np.nan, r.time)}, RecordingError, "time of sample"),
         (lambda r: {"position": 4096.0 * r.position}, RecordingError, "are these degrees or encoder"),
         (lambda r: {"position": r.position + 2.0 * np.pi * (r.time > 1.0)}, RecordingError, "unwrap the angle"),
+        (lambda r: {"position": r.position + 2.0 * np.pi * (r.time == r.time[99])}, RecordingError, "unwrap the angle"),
+        (
+            lambda r: {"position": r.position + 20.0 * (r.time == r.time[99])},
+            RecordingError,
+            r"joint 1: sample 100 at \S+ s is \S+ rad away from both its neighbours: single samples are wrong",
+        ),
         (lambda r: {"position": np.full_like(r.position, np.nan)}, RecordingError, "0 % of"),
         (lambda r: {"position": np.zeros_like(r.position)}, StandstillError, "joint 1 moved by 0 rad"),
         (lambda r: {"torque": np.where(r.time > 1.0, np.nan, r.torque)}, RecordingError, "torques are not finite"),

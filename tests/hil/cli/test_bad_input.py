@@ -119,14 +119,14 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate header.csv", 2, "is empty"),
     ("estimate no_header.csv", 2, "no header line"),
     ("estimate ragged.csv", 2, "line 102: 2 fields for 3 columns"),
-    ("estimate words.csv", 2, "'t' is not a number"),
+    ("estimate words.csv", 2, "words.csv, line 12: column 't' is 'soon'; it must be a finite number."),
     ("estimate twice.csv", 2, "two columns are named 'q1'"),
     ("estimate binary.csv", 2, "binary"),
     ("estimate backwards.csv", 2, "time goes back"),
     ("estimate still.csv", 2, "joint 1 moved by 0 rad"),
     ("estimate unknown.csv", 2, "a, b, c"),
     ("estimate not.parquet", 2, "not.parquet"),
-    ("estimate not.mcap", 2, "not.mcap"),
+    ("estimate not.mcap", 2, "not.mcap cannot be read: it is not an MCAP file, or incomplete or damaged."),
     ("estimate old.db3", 2, ".db3 files are not supported"),
     ("estimate arm.npz --config columns.toml --out other", 2, ".npz files are not supported. Recordings are CSV"),
     ("estimate arm.jsonl --out other", 2, ".jsonl files are not supported"),
@@ -259,6 +259,11 @@ CASES: list[tuple[str, int, str]] = [
     ("hand arm.toml 1:to=2", 2, "no fake arm is served here"),
     ("note nowhere", 2, "nowhere is not a run folder"),
     ("note . --name x", 2, "is not a run folder"),
+    (
+        "estimate good.csv",
+        2,
+        "good.csv: no recording has two segments of 1 s, one to fit and one to check; the longest",
+    ),
     ("estimate short.csv", 2, "short.csv: the recording has 2 samples"),
     ("estimate run list.csv", 2, "give either one run folder or recordings"),
     ("estimate arm.toml", 2, "give the folder of a run"),
@@ -324,6 +329,21 @@ def contents(folder: Path) -> dict[str, str]:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
+
+
+LONG = "x" * 5000
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("check", "identify", "dry-run", "estimate", "report", "runs", "note", "export --format urdf", "fake", "scan"),
+        *("init", "pose", "compare", f"diff {LONG}", "fake koch --pty --link", "schema --out"),
+    ],
+)
+def test_a_name_too_long_for_a_file_is_said_briefly(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil(*line.split(), LONG) == 2
+    assert capsys.readouterr().err == f"hil: {LONG[:80]}...: File name too long.\n"
 
 
 @pytest.mark.parametrize(("line", "code", "said"), CASES, ids=[case[0] for case in CASES])

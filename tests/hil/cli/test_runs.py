@@ -20,6 +20,21 @@ def test_runs_are_listed_with_their_notes(identified: Path, capsys: pytest.Captu
     assert run["verdict"] == "yes" and run["arm"] == "arm"
 
 
+@pytest.mark.parametrize("option", ["--name", "--text"])
+@pytest.mark.parametrize(("value", "bad"), [("a\x1b[31mX", r"'\x1b'"), ("a\nb", r"'\n'"), ("\udcff", r"'\udcff'")])
+def test_a_note_has_printable_characters_only(
+    identified: Path, option: str, value: str, bad: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert hil("note", identified, option, value) == 2
+    assert capsys.readouterr().err == f"hil: {option} {value!a}: {bad} is not a printable character.\n"
+    assert not (identified / "note.json").exists()
+
+
+def test_control_characters_of_a_path_are_escaped(capsys: pytest.CaptureFixture[str]) -> None:
+    assert hil("check", "a\x1b[31m\udcff.toml") == 2
+    assert capsys.readouterr().err == "hil: a\\x1b[31m\\udcff.toml cannot be read: No such file or directory.\n"
+
+
 def test_an_unfinished_run_is_listed_as_one(identified: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (identified / "result.json").write_text('{"schema": 1, ', encoding="utf-8")
     assert hil("runs", identified) == 0

@@ -121,6 +121,12 @@ def test_an_absent_file_and_one_that_is_no_text(tmp_path: Path) -> None:
         load_config(binary)
     with pytest.raises(ConfigError, match=r"cannot be read: it is a folder; did you mean .*binary\.toml\?$"):
         load_config(tmp_path)
+    (tmp_path / "other.toml").touch()
+    with pytest.raises(ConfigError, match=r"cannot be read: it is a folder\. Name a TOML file\.$"):
+        load_config(tmp_path)
+    for here in ("", "."):
+        with pytest.raises(ConfigError, match=r"^\. cannot be read: it is the current folder \(as is an empty name\)"):
+            load_config(here)
 
 
 def test_a_misspelt_bundled_name_is_guessed() -> None:

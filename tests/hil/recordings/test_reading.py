@@ -142,7 +142,9 @@ def test_rows_that_can_be_put_right_are_and_it_is_said(
     [
         (lambda rows: rows[::-1], "time goes back"),
         (lambda rows: [row.replace(row.split(",")[0], row.split(",")[0][:3], 1) for row in rows], "too coarse"),
-        (lambda rows: ["x" + row for row in rows], "column 'time' is not a number.*ISO 8601"),
+        (lambda rows: ["x" + row for row in rows], r"line 2: column 'time' is 'x\S+'; it must be a finite number\.$"),
+        (lambda rows: [f"1.3.2026,{row.partition(',')[2]}" for row in rows], "'time' is '1.3.2026'; .*ISO 8601"),
+        (lambda rows: [f"-inf,{row.partition(',')[2]}" for row in rows], "'time' is '-inf'; it .* finite number\\.$"),
         (lambda rows: [*rows[:9], "1,2,3", *rows[9:]], "line 11: 3 fields for 5 columns"),
         (lambda rows: [], "is empty"),
     ],
@@ -432,6 +434,13 @@ def test_the_example_of_a_file_of_one_joint_has_its_own_names() -> None:
     Path("a.csv").write_text("t,q1,cmd\n0,0,0\n1,1,1\n", encoding="utf-8")
     with pytest.raises(CsvError, match=r'time = "t"\nposition = \["q1"\]\ntorque = \["cmd"\]'):
         read(Path("a.csv"))
+
+
+def test_three_joints_need_a_urdf() -> None:
+    Path("a.csv").write_text("t,q1,q2,q3,tau1,tau2,tau3\n0,1,2,3,4,5,6\n", encoding="utf-8")
+    with pytest.raises(CsvError, match=r"q1, q2, q3 seem to be the positions of 3 joints; .* arm\.urdf") as caught:
+        read(Path("a.csv"))
+    assert "torque" not in str(caught.value)
 
 
 def test_an_angle_that_wraps_is_to_be_unwrapped() -> None:
