@@ -171,3 +171,21 @@ def test_turns_of_a_smooth_motion_are_not_wrong_samples() -> None:
     assert found(smooth, smooth.position + 1e-4) == ()
     (named,) = found(spiky(smooth), smooth.position + 1e-4)
     assert "4 of 1600 samples" in named
+
+
+def test_missing_rows_are_named() -> None:
+    """Every tenth row is missing; without equal time steps, nothing is known to be missing."""
+    estimate: Any = SimpleNamespace(
+        **{"model": SimpleNamespace(joints=2, base_names=()), "names": (), "value": (), "std": ()},
+        **{"residual_rms": np.full(2, 1e-3), "residual_over_noise": np.ones(2)},
+    )
+    uneven = replace(healthy(), time=healthy().time + 0.001 * np.random.default_rng(1).uniform(size=1600))
+    for recording, said in ((healthy(), False), (without_rows(healthy()), True), (without_rows(uneven), False)):
+        warnings = doubts_of([recording], estimate).warnings
+        assert any("10 % of the rows are missing" in each for each in warnings) is said
+
+
+def without_rows(recording: Recording) -> Recording:
+    kept = np.arange(recording.time.size) % 10 != 5
+    time, torque, position = recording.time[kept], recording.torque[:, kept], recording.position[:, kept]
+    return replace(recording, time=time, torque=torque, position=position)
