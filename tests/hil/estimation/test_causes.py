@@ -189,3 +189,19 @@ def without_rows(recording: Recording) -> Recording:
     kept = np.arange(recording.time.size) % 10 != 5
     time, torque, position = recording.time[kept], recording.torque[:, kept], recording.position[:, kept]
     return replace(recording, time=time, torque=torque, position=position)
+
+
+def test_exact_positions_beside_gaps_are_not_wrong_samples() -> None:
+    """The motion goes on during gaps of 0.1 to 1 s, so the positions before and after them are far apart."""
+    smooth = replace(healthy(), position=0.5 * np.sin(9.4 * healthy().time + np.array([[0.0], [1.0]])))
+    kept = np.ones(1600, dtype=bool)
+    for first, count in ((300, 20), (322, 40), (364, 100), (700, 60), (761, 30), (1200, 200)):
+        kept[first : first + count] = False
+
+    def cut(recording: Recording) -> Recording:
+        time, torque, position = recording.time[kept], recording.torque[:, kept], recording.position[:, kept]
+        return replace(recording, time=time, torque=torque, position=position)
+
+    predicted = cut(smooth).position + 1e-4
+    assert not any("far from their neighbours" in each for each in found(cut(smooth), predicted))
+    assert any("3 of 1150 samples" in each for each in found(cut(spiky(smooth)), predicted))
