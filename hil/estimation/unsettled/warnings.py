@@ -31,10 +31,13 @@ class Doubts:
     warnings: tuple[str, ...]
 
 
-def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate, cause_known: bool = False) -> Doubts:
+def doubts_of(
+    recordings: Sequence[Recording], estimate: ShootingEstimate, cause_known: bool = False, gravity: bool = True
+) -> Doubts:
     """Find what looks wrong in the recordings, or in how the estimate explains them.
 
-    cause_known: whether the verdict says why much of the motion is unexplained.
+    cause_known: whether the verdict says why much of the motion is unexplained. gravity: whether it acts in the
+    arm's plane.
     """
     faults, doubts, warnings = _signs(recordings), [], _rows(recordings)
     for joint in range(estimate.model.joints):
@@ -51,7 +54,7 @@ def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate, cause
                 f"{advice}."
             )
     early = [] if cause_known else _early(recordings, estimate)
-    return Doubts(tuple(faults), tuple(doubts), (*warnings, *early, *_weak(estimate)))
+    return Doubts(tuple(faults), tuple(doubts), (*warnings, *early, *_weak(estimate, gravity)))
 
 
 def _signs(recordings: Sequence[Recording]) -> list[str]:
@@ -133,13 +136,13 @@ def _early(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[
     ]
 
 
-def _weak(estimate: ShootingEstimate) -> list[str]:
+def _weak(estimate: ShootingEstimate, gravity: bool) -> list[str]:
     count = len(estimate.model.base_names)
     known = zip(estimate.names[:count], estimate.value, estimate.std, strict=False)
     weak = [
         f"{name} ({100 * std / abs(value):.0f} %)" if std < UNSEEN * abs(value) else f"{name} (not at all)"
         for name, value, std in known
-        if not name.startswith("offset") and std > WEAK * abs(value)
+        if not name.startswith("offset" if gravity else ("offset", "gravity")) and std > WEAK * abs(value)
     ]
     if not weak:
         return []

@@ -15,6 +15,7 @@ from hil.estimation.unsettled.causes import Fitted, causes
 from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.torque_faults import suspect_clipped
 from hil.estimator.data.recording import Recording
+from hil.estimator.selection.segment_verdict import relative_std
 from tests.support.recorded_motion import two_joints
 
 Spoil = Callable[[Recording], Recording]
@@ -205,3 +206,17 @@ def test_exact_positions_beside_gaps_are_not_wrong_samples() -> None:
     predicted = cut(smooth).position + 1e-4
     assert not any("far from their neighbours" in each for each in found(cut(smooth), predicted))
     assert any("3 of 1150 samples" in each for each in found(cut(spiky(smooth)), predicted))
+
+
+def test_without_gravity_its_torques_are_not_called_uncertain() -> None:
+    estimate: Any = SimpleNamespace(
+        model=SimpleNamespace(joints=2, base_names=("inertia_1", "gravity_1")),
+        names=("inertia_1", "gravity_1"),
+        value=np.array([0.01, 1e-4]),
+        std=np.array([1e-4, 0.3]),
+        residual_rms=np.full(2, 1e-3),
+        residual_over_noise=np.ones(2),
+    )
+    for gravity in (True, False):
+        assert ("gravity_1" in str(doubts_of([healthy()], estimate, False, gravity).warnings)) is gravity
+        assert ("gravity_1" in relative_std([healthy()], estimate, gravity)) is gravity
