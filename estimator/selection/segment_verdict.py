@@ -20,6 +20,7 @@ from hil.estimator.selection.verdict import (
     WEAK,
     WELL_KNOWN,
     Verdict,
+    percent,
 )
 
 NEARLY_EXPLAINED = 1.5  # ratio of residual to noise up to which undetermined friction near standstill does no harm
@@ -54,32 +55,34 @@ class SegmentEvidence:
     """Whether the recordings themselves are at fault, so that neither more terms nor other motion would help."""
     notes: tuple[str, ...] = ()
     """Findings that cast no doubt on the values, as sentences."""
+    gravity: bool = True
+    """Whether gravity acts in the arm's plane."""
 
 
-def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate) -> dict[str, float]:
-    """Return the relative standard error of each base parameter except offsets.
+def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool = True) -> dict[str, float]:
+    """Return the relative standard error of each base parameter except offsets and, without gravity, its torques.
 
     If gravity is negligible, its error is relative to the fraction LITTLE_TORQUE of the RMS torque.
     """
     torque = LITTLE_TORQUE * np.sqrt(np.mean([np.mean(each.torque**2, axis=1) for each in recordings], axis=0))
     relative = {}
     for name, value, std in zip(estimate.model.base_names, estimate.value, estimate.std, strict=False):
-        if kind_of(name) != "offset":
+        if kind_of(name) != "offset" and (gravity or kind_of(name) != "gravity"):
             least = float(torque[(joint_of(name) or 1) - 1]) if kind_of(name) == "gravity" else 0.0
             size = max(abs(float(value)), least)
             relative[name] = float(std) / size if size else np.inf
     return relative
 
 
-def explains_well(recordings: Sequence[Recording], estimate: ShootingEstimate) -> bool:
+def explains_well(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool = True) -> bool:
     """Whether the motion is nearly explained and determines every base parameter well."""
-    well = max(relative_std(recordings, estimate).values()) <= WELL_KNOWN
+    well = max(relative_std(recordings, estimate, gravity).values()) <= WELL_KNOWN
     return well and float(estimate.residual_over_noise.max()) <= NEARLY_EXPLAINED
 
 
 def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, evidence: SegmentEvidence) -> Verdict:
     """Return the verdict on `estimate`, whose standard errors include the effect of omitted terms."""
-    relative = relative_std(recordings, estimate)
+    relative = relative_std(recordings, estimate, evidence.gravity)
     left, held_out = float(estimate.residual_over_noise.max()), evidence.held_out
     weakest = max(relative, key=lambda name: relative[name])
     explained = left <= EXPLAINED
@@ -131,14 +134,14 @@ def _predicted(held_out: Array | None, length: float) -> str:
         return "The model was not validated on a held-out motion: the recording is too short to hold out a part of it."
     return (
         f"Fitted to every other segment of {length:g} s, the model predicts the remaining ones to within "
-        f"{100.0 * float(held_out.max()):.2g} % of the motion's RMS."
+        f"{percent(float(held_out.max()))} of the motion's RMS."
     )
 
 
 def _weakest(name: str, part: float, spoiled: bool) -> str:
     if part <= WELL_KNOWN or spoiled:
-        return f"The least certain parameter is {name}, known to within {100 * part:.2g} %."
+        return f"The least certain parameter is {name}, known to within {percent(part)}."
     if not np.isfinite(part):
         return f"This motion provides no information on {name}. To identify it: {IMPROVEMENT[kind_of(name)]}."
     improvement = IMPROVEMENT[kind_of(name)]
-    return f"The least certain parameter is {name}, known to within {100 * part:.2g} %. To improve it: {improvement}."
+    return f"The least certain parameter is {name}, known to within {percent(part)}. To improve it: {improvement}."

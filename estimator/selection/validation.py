@@ -72,8 +72,8 @@ class Validation:
         return max(self.relative_std, key=lambda name: self.relative_std[name])
 
 
-def validate(period: SettledPeriod, estimate: Estimate) -> Validation:
-    """Check `estimate` against the period to which it was fitted."""
+def validate(period: SettledPeriod, estimate: Estimate, gravity: bool = True) -> Validation:
+    """Check `estimate` against the period to which it was fitted. gravity: whether it acts in the arm's plane."""
     residual = np.nan_to_num(estimate.residual)
     lags = min(LAGS, period.samples // 4)
     band = 1.96 / np.sqrt(period.samples)
@@ -88,7 +88,7 @@ def validate(period: SettledPeriod, estimate: Estimate) -> Validation:
         _free_run(period, estimate),
         float(linalg.cond(correlation)),
         (names[first], names[second], float(correlation[first, second])),
-        _relative_std(period, estimate),
+        {name: part for name, part in _relative_std(period, estimate).items() if gravity or kind_of(name) != "gravity"},
         _torque_std(period, estimate),
         levels(period, estimate),
     )

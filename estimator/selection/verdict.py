@@ -185,7 +185,7 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
     if not worst:
         return "This error does not affect the parameters significantly: including it, each is known to 2 % or better."
     named = sorted(worst, key=lambda name: -worst[name])
-    listed = ", ".join(f"{name} ({100.0 * worst[name]:.2g} %)" for name in named[:4])
+    listed = ", ".join(f"{name} ({percent(worst[name])})" for name in named[:4])
     more = f" and {len(named) - 4} others" if len(named) > 4 else ""
     if trust == "no":
         return f"This error may bias all parameters, most of all {listed}{more}."
@@ -209,7 +209,7 @@ def _distorted(validation: Validation) -> tuple[str, ...]:
     joint = int(np.argmax(np.maximum(levels.odd.motion, levels.even.motion) / driven))
 
     def share(level: Array) -> str:
-        return f"{100.0 * float(level[joint] / driven[joint]):.2g} %"
+        return percent(float(level[joint] / driven[joint]))
 
     found = (
         f"Joint {joint + 1} also responds on lines that were not excited. Relative to an excited line's motion: "
@@ -229,7 +229,7 @@ def _drifted(drift: Drift | None) -> tuple[str, ...]:
     if drift is None:
         return ()
     return tuple(
-        f"Friction of joint {joint + 1} {'fell' if change < 0.0 else 'rose'} by {100.0 * abs(change):.2g} % within "
+        f"Friction of joint {joint + 1} {'fell' if change < 0.0 else 'rose'} by {percent(abs(change))} within "
         f"{drift.seconds:.0f} s{_reason(change, drift.seconds)}"
         for joint, (change, std) in enumerate(zip(drift.change.tolist(), drift.std.tolist(), strict=True))
         if abs(change) > max(LEAST, 3.0 * std)
@@ -286,8 +286,12 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
 
 def _percent(error: Array) -> str:
     """The largest of some relative errors in percent, never in exponential notation."""
-    worst = max(100.0 * float(error.max()), LEAST_PERCENT)
-    return f"{worst:.2g} %" if worst < 99.5 else f"{worst:.0f} %"
+    return percent(max(float(error.max()), 0.01 * LEAST_PERCENT))
+
+
+def percent(part: float) -> str:
+    """A fraction in percent, never in exponential notation if it is large."""
+    return f"{100.0 * part:.{'2g' if part < 0.995 else '0f'}} %"
 
 
 def improvement_of(name: str, torque_limit: str = "") -> str:
@@ -301,19 +305,17 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
     name = validation.weakest
     part = validation.relative_std[name]
     if part <= WELL_KNOWN:
-        return (f"The least certain parameter is {name}, known to within {100 * part:.2g} %.",)
+        return (f"The least certain parameter is {name}, known to within {percent(part)}.",)
     improvement = improvement_of(name, torque_limit)
     if part > WEAK and not _is_weak(validation, name):
         share = 100 * validation.torque_std[name]
         return (
-            f"The least certain parameter is {name}, known to within {100 * part:.2g} %. It hardly affects this arm: "
+            f"The least certain parameter is {name}, known to within {percent(part)}. It hardly affects this arm: "
             f"its standard error is {share:.2g} % of the torque of the fitted motion. To improve it: {improvement}.",
         )
     if not np.isfinite(part):
         return (f"This motion provides no information on {name}. To identify it: {improvement}.",)
-    return (
-        f"The least certain parameter is {name}, known to within {100 * part:.2g} %. To improve it: {improvement}.",
-    )
+    return (f"The least certain parameter is {name}, known to within {percent(part)}. To improve it: {improvement}.",)
 
 
 def _alike(validation: Validation) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from hil.dry_run.run import ARMS
 from hil.dry_run.run import dry_run as simulate
 from hil.dry_run.summary import DryRun, dry_run_json
 from hil.errors import ConfigError
+from hil.estimator.selection.verdict import percent
 from hil.pilot.chain_rehearsal import rehearse
 from hil.pilot.rehearsal import rehearse_in_steps
 from hil.results.display import html_table
@@ -80,7 +81,7 @@ class Rehearsal:
         )
         return (
             f"Dry run of {self.file} on {self.found.arms} arms drawn from the {self.found.source}: "
-            f"{'safe' if self.is_safe else 'NOT SAFE'}, chance of a guard stop {100 * self.stop_chance:.2g} %; "
+            f"{'safe' if self.is_safe else 'NOT SAFE'}, chance of a guard stop {percent(self.stop_chance)}; "
             f"{largest}"
         )
 

@@ -13,6 +13,7 @@ from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
 from hil.dry_run.prediction import Prediction, quantities_of
 from hil.dry_run.stopping_distance import Stopping, Way
+from hil.estimator.selection.verdict import percent
 from hil.printing import print_fitting, say
 
 
@@ -239,7 +240,7 @@ def _percent(chance: float) -> str:
     """A percentage; "below 0.01 %" in the far tail, which a few hundred arms cannot resolve."""
     if chance < 1e-8:
         return "0 %"
-    return "below 0.01 %" if chance < 1e-4 else f"{100 * chance:.2g} %"
+    return "below 0.01 %" if chance < 1e-4 else percent(chance)
 
 
 def _each(config: Config, beyond: NDArray[np.float64]) -> str:

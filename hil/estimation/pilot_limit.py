@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 
+REACHED = 0.5  # fraction of a limit, below which something else limited the torque
+
 
 def torque_limit(config: Config, samples: NDArray[np.void], index: int | None = None) -> str:
     """Describe, for a message, the limit that the pilot approached most closely: its setting, and the fraction used.
@@ -32,4 +34,7 @@ def torque_limit(config: Config, samples: NDArray[np.void], index: int | None = 
             f"position_limit of {joint.name}": float(max(below / (rest - low), above / (high - rest))),
         }
     setting = max(shares, key=lambda name: shares[name])
-    return f"the {setting} (the pilot reached {100 * shares[setting]:.0f} % of it, which limited its torque)"
+    reached = f"{100 * shares[setting]:.0f} %"
+    if shares[setting] < REACHED:
+        return f"the torque (the pilot's safety rules limited it; it reached at most {reached} of any limit)"
+    return f"the {setting} (the pilot reached {reached} of it, which limited its torque)"

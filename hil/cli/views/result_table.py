@@ -41,7 +41,8 @@ def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
     """Print a result of multiple shooting. run: its folder."""
     print(f"{result.joints}-joint arm, {result.config}")
     for name, entry in result.quantities.items():
-        print(f"{name:22s} {entry.unit:10s} {entry.value:12.5g} {entry.std:9.1e}")
+        value, std = _shown(entry)
+        print(f"{name:22s} {entry.unit:10s} {value:>12s} {std:>9s}")
     rms = ", ".join(f"{1000 * value:.3g}" for value in result.fit.residual_rms_rad)
     for found in result.zeros or ():
         shown = ", ".join(f"{zero:.4f} +- {std:.1g}" for zero, std in zip(found.zero, found.std, strict=True))
@@ -91,15 +92,20 @@ def _parameters(result: SettledResult, truth: Truth) -> Table:
         table.add_row(escape(name), escape(entry.unit), *_numbers(name, entry, truth))
     table.add_row()
     for name, entry in result.extra.items():
-        table.add_row(escape(name), escape(entry.unit), f"{entry.value:.5g}", f"{entry.std:.1e}")
+        table.add_row(escape(name), escape(entry.unit), *_shown(entry))
     table.add_row()
     return table
+
+
+def _shown(entry: Quantity) -> list[str]:
+    """Value and standard error; no digits of a value about which the motion provides no information."""
+    return [f"{entry.value:.5g}", f"{entry.std:.1e}"] if entry.std < math.inf else ["undetermined", "-"]
 
 
 def _numbers(name: str, entry: Quantity, truth: Truth) -> list[str]:
     """Return the cells of a parameter: value, standard error and, if there is any truth, the error."""
     value, std = entry.value, entry.std
-    cells = [f"{value:.5g}", f"{std:.1e}"]
+    cells = _shown(entry)
     if name not in truth.values:
         return [*cells, "", "", ""] if truth.values else cells
     true = truth.values[name]

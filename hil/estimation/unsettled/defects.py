@@ -11,6 +11,7 @@ from hil.estimator.fit.multiple_shooting import ShootingEstimate
 AS_WELL = 1.05  # largest mean square of the residual, relative to that of the chosen model
 WELL = 2.0  # mean square of the residual relative to the noise, up to which a defect is certain to be the cause
 MOSTLY = 0.8  # fraction of the residual that a defect must explain to be named at all
+GAIN = 1.5  # mean square of the residual without the defect, relative to that with it, below which nothing is gained
 
 
 def likely_defect(
@@ -22,6 +23,8 @@ def likely_defect(
     """
     found = probable_defect(recordings, plain, gravity)
     if found is None or found.fit.left > AS_WELL * float((estimate.residual_over_noise**2).mean()):
+        return None
+    if found.given.left < GAIN * found.fit.left:
         return None
     return found if found.explained > MOSTLY or found.fit.left < WELL else None
 

@@ -124,7 +124,7 @@ def estimate_any(
     plain = estimate if choice is None else choice.plain
     fitted = Fitted(recordings, given.names, predicted, plain, estimate, gravity)
     why = () if given.jumps else causes(fitted)
-    found = doubts_of(recordings, estimate, bool(why))
+    found = doubts_of(recordings, estimate, bool(why), gravity > 0.0)
     verdict = _judged(fitted, given, why, held_out, found)
     result = _result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3), stepped)
     result = replace(
@@ -155,7 +155,7 @@ def _judged(
         () if why else contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
     )
     scales = () if spoiled else angle_scale(recordings, estimate, given.origin)
-    unknown, known_well = undetermined(estimate), explains_well(recordings, estimate)
+    unknown, known_well = undetermined(estimate), explains_well(recordings, estimate, fitted.gravity > 0.0)
     odd = (*why, *scales, *contradictory, *implausible(recordings, estimate, fitted.gravity))
     return judge_segments(
         recordings,
@@ -172,6 +172,7 @@ def _judged(
                 *(unknown if known_well else ()),
                 *(() if why else ratios_said(joints, ratios, given.torque_source, contradictory)),
             ),
+            fitted.gravity > 0.0,
         ),
     )
 

@@ -22,6 +22,7 @@ MOST_WINDOWS = 0.3  # fraction of windows that may be far above: more are no loc
 SHORTEST, FEWEST = 0.2, 10  # s and samples during which a value stays the same
 MOST_STRETCHES = 5  # in which a value stays the same: more are the nature of the joint or of the commands
 SPIKE_NOISES, SPIKE_USUAL, USUAL_QUANTILE = 20.0, 10.0, 0.95
+LONG = 1.5  # duration of five neighbouring samples, relative to the usual one, from which they lie beside a gap
 MOST_SPIKES = 0.05  # fraction of the samples
 IMPACT_TIME = 0.01  # s, over which velocities before and after an impact are measured
 IMPACT_USUAL, IMPACT_STEPS = 4.0, 20.0  # change of velocity relative to the usual one, and in encoder steps
@@ -141,13 +142,14 @@ def _spikes(joint: _Joint) -> list[str]:
     known = np.flatnonzero(np.isfinite(joint.position))
     if known.size < FEWEST:
         return []
-    values = joint.position[known]
+    time, values = joint.time[known], joint.position[known]
     windows = np.lib.stride_tricks.sliding_window_view
+    span = np.ptp(windows(np.pad(time, 2, mode="edge"), 5), axis=1)
     away = np.abs(values - np.median(windows(np.pad(values, 2, mode="edge"), 5), axis=1))
     far = away > max(SPIKE_NOISES * joint.noise, SPIKE_USUAL * float(np.quantile(away, USUAL_QUANTILE)))
     # A wrong sample also moves the medians of its neighbours.
     found = far & (away > 0.5 * windows(np.pad(away, 2), 5).max(axis=1))
-    found &= _departs(joint.time[known], values, found, SPIKE_NOISES * joint.noise)
+    found &= (span < LONG * np.median(span)) & _departs(time, values, found, SPIKE_NOISES * joint.noise)
     spikes = known[found]
     if not 0 < spikes.size <= MOST_SPIKES * known.size:
         return []

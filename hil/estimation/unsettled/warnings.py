@@ -16,6 +16,7 @@ MANY_TURNS = 2.0
 FLAT = 0.05  # fraction of samples at the largest torque; a sine has fewer
 LEFT = 0.1  # RMS residual relative to the motion's RMS
 CERTAIN, LEAST_EARLY = 4.0, 0.1  # standard errors and sampling intervals by which a delay is negative
+EQUAL, MOSTLY = 0.1, 0.9  # deviation from a whole number of intervals; fraction of the steps that are so equal
 WEAK, UNSEEN = 0.5, 10.0  # standard error relative to the value
 
 UNITS_ADVICE = "check the units, signs and zero of position and torque; then try shorter segments"
@@ -30,12 +31,15 @@ class Doubts:
     warnings: tuple[str, ...]
 
 
-def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate, cause_known: bool = False) -> Doubts:
+def doubts_of(
+    recordings: Sequence[Recording], estimate: ShootingEstimate, cause_known: bool = False, gravity: bool = True
+) -> Doubts:
     """Find what looks wrong in the recordings, or in how the estimate explains them.
 
-    cause_known: whether the verdict says why much of the motion is unexplained.
+    cause_known: whether the verdict says why much of the motion is unexplained. gravity: whether it acts in the
+    arm's plane.
     """
-    faults, doubts, warnings = _signs(recordings), [], []
+    faults, doubts, warnings = _signs(recordings), [], _rows(recordings)
     for joint in range(estimate.model.joints):
         name = f"Joint {joint + 1}"
         warnings += _motion(recordings, joint, name)
@@ -50,7 +54,7 @@ def doubts_of(recordings: Sequence[Recording], estimate: ShootingEstimate, cause
                 f"{advice}."
             )
     early = [] if cause_known else _early(recordings, estimate)
-    return Doubts(tuple(faults), tuple(doubts), (*warnings, *early, *_weak(estimate)))
+    return Doubts(tuple(faults), tuple(doubts), (*warnings, *early, *_weak(estimate, gravity)))
 
 
 def _signs(recordings: Sequence[Recording]) -> list[str]:
@@ -63,6 +67,20 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
         f"The sign of {columns} seems to be reversed: with the sign changed, inverse dynamics leaves "
         f"{100 * suspicion.residual:.2g} % of the torque unexplained instead of {100 * suspicion.residual_given:.2g} %"
         f"{negative}. Correct the sign in the file, or swap the columns."
+    ]
+
+
+def _rows(recordings: Sequence[Recording]) -> list[str]:
+    """Detect rows that are missing among equal time steps, apart from gaps."""
+    steps = [np.diff(each.time)[np.diff(each.time) < each.longest_interval] / each.interval for each in recordings]
+    step = np.concatenate(steps)
+    whole = np.round(step)
+    lost = 1.0 - step.size / max(float(whole.sum()), 1.0)
+    if lost <= LOST or np.mean(np.abs(step - whole) < EQUAL) < MOSTLY:
+        return []
+    return [
+        f"{100 * lost:.2g} % of the rows are missing among equal time steps: the torques of these rows are unknown, "
+        "which increases the residual. Log every row."
     ]
 
 
@@ -118,13 +136,13 @@ def _early(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[
     ]
 
 
-def _weak(estimate: ShootingEstimate) -> list[str]:
+def _weak(estimate: ShootingEstimate, gravity: bool) -> list[str]:
     count = len(estimate.model.base_names)
     known = zip(estimate.names[:count], estimate.value, estimate.std, strict=False)
     weak = [
         f"{name} ({100 * std / abs(value):.0f} %)" if std < UNSEEN * abs(value) else f"{name} (not at all)"
         for name, value, std in known
-        if not name.startswith("offset") and std > WEAK * abs(value)
+        if not name.startswith("offset" if gravity else ("offset", "gravity")) and std > WEAK * abs(value)
     ]
     if not weak:
         return []

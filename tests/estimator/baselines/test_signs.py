@@ -1,16 +1,22 @@
 """Reversed columns are found and named; a recording with correct signs raises no suspicion."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hil.config.csv_columns import load_recording_config
+from hil.errors import CsvError
+from hil.estimation.unsettled.slips import refuse_slips
+from hil.estimator.baselines import signs
 from hil.estimator.baselines.signs import Signs, suspect_signs
 from hil.estimator.data.recording import Recording
 from hil.recordings.convert import convert
 from hil.recordings.csv_file import read_csv_table
 from tests.support.paths import CONFIGS, DATA
+from tests.support.recorded_motion import two_joints
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +69,25 @@ def test_too_short_a_recording_says_nothing(recording: Recording) -> None:
         position=recording.position[:, :60],
     )
     assert suspect_signs([short]) is None
+
+
+def test_swapped_position_columns_are_named() -> None:
+    motion = two_joints(8.0)
+    given = Recording(motion.time, motion.torque, motion.position, np.full(2, 2 * np.pi / 4096), "held")
+    refuse_slips([given], "arm.csv")
+    with pytest.raises(CsvError, match="the position columns of joints 1 and 2 seem to be swapped"):
+        refuse_slips([replace(given, position=given.position[::-1].copy())], "arm.csv")
+
+
+@pytest.mark.parametrize(("given", "left", "offered"), [(0.81, 0.83, False), (0.2, 0.2, True)])
+def test_a_reversed_sign_that_explains_hardly_anything_is_not_offered(
+    monkeypatch: pytest.MonkeyPatch, recording: Recording, given: float, left: float, offered: bool
+) -> None:
+    def fitted(_: object, tried: Signs) -> Any:
+        value, residual = (1.0, left) if tried.reversed_columns else (-1.0, given)
+        return SimpleNamespace(
+            relative_residual=np.array([residual]), value=np.array([value]), std=np.array([0.1]), names=("inertia_1",)
+        )
+
+    monkeypatch.setattr(signs, "_fit", fitted)
+    assert (suspect_signs([recording]) is not None) is offered

@@ -150,6 +150,14 @@ def test_intervals_cover_the_truth_where_the_model_lacks_something(
     assert "the model cannot explain" in verdict.sentences[0]
 
 
+def test_without_gravity_its_torques_are_not_the_least_certain(ideal_period: SettledPeriod) -> None:
+    found = identify(ideal_period, Model(2))
+    factor = np.array([100.0 if "gravity" in name else 1.0 for name in found.names])
+    found = replace(found, covariance=found.covariance * np.outer(factor, factor))
+    assert validate(ideal_period, found).weakest.startswith("gravity")
+    assert not validate(ideal_period, found, gravity=False).weakest.startswith("gravity")
+
+
 def test_a_good_estimate_is_trusted(ideal_period: SettledPeriod) -> None:
     estimate = identify(ideal_period, Model(2))
     validation = validate(ideal_period, estimate)

@@ -15,6 +15,7 @@ from hil.estimation.unsettled.causes import Fitted, causes
 from hil.estimation.unsettled.warnings import doubts_of
 from hil.estimator.baselines.torque_faults import suspect_clipped
 from hil.estimator.data.recording import Recording
+from hil.estimator.selection.segment_verdict import relative_std
 from tests.support.recorded_motion import two_joints
 
 Spoil = Callable[[Recording], Recording]
@@ -171,3 +172,51 @@ def test_turns_of_a_smooth_motion_are_not_wrong_samples() -> None:
     assert found(smooth, smooth.position + 1e-4) == ()
     (named,) = found(spiky(smooth), smooth.position + 1e-4)
     assert "4 of 1600 samples" in named
+
+
+def test_missing_rows_are_named() -> None:
+    """Every tenth row is missing; without equal time steps, nothing is known to be missing."""
+    estimate: Any = SimpleNamespace(
+        **{"model": SimpleNamespace(joints=2, base_names=()), "names": (), "value": (), "std": ()},
+        **{"residual_rms": np.full(2, 1e-3), "residual_over_noise": np.ones(2)},
+    )
+    uneven = replace(healthy(), time=healthy().time + 0.001 * np.random.default_rng(1).uniform(size=1600))
+    for recording, said in ((healthy(), False), (without_rows(healthy()), True), (without_rows(uneven), False)):
+        warnings = doubts_of([recording], estimate).warnings
+        assert any("10 % of the rows are missing" in each for each in warnings) is said
+
+
+def without_rows(recording: Recording) -> Recording:
+    kept = np.arange(recording.time.size) % 10 != 5
+    time, torque, position = recording.time[kept], recording.torque[:, kept], recording.position[:, kept]
+    return replace(recording, time=time, torque=torque, position=position)
+
+
+def test_exact_positions_beside_gaps_are_not_wrong_samples() -> None:
+    """The motion goes on during gaps of 0.1 to 1 s, so the positions before and after them are far apart."""
+    smooth = replace(healthy(), position=0.5 * np.sin(9.4 * healthy().time + np.array([[0.0], [1.0]])))
+    kept = np.ones(1600, dtype=bool)
+    for first, count in ((300, 20), (322, 40), (364, 100), (700, 60), (761, 30), (1200, 200)):
+        kept[first : first + count] = False
+
+    def cut(recording: Recording) -> Recording:
+        time, torque, position = recording.time[kept], recording.torque[:, kept], recording.position[:, kept]
+        return replace(recording, time=time, torque=torque, position=position)
+
+    predicted = cut(smooth).position + 1e-4
+    assert not any("far from their neighbours" in each for each in found(cut(smooth), predicted))
+    assert any("3 of 1150 samples" in each for each in found(cut(spiky(smooth)), predicted))
+
+
+def test_without_gravity_its_torques_are_not_called_uncertain() -> None:
+    estimate: Any = SimpleNamespace(
+        model=SimpleNamespace(joints=2, base_names=("inertia_1", "gravity_1")),
+        names=("inertia_1", "gravity_1"),
+        value=np.array([0.01, 1e-4]),
+        std=np.array([1e-4, 0.3]),
+        residual_rms=np.full(2, 1e-3),
+        residual_over_noise=np.ones(2),
+    )
+    for gravity in (True, False):
+        assert ("gravity_1" in str(doubts_of([healthy()], estimate, False, gravity).warnings)) is gravity
+        assert ("gravity_1" in relative_std([healthy()], estimate, gravity)) is gravity

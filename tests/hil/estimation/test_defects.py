@@ -3,10 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from hil.estimation.unsettled import defects
 from hil.estimation.unsettled.defects import defect_said, likely_defect
 from hil.estimator.baselines.idim import fit_inverse_dynamics
 from hil.estimator.data.recording import Recording
@@ -87,3 +90,15 @@ def test_angles_of_two_joints_in_wrong_scales_are_named_with_both_scales() -> No
     found = named([replace(recording, position=recording.position * factor[:, None])], model)
     scales = found.removeprefix("The angles of joints 1 and 2 seem to be ").split(" times")[0].split(" and ")
     assert np.array(scales, dtype=float) == pytest.approx(factor, rel=0.01)
+
+
+@pytest.mark.parametrize(("given", "left", "named"), [(1.08, 1.03, False), (1.3, 1.0, True), (4.0, 3.5, False)])
+def test_a_defect_that_hardly_changes_the_residual_is_not_named(
+    monkeypatch: pytest.MonkeyPatch, given: float, left: float, named: bool
+) -> None:
+    found: Any = SimpleNamespace(
+        fit=SimpleNamespace(left=left**2), given=SimpleNamespace(left=given**2), explained=0.9, hypothesis=None
+    )
+    monkeypatch.setattr(defects, "probable_defect", lambda *_: found)
+    estimate: Any = SimpleNamespace(residual_over_noise=np.array([given]))
+    assert (likely_defect([], estimate, estimate, True) is found) is named

@@ -1,14 +1,17 @@
 """Lost samples, the limit of a pilot's torque, and doubtful verdicts are named."""
 
+import math
+
 import numpy as np
 import pytest
 
+from hil.cli.views.result_table import _shown
 from hil.config.schema import load_config
 from hil.estimation.changes.diff import Difference
 from hil.estimation.pilot_limit import torque_limit
 from hil.estimation.settled_period import scatter
-from hil.estimator.selection.verdict import improvement_of
-from hil.results.parts import ModelChoice, TriedModel
+from hil.estimator.selection.verdict import improvement_of, percent
+from hil.results.parts import ModelChoice, Quantity, TriedModel
 from hil.runs.recording import sample_type
 from hil.runs.timing import lost_samples
 from tests.support.paths import CONFIGS
@@ -43,6 +46,22 @@ def test_after_a_pilot_the_advice_names_the_limit(pilot: bool, expected: str) ->
     limit = torque_limit(config, samples)
     assert expected in improvement_of("gravity_1", limit)
     assert ("90 %" in limit) is pilot
+
+
+def test_a_limit_that_was_far_away_did_not_limit_the_torque() -> None:
+    config = load_config(CONFIGS / "fake_two_link.toml")
+    config = config.model_copy(update={"experiment": config.experiment.model_copy(update={"pilot": True})})
+    samples = some_samples()
+    samples["position"] = config.arm.rest_pose
+    samples["velocity"][5, 1] = 0.25 * config.joints[1].velocity_limit
+    said = torque_limit(config, samples)
+    assert "at most 25 % of any limit" in said and "velocity_limit" not in said
+
+
+def test_large_percentages_and_undetermined_values_are_readable() -> None:
+    assert [percent(each) for each in (0.00123, 0.25, 0.996, 12.3)] == ["0.12 %", "25 %", "100 %", "1230 %"]
+    assert _shown(Quantity(1.0769e-26, math.inf, "s")) == ["undetermined", "-"]
+    assert _shown(Quantity(0.0021, 1.2e-4, "s")) == ["0.0021", "1.2e-04"]
 
 
 def test_a_difference_repeats_doubtful_verdicts() -> None:
