@@ -470,6 +470,29 @@ def test_a_current_behind_its_goal_near_no_load_speed_is_the_supplys(
     assert ("Lower velocity_limit" in str(stop.value)) == (cause is Cause.OUT_OF_VOLTAGE)
 
 
+@pytest.mark.parametrize(
+    ("carried", "velocity", "lacking", "is_supply"),
+    [
+        (0.1, 4.6, 0.4, True),
+        (0.1, 4.6, 2.0, False),  # explains too little
+        (0.1, 4.6, -0.4, False),
+        (0.1, 1.0, 0.4, False),
+        (0.29, 4.6, 0.4, False),
+    ],
+)
+def test_a_torque_that_the_supply_cannot_drive_explains_what_a_joint_lacks(
+    arm: Arm, carried: float, velocity: float, lacking: float, is_supply: bool
+) -> None:
+    fast = STILL._replace(goal_current=(0.0, 0.3), current=(0.0, carried), velocity=(0.0, velocity))
+    recent = [at(n, fast) for n in range(0, 40, 20)]
+    if is_supply:
+        with pytest.raises(SafetyStop, match=r"carries 0\.100 A .* cannot drive more") as stop:
+            Guard(arm()).look_at_supply(1, lacking, recent)
+        assert stop.value.cause is Cause.OUT_OF_VOLTAGE
+    else:
+        Guard(arm()).look_at_supply(1, lacking, recent)
+
+
 def not_followed(
     guard: Guard, carried: float, velocity: float, *, volt: float = nan, held: float | None = None
 ) -> SafetyStop:
