@@ -152,12 +152,14 @@ def _packets_within(received: bytes) -> list[Packet]:
 
 
 def _fronts_of_replies(received: bytes) -> Iterator[tuple[int, int]]:
-    """ID and number of data bytes of each status packet, whether it is complete or not."""
+    """ID and number of data bytes, without stuffing, of each status packet, whether it is complete or not."""
     at = received.find(HEADER)
     while at >= 0:
         front = received[at : at + _FRONT_SIZE]
         if len(front) == _FRONT_SIZE and front[-1] == Instruction.STATUS:
-            yield front[4], int.from_bytes(front[5:7], "little") - _BESIDE_DATA
+            length = int.from_bytes(front[5:7], "little")
+            stuffed = received.count(b"\xff\xff\xfd\xfd", at, at + _BEFORE_LENGTH + length)
+            yield front[4], length - stuffed - _BESIDE_DATA
         at = received.find(HEADER, at + 1)
 
 

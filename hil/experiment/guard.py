@@ -312,9 +312,9 @@ class Guard:
         if heard := self._heard_instead():
             return heard
         if len(self._missing) == 1 or not all(self._missing):
-            return "Check its cable and its supply."
+            return "Requests or replies are lost: check its cable and its supply."
         # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
-        shared = f"{NONE_HEARD}: check the adapter, the cables and the supply"
+        shared = f"{NONE_HEARD}; requests or replies are lost: check the adapter, the cables and the supply"
         if self._silence.is_busy:
             return f"{shared}, and whether other programs keep this computer busy: this program had just been late."
         return f"{shared}."

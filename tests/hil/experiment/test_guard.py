@@ -106,8 +106,11 @@ def test_replies_may_be_missing_but_not_too_many_in_a_row(arm: Arm) -> None:
 @pytest.mark.parametrize(
     ("missing", "said"),
     [
-        ((False, True), "Check its cable and its supply."),
-        ((True, True), "No servo was heard: check the adapter, the cables and the supply."),
+        ((False, True), "Requests or replies are lost: check its cable and its supply."),
+        (
+            (True, True),
+            "No servo was heard; requests or replies are lost: check the adapter, the cables and the supply.",
+        ),
     ],
 )
 def test_silence_of_all_servos_points_to_what_they_share(arm: Arm, missing: tuple[bool, bool], said: str) -> None:
@@ -160,7 +163,7 @@ def test_silence_on_a_computer_that_was_late_before_names_it_too(arm: Arm) -> No
     assert number == round(400 * arm().safety.late_time), "as for missed deadlines"
     guard.look(at(30, STILL))
     guard.woke_up(30 / 400, 0.0011)
-    with pytest.raises(SafetyStop, match=r"Check its cable and its supply.$"):
+    with pytest.raises(SafetyStop, match=r"check its cable and its supply.$"):
         for number in range(31, 60):
             guard.look(at(number, MISSING))
     assert number == 36, "a single servo is itself silent"
