@@ -27,12 +27,13 @@ def exit_code(error: Exception) -> int | None:
 def message(error: Exception) -> str:
     """Return the text to print for an error: its message and its notes.
 
-    If the error occurred while another expected error was being handled, the message of that error is included. If the
+    If the error occurred while another expected error was being handled, the message of that error is included, unless
+    it is the same. If the
     notes name a command to type next, they end with it.
     """
     lines = [f"hil: {error}"]
     cause = None if error.__suppress_context__ else error.__context__
-    if isinstance(cause, Exception) and exit_code(cause) is not None:
+    if isinstance(cause, Exception) and exit_code(cause) is not None and str(cause) != str(error):
         lines.append(f"Preceded by: {cause}")
     return "\n".join([*lines, *getattr(error, "__notes__", [])])
 
