@@ -95,3 +95,21 @@ def test_a_stop_inside_a_progress_callback_is_a_stop(caplog: pytest.LogCaptureFi
         with pytest.raises(StopRequested):
             tell(Progress("experiment", "THE ARM MOVES AGAIN"))
     assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("note", "command"),
+    [
+        ("Torque is off on both servos.", "record"),
+        ("The settings of joint 'elbow' could not be restored.", "check"),
+        ("TORQUE IS ON at ID 1.", "check"),
+    ],
+)
+def test_servos_that_are_not_as_before_are_checked_next(
+    monkeypatch: pytest.MonkeyPatch, note: str, command: str
+) -> None:
+    monkeypatch.setattr(experiment, "after_a_stop", lambda *_: ["The recording is kept.", "Next: hil record a.toml"])
+    stopped = KeyboardInterrupt()
+    stopped.add_note(note)
+    run: Any = None
+    assert experiment._how_to_go_on(stopped, run, "record", Path("a.toml"))[-1] == f"Next: hil {command} a.toml"
