@@ -165,6 +165,8 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
             with suppress(Exception):  # a failing hint must not hide what stopped the arm, or its torque state
                 for line in _how_to_go_on(stopped, run, command, shown):
                     stopped.add_note(line)
+        elif isinstance(stopped, DriverError) and hasattr(stopped, "__notes__"):  # with the servos' torque state
+            stopped.add_note(next_step("check", shown))
         raise
 
 

@@ -364,3 +364,9 @@ def test_a_stop_between_two_runs_says_that_torque_is_off(
     (note,) = raised.value.__notes__
     assert note.startswith(f"Torque is off on {'both' if runs else 'all'} servos") and "reading it back" in note
     assert ("has not switched it on" in note) is (runs == 0)
+
+
+def test_another_master_before_torque_was_switched_on_leaves_a_word_about_torque(arm: Arm, bench: Bench) -> None:
+    with pytest.raises(BusShared) as stop, servo_session(arm(SHORT)):
+        raise BusShared("Another master")
+    assert any("this command has not switched it on" in note for note in stop.value.__notes__)
