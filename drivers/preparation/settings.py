@@ -111,15 +111,18 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
     return written
 
 
-def holds(servo: Servo, settings: Mapping[str, int]) -> bool:
-    """Return whether the registers that decide how a servo moves are as in `settings`: EEPROM registers and goals.
+def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | None:
+    """A register that decides how a servo moves (EEPROM or a goal) and is not as in `settings`: its name, its value and
+    the one in `settings`; None if there is none.
 
     They are read in the opposite order to that of `put_back`, so that replies to earlier requests do not agree again.
     Raises the same errors as `Servo.read`.
     """
     wanted = attainable(servo, settings)
-    names = [name for name in (*EEPROM, *_BOUNDS) if name in wanted and name in servo.table]
-    return all(servo.read_despite_error(name) == wanted[name] for name in reversed(names))
+    for name in reversed((*EEPROM, *_BOUNDS)):
+        if name in wanted and name in servo.table and (now := servo.read_despite_error(name)) != wanted[name]:
+            return name, now, wanted[name]
+    return None
 
 
 def arms_itself(servo: Servo) -> bool:

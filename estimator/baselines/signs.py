@@ -26,8 +26,10 @@ LESS_RESIDUAL = 0.6
 
 SAME_RESIDUAL = 1.05
 """A combination that also makes a negative inertia or friction positive is credible if its residual is up to this
-multiple of the residual with the signs as given.
+multiple of the residual with the signs as given, and explains most of the torque (MOST_LEFT).
 """
+
+MOST_LEFT = 0.5
 
 _POSITIVE = ("inertia", "viscous", "coulomb")
 _STANDARD_ERRORS = 3.0
@@ -79,7 +81,9 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
         if fitted is None or _impossible(fitted):
             continue
         residual = float(fitted.relative_residual.max())
-        credible = residual < LESS_RESIDUAL * left or (bool(impossible) and residual < SAME_RESIDUAL * left)
+        credible = residual < LESS_RESIDUAL * left or (
+            bool(impossible) and residual < min(SAME_RESIDUAL * left, MOST_LEFT)
+        )
         if credible and (best is None or residual < best[0]):
             best = residual, signs
     return None if best is None else Suspicion(best[1], best[0], left, impossible)
@@ -113,15 +117,18 @@ def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | No
     return _better_explained(recordings, [replace(each, torque=each.torque[::-1].copy()) for each in recordings])
 
 
-def suspect_order(recordings: Sequence[Recording]) -> tuple[float, float] | None:
-    """Return evidence that both the angles and the torques of two joints are in the opposite order.
+def suspect_order(recordings: Sequence[Recording], torques: bool = True) -> tuple[float, float] | None:
+    """Return evidence that the angles of two joints, and by default also their torques, are in the opposite order.
 
     See `suspect_swapped` for the result. The outer joint's zero angle may be unknown until the columns have been
     exchanged.
     """
     if recordings[0].joints != 2:
         return None
-    other = [replace(each, torque=each.torque[::-1].copy(), position=each.position[::-1].copy()) for each in recordings]
+    order = slice(None, None, -1 if torques else 1)
+    other = [
+        replace(each, torque=each.torque[order].copy(), position=each.position[::-1].copy()) for each in recordings
+    ]
     zeros = turned_zeros(other)
     if zeros is not None:
         other = [replace(each, position=each.position + zeros[:, None]) for each in other]

@@ -1,6 +1,7 @@
 """`hil.identify` and `hil.record`: run an experiment on a real or fake arm."""
 
 import logging
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -19,6 +20,7 @@ from hil.estimation.after_a_stop import after_a_failure, after_a_stop
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress as StreamProgress
+from hil.next_step import next_step
 from hil.report.page import FILE_NAME, write_report
 from hil.report.run_data import RunData
 from hil.results.result import Result
@@ -27,6 +29,9 @@ from hil.runs.run_folder import RunFolder
 __all__ = ["identify", "record"]
 
 log = logging.getLogger(__name__)
+
+_UNSETTLED = re.compile("TORQUE IS ON|could not be restored")
+"""Where a message says this, the servos' state is to be checked before anything else."""
 
 
 def identify(
@@ -140,8 +145,12 @@ def _tell_doubts(config: Config, tell: OnProgress) -> None:
 
 def _how_to_go_on(stopped: BaseException, run: RunFolder, command: str, shown: Path) -> list[str]:
     if isinstance(stopped, KeyboardInterrupt | StopRequested):
-        return after_a_stop(run, command, shown)
-    return after_a_failure(run, shown) if isinstance(stopped, ExperimentError | DriverError) else []
+        said = after_a_stop(run, command, shown)
+    else:
+        said = after_a_failure(run, shown) if isinstance(stopped, ExperimentError | DriverError) else []
+    if said and _UNSETTLED.search("\n".join([str(stopped), *getattr(stopped, "__notes__", [])])):
+        said[-1] = next_step("check", shown)
+    return said
 
 
 @contextmanager
@@ -156,6 +165,8 @@ def _discarding(run: RunFolder, command: str, shown: Path) -> Iterator[None]:
             with suppress(Exception):  # a failing hint must not hide what stopped the arm, or its torque state
                 for line in _how_to_go_on(stopped, run, command, shown):
                     stopped.add_note(line)
+        elif isinstance(stopped, DriverError) and hasattr(stopped, "__notes__"):  # with the servos' torque state
+            stopped.add_note(next_step("check", shown))
         raise
 
 

@@ -37,8 +37,8 @@ def _is_of_a_path(error: Exception) -> bool:
 def message(error: Exception) -> str:
     """Return the text to print for an error: its message and its notes.
 
-    If the error occurred while another expected error was being handled, the message of that error is included. If the
-    notes name a command to type next, they end with it. Control characters, as of a path, are escaped.
+    If the error occurred while another expected error was being handled, the message of that error is included, unless
+    it is the same. If the notes name a command to type next, they end with it. Control characters are escaped.
     """
     said = str(error)
     if isinstance(error, OSError) and _is_of_a_path(error):
@@ -46,7 +46,7 @@ def message(error: Exception) -> str:
         said = f"{path[:_LONGEST]}{'...' * (len(path) > _LONGEST)}: {error.strerror}."
     lines = [f"hil: {said}"]
     cause = None if error.__suppress_context__ else error.__context__
-    if isinstance(cause, Exception) and exit_code(cause) is not None:
+    if isinstance(cause, Exception) and exit_code(cause) is not None and str(cause) != str(error):
         lines.append(f"Preceded by: {cause}")
     text = "\n".join([*lines, *getattr(error, "__notes__", [])])
     return "".join(each if each.isprintable() or each in "\n\t" else ascii(each)[1:-1] for each in text)

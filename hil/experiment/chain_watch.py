@@ -23,6 +23,7 @@ from hil.estimator.chain.simulation.motion_observer import ChainObserver
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.experiment.apart import causes_of_standstill
 from hil.experiment.consistency import check_standstill
+from hil.experiment.model_watch import Explain
 from hil.plan.chain_model import known_chain
 from hil.plan.obedience import Residual
 
@@ -47,12 +48,18 @@ class ChainWatch:
     """Checks every sample against the model.
 
     planned: largest goal of each joint [A, or V under PWM]. arms: prior knowledge of the arm; by default, from the
-    configuration. interval: time between two exchanges [s]; by default, that between two samples.
+    configuration. interval, explain: as for `ModelWatch`.
     """
 
     def __init__(
-        self, config: Config, planned: Sequence[float], arms: ChainArms | None = None, interval: float | None = None
+        self,
+        config: Config,
+        planned: Sequence[float],
+        arms: ChainArms | None = None,
+        interval: float | None = None,
+        explain: Explain = lambda *_: None,
     ) -> None:
+        self._explain = explain
         arms = prior_arms(config, known_chain(config), ARMS) if arms is None else arms
         self._constants = np.array([joint.torque_per_goal for joint in config.joints])
         mean, covariance = observed_parameters(arms)
@@ -127,6 +134,7 @@ class ChainWatch:
                 f"{self._blocked_by[joint]}"
             )
         else:
+            self._explain(joint, float(lacking), [state for state, _ in self._commanded])
             said = (
                 f"{name} does not move like any arm consistent with the prior and the data so far: "
                 f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "

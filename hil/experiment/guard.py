@@ -7,6 +7,7 @@ commands or replies (`deadlines` and `silence`); `command_limits` clamps what is
 """
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from math import copysign, isnan
 from typing import NoReturn
 
@@ -43,6 +44,9 @@ BELOW_VOLTAGE = 0.9
 """If the supply cannot drive the commanded current at some speed, this fraction of that speed is proposed as a
 limit.
 """
+
+_LACKS_S, _EXPLAINED = 0.1, 0.5
+"""The supply explains a lack of torque if, within the last `_LACKS_S` [s], it caused at least this share of it."""
 
 _ERRORS_IN_A_ROW = 3
 """If this many consecutive replies of a servo contain both values and an error number, the arm is stopped: the servo
@@ -92,6 +96,7 @@ class Guard:
         self._safety = safety
         self._left_by_a_run = left_by_a_run
         currents = (joint.drive_mode is Mode.CURRENT for joint in config.joints)
+        self._constants = [joint.torque_per_goal for joint in config.joints]
         self._units = [joint.drive_mode.goal_unit for joint in config.joints]
         self._models = [
             joint.joint.servo if by_current else None for joint, by_current in zip(config.joints, currents, strict=True)
@@ -307,9 +312,9 @@ class Guard:
         if heard := self._heard_instead():
             return heard
         if len(self._missing) == 1 or not all(self._missing):
-            return "Check its cable and its supply."
+            return "Requests or replies are lost: check its cable and its supply."
         # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
-        shared = f"{NONE_HEARD}: check the adapter, the cables and the supply"
+        shared = f"{NONE_HEARD}; requests or replies are lost: check the adapter, the cables and the supply"
         if self._silence.is_busy:
             return f"{shared}, and whether other programs keep this computer busy: this program had just been late."
         return f"{shared}."
@@ -369,24 +374,17 @@ class Guard:
         # If the servo holds another goal, that explains its current.
         has_own_goal = self._status.other_goal(index) is None
         if has_own_goal and model and model.is_out_of_voltage(commanded, carried, velocity):
-            slower = f"{BELOW_VOLTAGE * abs(velocity):.2g} rad/s"
-            said = f"{said} at {velocity:.2f} rad/s"
             if model.is_out_of_voltage(commanded, carried, velocity, self._supply[index]):
-                self._stop(
-                    index,
-                    Cause.OUT_OF_VOLTAGE,
-                    f"{said}: at that speed its supply cannot drive more current against the back-EMF, or its current "
-                    f"sensor is wrong. Lower velocity_limit to {slower}, or raise the supply voltage; if this "
-                    f"happens at lower speeds too, suspect the sensor.{self._lower_torque}",
-                )
+                self._out_of_voltage(index, commanded, carried, velocity)
             # Published figures are too uncertain to rule the supply out: the arm is braked all the same.
             self._stop(
                 index,
                 Cause.GOALS_CHANGED,
-                f"{said}: {self._supply[index]:.1f} V would drive the commanded current at that speed, according to "
-                "the published figures. Its goals are being changed on the way or by another program, its supply sags, "
+                f"{said} at {velocity:.2f} rad/s: {self._supply[index]:.1f} V would drive the commanded current at "
+                "that speed, according to the published figures. Its goals are being changed on the way or by another "
+                "program, its supply sags, "
                 "or its current sensor is wrong: check these. If all are in order, its motor is weaker than published: "
-                f"lower velocity_limit to {slower}.",
+                f"lower velocity_limit to {BELOW_VOLTAGE * abs(velocity):.2g} rad/s.",
             )
         seconds = self._joints[index]["found"]
         self._stop(
@@ -395,6 +393,33 @@ class Guard:
             f"{said}, according to the readings of the last {1e3 * seconds:.0f} ms. "
             f"{self._why_not_followed(index, state)}",
         )
+
+    def _out_of_voltage(self, index: int, goal: float, carried: float, velocity: float) -> NoReturn:
+        unit = self._units[index]
+        self._stop(
+            index,
+            Cause.OUT_OF_VOLTAGE,
+            f"carries {carried:.3f} {unit} instead of the commanded {goal:.3f} {unit} at {velocity:.2f} rad/s: at that "
+            "speed its supply cannot drive more current against the back-EMF, or its current sensor is wrong. Lower "
+            f"velocity_limit to {BELOW_VOLTAGE * abs(velocity):.2g} rad/s, or raise the supply voltage; if this "
+            f"happens at lower speeds too, suspect the sensor.{self._lower_torque}",
+        )
+
+    def look_at_supply(self, index: int, lacking: float, recent: Sequence[State]) -> None:
+        """Raise SafetyStop if the measured current shows that the supply causes a joint's lack of torque [N m]."""
+        model = self._models[index]
+        if model is None or not self._joints[index]["is_followed"] or self._status.other_goal(index) is not None:
+            return
+        for before, state in pairwise(recent):
+            # What was sent with one sample acts until the next.
+            goal, carried, velocity = before.goal_current[index], state.current[index], state.velocity[index]
+            explained = self._constants[index] * (goal - carried) * copysign(1.0, lacking)
+            if (
+                state.time_before_write >= recent[-1].time_before_write - _LACKS_S
+                and explained >= _EXPLAINED * abs(lacking)
+                and model.is_out_of_voltage(goal, carried, velocity, self._supply[index])
+            ):
+                self._out_of_voltage(index, goal, carried, velocity)
 
     def _why_not_followed(self, index: int, state: State) -> str:
         carried, commanded, unit = state.current[index], state.goal_current[index], self._units[index]

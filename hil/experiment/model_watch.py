@@ -208,6 +208,7 @@ def _watch_loop(
     return int(_JOLTED * (jolted + 1) + unlike + 1)
 
 
+Explain = Callable[[int, float, Sequence[State]], None]
 _JOLTED = 4
 _watch: Callable[..., int] = compiled(_watch_loop)
 
@@ -216,12 +217,19 @@ class ModelWatch:
     """Checks every sample against the model.
 
     planned: largest goal of each joint [A, or V under PWM]. arms: prior knowledge of the arm; by default, from the
-    configuration. interval: time between two exchanges [s]; by default, that between two samples.
+    configuration. interval: time between two exchanges [s]; by default, that between two samples. explain: raises
+    SafetyStop if the latest samples show why a moving joint lacks a torque [N m].
     """
 
     def __init__(
-        self, config: Config, planned: Sequence[float], arms: Ensemble | None = None, interval: float | None = None
+        self,
+        config: Config,
+        planned: Sequence[float],
+        arms: Ensemble | None = None,
+        interval: float | None = None,
+        explain: Explain = lambda *_: None,
     ) -> None:
+        self._explain = explain
         self._constants = [joint.torque_per_goal for joint in config.joints]
         largest = np.array([constant * goal for constant, goal in zip(self._constants, planned, strict=True)])
         mean, covariance = known_arm(config, largest, arms)
@@ -319,6 +327,7 @@ class ModelWatch:
                 f"arm consistent with the prior and the data so far would be moving. {self._blocked_by[joint]}"
             )
         else:
+            self._explain(joint, lacking, self._recent)
             said = (
                 f"{name} does not move like any arm consistent with the prior and the data so far: "
                 f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "

@@ -107,9 +107,11 @@ class Stream:
             left_by_a_run=self._left_by_a_run,
         )
         self._model: ModelWatch | ChainWatch = (
-            ModelWatch(config, planned, arms, apart)
+            ModelWatch(config, planned, arms, apart, self._guard.look_at_supply)
             if not isinstance(arms, ChainArms) and not config.is_chain
-            else ChainWatch(config, planned, arms if isinstance(arms, ChainArms) else None, apart)
+            else ChainWatch(
+                config, planned, arms if isinstance(arms, ChainArms) else None, apart, self._guard.look_at_supply
+            )
         )
         self._way_down: WayDown | None = None
         if config.is_chain:

@@ -93,3 +93,10 @@ def test_a_reply_that_was_still_arriving_when_time_was_up_is_late_not_damaged(ke
 def test_so_is_the_beginning_of_a_reply_to_an_earlier_request(fast: bool) -> None:
     """After a lost reply another number of bytes is asked for."""
     assert said(b"", both(1, 2, fast=fast)[:-1], fast=fast).startswith("Replies did arrive, but too late or twice")
+
+
+def test_a_lost_reply_after_stuffed_ones_is_not_called_late() -> None:
+    """Stuffing makes a reply as long as one to another request."""
+    stuffed = encode_status(1, 0, b"\xff\xff\xfd" + state(1, 2, 3)[3:]) + answer(2, 4, 5, 6)
+    assert b"\xff\xff\xfd\xfd" in stuffed
+    assert said(stuffed, b"") == ""

@@ -31,12 +31,15 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
             f"{_unexplained(*order)}. "
             "Joint 1 is the one at the base: name its columns first in [columns] of --config ARM.toml."
         )
-    swapped = suspect_swapped(recordings)
-    if swapped is not None and _is_clear(*swapped):
-        raise CsvError(
-            f"{source}: the torque columns of joints 1 and 2 seem to be swapped: with them exchanged, "
-            f"{_unexplained(*swapped)}. Exchange them in the file, or in [columns] of --config ARM.toml."
-        )
+    for column, swapped in (
+        ("torque", suspect_swapped(recordings)),
+        ("position", suspect_order(recordings, torques=False)),
+    ):
+        if swapped is not None and _is_clear(*swapped):
+            raise CsvError(
+                f"{source}: the {column} columns of joints 1 and 2 seem to be swapped: with them exchanged, "
+                f"{_unexplained(*swapped)}. Exchange them in the file, or in [columns] of --config ARM.toml."
+            )
     signs = suspect_signs(recordings)
     if signs is None:
         return

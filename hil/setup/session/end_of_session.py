@@ -74,7 +74,7 @@ def telling_of_torque(bus: ServoBus) -> Iterator[None]:
     except TorqueNotOff:
         raise
     except BaseException as ended:
-        is_stop = isinstance(ended, KeyboardInterrupt | StopRequested)
+        is_stop = isinstance(ended, KeyboardInterrupt | StopRequested | DriverError)
         told = any(_TELLS_OF_TORQUE.search(note) for note in getattr(ended, "__notes__", []))
         if not told and (is_stop or bus.torque_off_report is not None):
             with signals_held_back():

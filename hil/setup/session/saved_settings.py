@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError, WrongModel, WrongSetting
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import attainable, holds, put_back
+from hil.drivers.preparation.settings import attainable, put_back, unlike
 from hil.drivers.servo import Servo
 from hil.errors import RunFolderError
 from hil.setup.session import settings_file
@@ -15,8 +15,6 @@ from hil.setup.session.settings_file import Kept
 
 _MOST_CHECKS = 3
 """How often the settings of all servos are read again once they have been restored."""
-
-_UNVERIFIED = "its registers were written but read differently afterwards: they are unverified."
 
 
 @dataclass
@@ -104,14 +102,14 @@ class SavedSettings:
         never reached. failed: receives the errors of the servos whose settings still differ.
         """
         for attempt in range(_MOST_CHECKS):
-            unlike = {
+            differing = {
                 joint: error
                 for joint in self.kept
                 if joint not in failed and (error := self._differs(joint)) is not None
             }
-            if not unlike:
+            if not differing:
                 return
-            failed |= self.put_back(unlike) if attempt < _MOST_CHECKS - 1 else unlike
+            failed |= self.put_back(differing) if attempt < _MOST_CHECKS - 1 else differing
 
     def forget(self, restored: Iterable[Joint]) -> None:
         """Remove the files of these servos; not where a goal or limit has yet to be restored."""
@@ -122,10 +120,16 @@ class SavedSettings:
     def _differs(self, joint: Joint) -> DriverError | None:
         """The error for a servo whose settings are not read as restored, or cannot be read; None if they are."""
         try:
-            is_held = holds(self.bus.drives[joint], self.wanted[joint])
+            found = unlike(self.bus.drives[joint], self.wanted[joint])
         except DriverError as error:
             return error
-        return None if is_held else WrongSetting(f"{joint.title}: {_UNVERIFIED}")
+        if found is None:
+            return None
+        name, now, wanted = found
+        return WrongSetting(
+            f"{joint.title}: {name} reads {now} after {wanted} was restored and read back: another program writes to "
+            "it, or replies are late. End that program."
+        )
 
     def _check_model(self, servo: Servo) -> None:
         """Raise WrongModel if a servo of another model answers at this servo's ID."""

@@ -3,11 +3,13 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from hil.api import experiment
 from hil.api.progress import Progress, forgiving
+from hil.drivers.errors import BusShared
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
 from hil.estimation import after_a_stop
 from hil.estimator.errors import RecordingError
@@ -95,3 +97,30 @@ def test_a_stop_inside_a_progress_callback_is_a_stop(caplog: pytest.LogCaptureFi
         with pytest.raises(StopRequested):
             tell(Progress("experiment", "THE ARM MOVES AGAIN"))
     assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("note", "command"),
+    [
+        ("Torque is off on both servos.", "record"),
+        ("The settings of joint 'elbow' could not be restored.", "check"),
+        ("TORQUE IS ON at ID 1.", "check"),
+    ],
+)
+def test_servos_that_are_not_as_before_are_checked_next(
+    monkeypatch: pytest.MonkeyPatch, note: str, command: str
+) -> None:
+    monkeypatch.setattr(experiment, "after_a_stop", lambda *_: ["The recording is kept.", "Next: hil record a.toml"])
+    stopped = KeyboardInterrupt()
+    stopped.add_note(note)
+    run: Any = None
+    assert experiment._how_to_go_on(stopped, run, "record", Path("a.toml"))[-1] == f"Next: hil {command} a.toml"
+
+
+def test_a_bus_failure_before_the_first_sample_ends_with_a_command() -> None:
+    run: Any = type("Unused", (), {"discard_if_unused": lambda _: True})()
+    stopped = BusShared("Another master")
+    stopped.add_note("Torque is off.")
+    with pytest.raises(BusShared), experiment._discarding(run, "record", Path("a.toml")):
+        raise stopped
+    assert stopped.__notes__[-1] == "Next: hil check a.toml"

@@ -410,3 +410,9 @@ def test_what_led_to_an_error_is_told_unless_the_error_replaces_it(is_replaced: 
     error = ExperimentError("then")
     error.__context__, error.__suppress_context__ = ConfigError("first"), is_replaced
     assert message(error) == told
+
+
+def test_the_same_message_is_given_once() -> None:
+    again = StopRequested("Stopped by Ctrl-C.", number=signal.SIGINT)
+    again.__context__ = StopRequested("Stopped by Ctrl-C.", number=signal.SIGINT)
+    assert message(again) == "hil: Stopped by Ctrl-C."

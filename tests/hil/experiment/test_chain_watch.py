@@ -168,6 +168,17 @@ def test_the_observer_is_given_the_planned_torque_and_the_interval(config: Confi
     assert cast(Any, given._observer).given[4] == 0.007
 
 
+def test_what_explains_the_lack_of_torque_is_asked_first(config: Config, watch: ChainWatch) -> None:
+    asked: list[Any] = []
+    watch._explain = lambda *given: asked.append(given)
+    sees(config, watch, 1.0)
+    watch._observer.found = 0  # type: ignore[attr-defined]
+    with pytest.raises(SafetyStop, match="does not move like any arm"):
+        sees(config, watch, 1.5, velocity=(1.0, 0.0, 0.0))
+    (joint, lacking, recent), *_ = asked
+    assert (joint, lacking, [each.time_before_write for each in recent]) == (0, 0.25, [1.0, 1.5])
+
+
 def test_each_sample_is_judged_by_the_goal_before_it(config: Config, watch: ChainWatch) -> None:
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     seen = sees(config, watch, 1.0, goal_current=(0.1, 0.2, 0.3))

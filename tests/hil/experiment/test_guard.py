@@ -106,8 +106,11 @@ def test_replies_may_be_missing_but_not_too_many_in_a_row(arm: Arm) -> None:
 @pytest.mark.parametrize(
     ("missing", "said"),
     [
-        ((False, True), "Check its cable and its supply."),
-        ((True, True), "No servo was heard: check the adapter, the cables and the supply."),
+        ((False, True), "Requests or replies are lost: check its cable and its supply."),
+        (
+            (True, True),
+            "No servo was heard; requests or replies are lost: check the adapter, the cables and the supply.",
+        ),
     ],
 )
 def test_silence_of_all_servos_points_to_what_they_share(arm: Arm, missing: tuple[bool, bool], said: str) -> None:
@@ -160,7 +163,7 @@ def test_silence_on_a_computer_that_was_late_before_names_it_too(arm: Arm) -> No
     assert number == round(400 * arm().safety.late_time), "as for missed deadlines"
     guard.look(at(30, STILL))
     guard.woke_up(30 / 400, 0.0011)
-    with pytest.raises(SafetyStop, match=r"Check its cable and its supply.$"):
+    with pytest.raises(SafetyStop, match=r"check its cable and its supply.$"):
         for number in range(31, 60):
             guard.look(at(number, MISSING))
     assert number == 36, "a single servo is itself silent"
@@ -468,6 +471,29 @@ def test_a_current_behind_its_goal_near_no_load_speed_is_the_supplys(
             guard.look(state)
     assert stop.value.cause is cause
     assert ("Lower velocity_limit" in str(stop.value)) == (cause is Cause.OUT_OF_VOLTAGE)
+
+
+@pytest.mark.parametrize(
+    ("carried", "velocity", "lacking", "is_supply"),
+    [
+        (0.1, 4.6, 0.4, True),
+        (0.1, 4.6, 2.0, False),  # explains too little
+        (0.1, 4.6, -0.4, False),
+        (0.1, 1.0, 0.4, False),
+        (0.29, 4.6, 0.4, False),
+    ],
+)
+def test_a_torque_that_the_supply_cannot_drive_explains_what_a_joint_lacks(
+    arm: Arm, carried: float, velocity: float, lacking: float, is_supply: bool
+) -> None:
+    fast = STILL._replace(goal_current=(0.0, 0.3), current=(0.0, carried), velocity=(0.0, velocity))
+    recent = [at(n, fast) for n in range(0, 40, 20)]
+    if is_supply:
+        with pytest.raises(SafetyStop, match=r"carries 0\.100 A .* cannot drive more") as stop:
+            Guard(arm()).look_at_supply(1, lacking, recent)
+        assert stop.value.cause is Cause.OUT_OF_VOLTAGE
+    else:
+        Guard(arm()).look_at_supply(1, lacking, recent)
 
 
 def not_followed(

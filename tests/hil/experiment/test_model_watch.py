@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -164,6 +165,23 @@ def test_friction_that_looks_viscous_over_a_small_motion_is_not_mistaken_for_a_f
         velocity[:, index] = np.round(np.array(plant.velocity) / TICK) * TICK
         current = tuple(wanted / constants)
     assert seen_after(ModelWatch(config, planned(config, torque)), config, torque, position, velocity) == math.inf
+
+
+def test_what_explains_the_lack_of_torque_is_asked_before_the_arm_is_blamed(config: Config) -> None:
+    physics = prior_ensemble(config, 8, seed=7).physics[0]
+    torque = waves(6.0, (0.5, 0.25), 0)
+    position, velocity = motion(config, physics, torque)
+    asked: list[tuple[int, float, bool]] = []
+
+    def explain(joint: int, lacking: float, recent: Sequence[State]) -> None:
+        asked.append((joint, lacking, recent[-1].velocity[joint] * velocity[joint].max() != 0.0))
+        raise SafetyStop("any arm: supply", Cause.UNEXPECTED)
+
+    watch = ModelWatch(config, planned(config, torque), explain=explain)
+    at = fastest(velocity, 3.0)
+    velocity[0, at:] *= -1.0
+    assert seen_after(watch, config, torque, position, velocity) < math.inf
+    assert len(asked) == 1 and asked[0][2] and asked[0][1] != 0.0
 
 
 def test_a_lost_reply_and_a_stall_begin_anew(config: Config) -> None:

@@ -314,10 +314,27 @@ def test_settings_that_do_not_read_back_as_restored_stay_on_file(
     arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch, state_folder: Path
 ) -> None:
     monkeypatch.setattr(SavedSettings, "put_back", lambda *_: {})
-    said = r"ID 1.* and .*ID 2.* could not be restored\. .*they are unverified.* restores them from 2 files"
+    said = r"ID 1.* and .*ID 2.* could not be restored\. .*another program writes to it.* restores them from 2 files"
     with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
         pass
     assert len(list(state_folder.rglob("*.json"))) == 2
+
+
+def test_a_goal_that_another_program_keeps_writing_is_named_with_its_value(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    restore = SavedSettings.put_back
+
+    def put_back(session: SavedSettings, joints: Iterable[Joint]) -> dict[Joint, DriverError]:
+        failed = restore(session, list(joints))
+        servo = bench.servos[2]
+        servo.memory.store(servo.model.registers["Goal Current"], -36)
+        return failed
+
+    monkeypatch.setattr(SavedSettings, "put_back", put_back)
+    said = r"'elbow'.*Goal Current reads -36 after 1193 was restored .*another program writes to it.* End that program"
+    with pytest.raises(ExperimentError, match=said), servo_session(arm(SHORT)):
+        pass
 
 
 def test_a_pilot_writes_each_eeprom_register_twice(tmp_path: Path, bench: Bench) -> None:
@@ -347,3 +364,9 @@ def test_a_stop_between_two_runs_says_that_torque_is_off(
     (note,) = raised.value.__notes__
     assert note.startswith(f"Torque is off on {'both' if runs else 'all'} servos") and "reading it back" in note
     assert ("has not switched it on" in note) is (runs == 0)
+
+
+def test_another_master_before_torque_was_switched_on_leaves_a_word_about_torque(arm: Arm, bench: Bench) -> None:
+    with pytest.raises(BusShared) as stop, servo_session(arm(SHORT)):
+        raise BusShared("Another master")
+    assert any("this command has not switched it on" in note for note in stop.value.__notes__)
