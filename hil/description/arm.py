@@ -68,6 +68,16 @@ class Body:
         return bool(moments[0] >= -1e-12 and moments[2] <= (moments[0] + moments[1]) * (1 + 1e-6) + 1e-12)
 
 
+MOST_LINKS = 500
+"""Largest number of links that a description may have: no arm has so many, and its tree is walked recursively."""
+
+
+def check_size(links: int, path: Path) -> None:
+    """Raise ArmFileError if a description has more than `MOST_LINKS` links."""
+    if links > MOST_LINKS:
+        raise ArmFileError(f"{path} has {links} links; at most {MOST_LINKS} are read")
+
+
 @dataclass(frozen=True)
 class ArmJoint:
     """A revolute joint and the link that it moves."""

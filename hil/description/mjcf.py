@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.description.arm import ArmDescription, ArmFileError, ArmJoint, Array, Body
+from hil.description.arm import ArmDescription, ArmFileError, ArmJoint, Array, Body, check_size
 from hil.description.motion import rotation_about
 from hil.description.urdf import check_units
 
@@ -107,9 +107,11 @@ def _compiled(path: Path) -> Any:
     except ImportError as error:
         raise ArmFileError(f"{path}: reading MJCF needs MuJoCo: pip install 'hil[mujoco]', or give a URDF") from error
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise ArmFileError(f"{path}: MuJoCo cannot read it: {error}") from error
+    check_size(int(model.nbody), path)
+    return model
 
 
 @dataclass(frozen=True)

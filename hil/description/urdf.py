@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.description.arm import ArmDescription, ArmFileError, ArmJoint, Array, Body
+from hil.description.arm import ArmDescription, ArmFileError, ArmJoint, Array, Body, check_size
 
 MOST_LENGTH = 3.0  # m from joint to joint; a larger value suggests millimetres
 MOST_MASS = 100.0  # kg per link; a larger value suggests grams
@@ -105,6 +105,7 @@ def parse_urdf(path: Path) -> ET.Element:
 
 def _links(root: ET.Element, path: Path) -> tuple[dict[str, Body], dict[str, bool]]:
     bodies: dict[str, Body] = {}
+    check_size(len(root.findall("link")), path)
     for element in root.findall("link"):
         name = _name(element, "link", path)
         if name in bodies:
