@@ -45,7 +45,10 @@ many cycles late is recognised by its length.
 """
 
 _AGAIN_SHARE = 0.5
-"""Largest fraction of a cycle by which a second read-back, after a lost one, may delay the next cycle."""
+_SHORT_CYCLE_S = 0.005
+"""In cycles of up to `_SHORT_CYCLE_S` [s], a lost read-back is repeated at once, which may delay the next cycle by the
+share `_AGAIN_SHARE` of one. In longer ones, read-backs are rarely destroyed, and a delay leaves joints unobserved.
+"""
 
 _LONGEST_REPLY = 1024
 _DOUBTS = 3
@@ -150,7 +153,7 @@ class Exchange:
         """Duration of the latest cycle [s]."""
         self._usual = self._latest_plan = self._plans[0]
         self._read_back: ReadBack | None = None
-        self._longest_again = _AGAIN_SHARE * interval
+        self._longest_again = _AGAIN_SHARE * interval if interval <= _SHORT_CYCLE_S else 0.0
         self._asked_again_at = -math.inf
         self._damaged = False
         """Whether anything arrived in reply to the latest read-back."""

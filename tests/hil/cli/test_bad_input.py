@@ -94,7 +94,7 @@ CASES: list[tuple[str, int, str]] = [
     ("check typo.toml", 2, "peak_torqe"),
     ("dry-run typo.toml", 2, "peak_torqe"),
     ("identify no_joints.toml", 2, "joints"),
-    ("identify twice.toml", 2, "IDs 1, 1"),
+    ("identify twice.toml", 2, "two joints have the same id 1"),
     ("identify model.toml", 2, "XM999"),
     ("check baud.toml", 2, "1234567"),
     ("identify band.toml", 2, "band"),

@@ -78,7 +78,7 @@ COLUMNS = (
         (CSV, COLUMNS.replace('"deg"', '"turns"'), 2, "are these degrees or encoder"),
         (CSV, COLUMNS.replace('time = "t"', 'time = "t"\ntime_unit = "ms"'), 2, "jumps by"),
         (CSV, "[arm]\ngravity = 9.81\n", 2, "columns.torque_constant is missing"),
-        (CSV.replace("\n0.50,", "\n0.50,x"), COLUMNS, 2, "column 'q1' is not a number"),
+        (CSV.replace("\n0.50,", "\n0.50,x"), COLUMNS, 2, "column 'q1' is 'x34.2899'; it must be a finite number"),
         (CSV.replace("\n0.50,", "\n0.50,1,"), COLUMNS, 2, "6 fields for 5 columns"),
         (CSV.replace(",0.1\n", ",nan\n"), COLUMNS, 2, "holds no numbers at all"),
         (CSV[:300], COLUMNS, 2, "fields for 5 columns"),

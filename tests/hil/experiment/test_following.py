@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 from random import Random
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -56,17 +55,16 @@ def test_a_healthy_motor_is_never_stopped(rate: int, seed: int, noise: float, ga
     follow = Following(config, planned, 0.3, 0.05)
     random = Random(seed)
     waves = [(random.uniform(0.1, min(5.0, rate / 4.1)), random.uniform(0, math.tau)) for _ in range(8)]
-    held = np.arange(10 * rate) / rate
-    goals = [0.0, *(planned / 4 * sum(np.sin(math.tau * f * held + phase) for f, phase in waves)).tolist()]
-    # Measured right after the write: mainly the previous goal, and hardly any of the newest one.
-    share = 1.0 if lag < 1e-6 else 1.0 - math.exp(-0.2e-3 / lag)
 
     def goal(now: float) -> float:
-        return goals[round(now * rate) + 1]
+        held = math.floor(now * rate + 1e-9) / rate
+        return planned / 4 * sum(math.sin(math.tau * f * held + phase) for f, phase in waves)
 
-    def carried(newest: float, now: float) -> float:
-        former = goals[round(now * rate)]
-        return gain * (former + share * (newest - former)) + random.gauss(0.0, noise * planned)
+    def carried(_: float, now: float) -> float:
+        # Measured right after the write: mainly the previous goal, and hardly any of the newest one.
+        former = goal(now - 1 / rate) if now > 0 else 0.0
+        share = 1.0 if lag < 1e-6 else 1.0 - math.exp(-0.2e-3 / lag)
+        return gain * (former + share * (goal(now) - former)) + random.gauss(0.0, noise * planned)
 
     assert seen_after(follow, rate, goal, carried) == math.inf
 

@@ -95,6 +95,9 @@ class Checks:
     def clamp(self, wanted: list[float]) -> list[float]:
         return list(wanted)
 
+    def look_at_supply(self, *_: Any) -> None:
+        pass
+
     def woke_up(self, now: float, late: float) -> None:
         self.calls.append(("woke up", round(now, 6), round(late, 6)))
 
