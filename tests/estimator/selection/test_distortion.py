@@ -19,7 +19,7 @@ Recorder = Callable[[Arm, Multisine], SettledPeriod]
 
 @pytest.fixture(scope="module")
 def odd_wave() -> Multisine:
-    return design_multisine(400.0, 10.0, detecting_lines(10.0, (0.1, 5.0), 2, 1), (0.8, 0.42), 1)
+    return design_multisine(400.0, 10.0, detecting_lines(10.0, (0.1, 5.0), 2, 1), (0.8, 0.42), 3)
 
 
 def changed(arm: Arm, **terms: float) -> Arm:

@@ -28,9 +28,12 @@ PEAK = (0.2,)
 
 @pytest.fixture(scope="module")
 def cogging_period(pendulum: Arm, recorded: Recorder, wave: Wave) -> SettledPeriod:
-    """The motion of a pendulum whose cogging is 1.4 % of its gravity torque."""
+    """The motion of a pendulum whose cogging is 1.4 % of its gravity torque.
+
+    Optimised phases differ between processors, and with some of them other terms take the cogging's place.
+    """
     drive = pendulum.drives[0].model_copy(update={"cogging": 0.002, "cogging_cycles": 4.0})
-    return recorded(pendulum.model_copy(update={"drives": (drive,)}), wave(1, PEAK))
+    return recorded(pendulum.model_copy(update={"drives": (drive,)}), wave(4, PEAK))
 
 
 def test_cogging_is_found_and_named(pendulum: Arm, cogging_period: SettledPeriod) -> None:
