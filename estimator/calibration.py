@@ -1,4 +1,4 @@
-"""Torque constants from a known mass: one likelihood of two settled periods, without and with the mass.
+"""Torque constants from a known mass, by maximum likelihood over two settled periods, without and with the mass.
 
 Every parameter of a joint scales with its torque constant, so a single experiment cannot determine the constant. A mass
 M bolted to the last link at a known distance changes the arm's parameters by amounts that are known in kilograms and
@@ -145,7 +145,7 @@ def calibrate(
 
 
 class _TwoRuns:
-    """Residuals of both periods as a function of log factors, the parameters' coordinates and two initial states."""
+    """Residuals of both periods as a function of log factors, parameter coordinates and two initial states."""
 
     def __init__(
         self,
@@ -187,7 +187,7 @@ class _TwoRuns:
         )
 
     def evaluate(self, x: Array) -> Quadratic:
-        """Return the sum of squares at `x` with its normal equations, by finite differences."""
+        """Return the sum of squares at `x`, with normal equations from finite differences."""
         here = self.residual(x)
         jacobian = np.empty((here.size, x.size))
         difference = self._options.difference

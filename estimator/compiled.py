@@ -1,4 +1,4 @@
-"""Compiled loops whose cache on disk is invalidated by a change in any code or constant compiled into them.
+"""Compiled loops with a disk cache that any change in the code or constants compiled into them invalidates.
 
 numba stores compiled code next to the source and checks only the date of that one file. Functions inlined from other
 modules, and constants taken from them, could therefore be older than their sources; and if a file changes while a
@@ -32,9 +32,9 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
 def only_version(dispatcher: Any) -> Any:
     """Return the machine code of a compiled function that has been called with arguments of one set of types.
 
-    Calling it skips the lookup of the arguments' types, which takes 0.1 us per array: as long as a small loop itself
-    takes. Use it only where the arguments' types never change. Without a compiler (NUMBA_DISABLE_JIT), and if there are
-    several versions, the function is returned as it is.
+    Calling it skips the lookup of the argument types, which takes 0.1 us per array: as long as a small loop itself. Use
+    it only where the arguments' types never change. Without a compiler (NUMBA_DISABLE_JIT), and if there are several
+    versions, the function is returned unchanged.
     """
     versions = list(getattr(dispatcher, "overloads", {}).values())
     return versions[0].entry_point if len(versions) == 1 else dispatcher
@@ -70,7 +70,7 @@ def _plain(value: Any) -> Any:
 
 
 def _options(function: Any) -> str:
-    """Return the options that a function is compiled with; empty for one that is not."""
+    """Return the options with which a function is compiled; empty if it is not compiled."""
     options = getattr(function, "targetoptions", {})
     return repr(sorted((name, sorted(each) if isinstance(each, set) else each) for name, each in options.items()))
 
@@ -101,10 +101,10 @@ def _used(function: FunctionType) -> Iterator[tuple[str, Any]]:
 
 
 def _is_own(value: Any) -> bool:
-    """Whether a value is a constant or defined in this package."""
+    """Return whether a value is a constant or is defined in this package."""
     return not callable(value) or getattr(_plain(value), "__module__", "").startswith(PACKAGE)
 
 
 def _shown(value: Any) -> str:
-    """Return a constant as text; different constants give different texts."""
+    """Return a text that identifies a constant; different constants give different texts."""
     return repr(value.tolist()) if isinstance(value, np.ndarray) else repr(value)

@@ -68,8 +68,8 @@ def identify(
         periods: one settled period, or several of the same arm, which are fitted together.
         model: the model to fit.
         coarse: whether to stop early if the residual is well above the noise, which suffices to compare models.
-        starts: parameters by name [SI], from another experiment or similar arms, used only as additional initial
-            guesses.
+        starts: additional initial guesses, parameters by name [SI], such as those from another experiment or similar
+            arms.
         near: point known to be close to a minimum, used as the only initial guess, which is much faster.
         options: tolerances and limits of the likelihood.
 

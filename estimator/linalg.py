@@ -1,5 +1,4 @@
-"""numpy's linear algebra and scipy's least squares for the estimator: if they fail, they raise an error of the
-estimator.
+"""numpy's linear algebra and scipy's least squares for the estimator, with failures raised as estimator errors.
 
 Matrices that are not finite, because a simulated motion diverged or a parameter lost its effect, make decompositions
 fail with numpy's LinAlgError. Callers of an estimate do not handle it: a search over models would stop with a traceback
@@ -33,7 +32,7 @@ __all__ = [
 ]
 
 NOT_FINITE = re.compile(r"not finite|infs or NaNs")
-"""Text of scipy's ValueErrors about values that are not finite; other ValueErrors are the caller's mistakes."""
+"""Text of scipy's ValueErrors about values that are not finite; other ValueErrors are the caller's fault."""
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")

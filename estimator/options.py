@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class IntegrationOptions:
-    """Options of the simulation in `hil.estimator.simulation.arm`."""
+    """Options for the simulation in `hil.estimator.simulation.arm`."""
 
     max_step: float = 0.85e-3
     """Longest integration step [s]."""
@@ -20,7 +20,7 @@ class IntegrationOptions:
 
 @dataclass(frozen=True)
 class MinimiserOptions:
-    """Options of Levenberg-Marquardt, for coordinates of order 1."""
+    """Options for Levenberg-Marquardt with coordinates of order 1."""
 
     max_iterations: int = 150
     max_step: float = 2.0
@@ -35,7 +35,7 @@ class MinimiserOptions:
 
 @dataclass(frozen=True)
 class SegmentedMinimiserOptions:
-    """Options of Levenberg-Marquardt with additional unknowns per segment."""
+    """Options for Levenberg-Marquardt with additional unknowns per segment."""
 
     max_iterations: int = 80
     max_step: float = 2.0
@@ -49,7 +49,7 @@ class SegmentedMinimiserOptions:
 
 @dataclass(frozen=True)
 class CoordinateOptions:
-    """Options of the likelihood's coordinates, which keep parameters in their range."""
+    """Options for the likelihood's coordinates, which keep parameters in range."""
 
     width_floor: float
     """Lower bound of the width of every smoothed Coulomb step [rad/s]."""
@@ -74,18 +74,17 @@ class CoordinateOptions:
 
 @dataclass(frozen=True)
 class LinearOptions:
-    """Options of stage 1, the regression on Fourier lines."""
+    """Options for stage 1, the regression on Fourier lines."""
 
     coulomb_width: float = 0.05
-    """Width of the smoothed Coulomb step [rad/s]: about the error that omitted lines cause in a sticking joint's
-    velocity.
+    """Width of the smoothed Coulomb step [rad/s]: roughly the velocity error of a sticking joint due to omitted lines.
     """
     max_condition: float = 1e8
 
 
 @dataclass(frozen=True)
 class CovarianceOptions:
-    """Options of the standard errors for correlated residuals."""
+    """Options for the standard errors under correlated residuals."""
 
     max_lag: int = 400
     """Maximum lag [samples]."""
@@ -99,21 +98,21 @@ class CovarianceOptions:
 
 @dataclass(frozen=True)
 class LikelihoodOptions:
-    """Options of stage 2, the maximum likelihood estimation from settled periods.
+    """Options for stage 2, maximum likelihood estimation from settled periods.
 
     Sums of squares are in units of the noise variance: 1 per sample is noise alone.
     """
 
     ftol: float = 1e-5
-    """Final tolerance; the remaining gain corresponds to a tenth of a standard error, over all parameters together."""
+    """Final tolerance; the remaining decrease corresponds to a tenth of a standard error over all parameters."""
     ftol_refine: float = 3e-4
-    """Tolerance while candidate minima are compared."""
+    """Tolerance for comparing candidate minima."""
     ftol_start: float = 3e-3
     """Tolerance of the fit from one initial guess."""
     ftol_coarse: float = 2e-2
     """Tolerance if only the neighbourhood of a minimum is needed: in a coarse fit and in the tracking fit."""
     ftol_state: float = 0.1
-    """Tolerance of the fit of the initial state alone."""
+    """Tolerance for fitting the initial state alone."""
 
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=1e-4)
     """A width at its lower bound of 1e-4 rad/s cannot be distinguished from stiction; a width of 3e-4 rad/s differs
@@ -125,9 +124,9 @@ class LikelihoodOptions:
     """Coarse steps: accurate to a few hundredths of an encoder step, in a third of the time of fine ones."""
     covariance: CovarianceOptions = CovarianceOptions()
     least_inflation: float = 2.0
-    """Factor by which the data's variance must exceed that of independent errors for priors to be given more weight."""
+    """Factor by which the data's variance must exceed that of independent errors for priors to gain weight."""
     least_tempering: float = 1e-4
-    """Minimum relative increase of the sum of squares for which the fit is repeated with priors of greater weight."""
+    """Minimum relative increase of the sum of squares for which the fit is repeated with the heavier priors."""
 
     initial_widths: tuple[float, ...] = (0.005, 0.05)
     """Initial widths of the smoothed Coulomb step [rad/s], all of which are tried.
@@ -142,7 +141,7 @@ class LikelihoodOptions:
     """Scale of the initial angles [rad]."""
 
     tracking_frequency: float = 2.0
-    """Natural frequency of the springs that pull each joint to the measured motion in the tracking fit [Hz].
+    """Natural frequency of the springs that pull each joint towards the measured motion in the tracking fit [Hz].
 
     An arm that swings past the upright pose amplifies parameter errors, so it is first held to the measured motion.
     """
@@ -151,9 +150,7 @@ class LikelihoodOptions:
     this factor.
     """
     horizons: tuple[float, ...] = (0.125, 0.25, 0.5)
-    """Lengths of the initial parts of a run that are fitted before the whole, as fractions of the run, in this
-    order.
-    """
+    """Initial parts of a run to fit, in this order, before the whole run, as fractions of its length."""
     min_horizon_samples: int = 10
     """Minimum number of samples per unknown, over all joints; a shorter beginning is skipped."""
 
@@ -176,9 +173,7 @@ class LikelihoodOptions:
     hopeless_cost: float = 2.0
     """Cost per sample above which a coarse fit is abandoned."""
     refine_ratio: float = 1.01
-    """A candidate with up to this multiple of the best sum of squares may still reach a lower one when it is
-    refined.
-    """
+    """A candidate with up to this multiple of the best sum of squares may still reach a lower one when refined."""
     outlier_threshold: float = 4.0
     """Residual in standard deviations above which a sample is downweighted; rounding alone stays below 1.7."""
     threads: int = 8
@@ -187,18 +182,18 @@ class LikelihoodOptions:
 
 @dataclass(frozen=True)
 class ShootingOptions:
-    """Options of multiple shooting, which fits any recording."""
+    """Options for multiple shooting, which fits any recording."""
 
     ftol: float = 3e-5
     ftol_refine: float = 1e-3
-    """Tolerance of the fits between which segments are downweighted."""
+    """Tolerance of the fits after each downweighting of segments."""
     ftol_start: float = 1e-2
     """Tolerance of the fits that only need to come close to a minimum."""
     max_step: float = 1e-3
     """Longest integration step of the last fit [s]."""
     coarse_step: float = 2.6e-3
-    """Longest integration step of the earlier fits [s], which are three times as fast and off by hundredths of a
-    standard error.
+    """Longest integration step of the earlier fits [s]: three times as fast, with errors of hundredths of a standard
+    error.
     """
     start_segments: int = 80
     """Maximum number of segments, evenly spread, in the fits that only need to come close to a minimum."""
@@ -223,7 +218,7 @@ class ShootingOptions:
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """Options of the combined likelihood of two periods, without and with a known mass."""
+    """Options for the combined likelihood of two periods, without and with a known mass."""
 
     ftol: float = 1e-6
     coordinates: CoordinateOptions = CoordinateOptions(width_floor=3e-4)
@@ -240,7 +235,7 @@ class CalibrationOptions:
 
 @dataclass(frozen=True)
 class SettlingOptions:
-    """Options of a simulation that continues until the motion is periodic."""
+    """Options for a simulation that continues until the motion is periodic."""
 
     max_periods: int = 50
     atol: float = 1e-7
@@ -251,7 +246,7 @@ class SettlingOptions:
 
 @dataclass(frozen=True)
 class SelectionOptions:
-    """Options for choosing a friction model by held-out error."""
+    """Options for selecting a friction model by held-out error."""
 
     keep_ratio: float = 0.98
     """A richer model is kept only if its error is below this fraction of the error of the best model so far."""
@@ -260,12 +255,11 @@ class SelectionOptions:
     explained_residual: float = 1.02
     """RMS residual in units of the noise below which no further term is tried."""
     near_residual: float = 5.0
-    """If the RMS residual, in units of the noise, is below this, a richer model's minimum is searched for near the
-    simpler one's.
+    """RMS residual in units of the noise below which a richer model's minimum is searched for near the simpler one's.
     """
     steady_residual: float = 5.0
-    """RMS residual in units of the noise below which a change of friction is searched for: a worse model may
-    imitate such a change.
+    """RMS residual in units of the noise below which a change of friction is searched for, since a worse model may
+    imitate one.
     """
     presliding_residual: float = 1.2
     """RMS residual in units of the noise above which a fit with presliding is tried; such fits are slow."""
@@ -280,14 +274,12 @@ class SelectionOptions:
     model's.
     """
     wave_cycles: tuple[float, ...] = tuple(0.5 * n for n in range(6, 33)) + tuple(float(n) for n in range(17, 41))
-    """Numbers of ripple and cogging cycles per turn that are tried."""
+    """Numbers of ripple and cogging cycles per turn to try."""
     max_wave_peaks: int = 3
     """Maximum number of spatial frequencies (cycles per turn) from which fits with ripple or cogging start."""
     wave_evidence: float = 0.05
-    """Ripple or cogging is tried if the evidence in the score test is at least this.
-
-    The threshold is lenient because the test only finds the wave's period roughly; a fit that includes the wave
-    explains more.
+    """Minimum evidence in the score test for ripple or cogging to be tried. The threshold is lenient because the test
+    finds the wave's period only roughly; a fit that includes the wave explains more.
     """
     prune_levels: tuple[float, ...] = (1e-3, 0.1)
     """Significance levels for removing terms, tried in turn until the reduced model explains the motion equally well.

@@ -1,9 +1,9 @@
-"""Other methods on the same settled period, each tuned and timed, for comparison.
+"""Comparison with other methods on the same settled period, each tuned and timed.
 
-All methods receive the same positions and commands. Their torque is the command, delayed by the delay found in hil's
-stage 1, so that none of them has to estimate it. The settings of each method (cut-off, width of the smoothed Coulomb
-step, process noise) are tuned by trying several and keeping those whose simulation is closest to the recording; only
-the run time with these settings counts.
+All methods receive the same positions and commands. Their torque is the command with the delay from hil's stage 1, so
+that none of them has to estimate it. The settings of each method (cut-off, width of the smoothed Coulomb step, process
+noise) are tuned by trying several and keeping those whose simulation is closest to the recording; only the run time
+with these settings is reported.
 """
 
 import time
@@ -40,7 +40,7 @@ class Peer:
 
     name: str
     parameters: dict[str, float]
-    """Base parameters, and any others that its simulation needs, by name [SI]."""
+    """Base parameters, and any others needed to simulate the result, by name [SI]."""
     std: dict[str, float]
     """Standard errors as reported by the method, by name [SI]."""
     seconds: float

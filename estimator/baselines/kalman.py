@@ -93,7 +93,7 @@ def fit_by_kalman(
 
 
 def _scales(names: tuple[str, ...], start: Array) -> Array:
-    """Return for each parameter the largest magnitude among parameters of its kind, as its scale."""
+    """Return the scale of each parameter: the largest magnitude among parameters of its kind."""
     groups = dict.fromkeys(("coupling", "armature"), "inertia") | dict.fromkeys(TORQUES, "torque")
     kinds = [groups.get(name.split("_")[0], name.split("_")[0]) for name in names]
     largest = {kind: max(abs(v) for v, k in zip(start, kinds, strict=True) if k == kind) for kind in kinds}
@@ -103,7 +103,7 @@ def _scales(names: tuple[str, ...], start: Array) -> Array:
 def _accelerations(p: Any, width: float, q1: float, q2: float, v1: float, v2: float, t1: float, t2: float) -> Any:
     """Return the accelerations for the twelve constants `p`.
 
-    The determinant is bounded below, so that they stay finite if a filter's parameters leave the physical range.
+    The determinant is bounded below to keep them finite if a filter's parameters leave the physical range.
     """
     across = p[1] * np.cos(q2)
     turning = p[1] * np.sin(q2)
@@ -119,7 +119,7 @@ def _accelerations(p: Any, width: float, q1: float, q2: float, v1: float, v2: fl
 
 
 def _advance(x: Any, t1: float, t2: float, dt: float, substeps: int, p: Any, width: float, joints: int) -> None:
-    """Advance the angles and velocities at the head of `x` by `dt` with the classical Runge-Kutta method."""
+    """Advance the angles and velocities (first elements of `x`) by `dt` with the classical Runge-Kutta method."""
     q1, v1 = x[0], x[joints]
     q2 = x[1] if joints == 2 else 0.0
     v2 = x[joints + 1] if joints == 2 else 0.0
@@ -154,7 +154,7 @@ def _constants(x: Any, scale: Any, slots: Any, fixed: Any, joints: int, p: Any) 
 
 
 def _correct(x: Any, P: Any, R: Any, measured: Any) -> None:
-    """Apply a position sample, one joint after the other, since their errors are independent."""
+    """Update `x` and `P` with a position sample, joint by joint, since the joints' errors are independent."""
     n = x.size
     for j in range(measured.size):
         s = P[j, j] + R[j]
@@ -170,7 +170,7 @@ def _correct(x: Any, P: Any, R: Any, measured: Any) -> None:
 
 
 def _root(P: Any) -> Any:
-    """Return the lower triangular root of a covariance that rounding errors may have made slightly indefinite."""
+    """Return the lower triangular root of a covariance, which rounding may have made slightly indefinite."""
     n = P.shape[0]
     root = np.zeros((n, n))
     for j in range(n):

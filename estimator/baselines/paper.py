@@ -1,7 +1,7 @@
 """The method of Zhu et al. on their own arm: as printed, and by maximum likelihood on the same Fourier coefficients.
 
 Zhu, Man, Cao, Zheng, Wang, "Parameter Estimation for Robotic Manipulator Systems", Machines 10 (2022) 392. Numbers in
-parentheses are its equations; docs/paper.md explains them and lists the errors in print.
+parentheses are its equations; docs/paper.md explains them and lists the misprints.
 
 The arm consists of two point masses at the ends of two links, linearised about the hanging pose. As printed, in (16)
 and (17), it obeys the first-order equation q' = A q + B u. The correct form, q'' = A q + B u, never settles without
@@ -60,7 +60,7 @@ class PaperArm:
 
 @dataclass(frozen=True)
 class Excitation:
-    """Torque as a sum of cosines: the harmonics, and the amplitudes per joint."""
+    """Torque as a sum of cosines: harmonics and amplitudes per joint."""
 
     lines: npt.NDArray[np.int64]
     """Harmonics of FUNDAMENTAL (lines,)."""
@@ -87,7 +87,7 @@ def own_lines() -> Excitation:
 
 
 def printed_lines() -> Excitation:
-    """Return the lines of Table 2 for both joints at once, as printed."""
+    """Return the lines of Table 2 as printed, the same for both joints."""
     return Excitation(np.array(LINES), np.array([AMPLITUDES, AMPLITUDES]))
 
 
@@ -111,8 +111,8 @@ def record(arm: PaperArm, excitation: Excitation, order: Order, rate: float, see
 def coefficients(position: Array, excitation: Excitation) -> Complex:
     """Return the complex Fourier coefficients on the lines (2, lines) of one period (2, samples).
 
-    They are those of equations (48) and (60).
-    The mean of the noise, NOISE / 2, only affects line 0, which is not used. Raises ShapeError.
+    See equations (48) and (60). The mean of the noise, NOISE / 2, only affects line 0, which is not used. Raises
+    ShapeError.
     """
     if position.ndim != 2 or position.shape[0] != 2 or position.shape[1] <= 2 * excitation.lines.max():
         raise ShapeError(
@@ -129,8 +129,8 @@ def fit_as_printed(coefficient: Complex, excitation: Excitation, known: PaperArm
 
     Joint i's coefficients obey (s^2 + a1 s + a0) q_i = (b11 s + b10) u1 + (b21 s + b20) u2 for the first-order plant.
     Equations (52) to (58) solve this for joint 1 and (63) to (69) for joint 2, line by line, separately for real and
-    imaginary parts, with the noisy q_i on both sides. Then m1 is obtained from joint 1's six coefficients and m2 from
-    joint 2's, as the masses whose coefficients have the smallest relative error.
+    imaginary parts, with the noisy q_i on both sides. Then m1 is found from joint 1's six coefficients and m2 from
+    joint 2's, as the masses that minimise the coefficients' relative error.
 
     `known` provides lengths and inertias; its masses only set the scale. Noise in the regressors biases the
     coefficients towards zero, however much data there is. Raises ModelError if both joints use the same lines, since
@@ -156,7 +156,7 @@ def fit_as_printed(coefficient: Complex, excitation: Excitation, known: PaperArm
 
 @dataclass(frozen=True)
 class MassEstimate:
-    """The paper's two masses by maximum likelihood."""
+    """Maximum-likelihood estimate of the paper's two masses."""
 
     mass_1: float
     mass_2: float
@@ -203,7 +203,7 @@ def _nearest_masses(found: Array, joint: int, known: PaperArm) -> Array:
 
 
 def _transfer(arm: PaperArm, joint: int) -> Array:
-    """Return a1, a0, b11, b10, b21, b20 of one joint of the first-order plant, (25) to (28)."""
+    """Return a1, a0, b11, b10, b21, b20 of one joint of the first-order plant, equations (25) to (28)."""
     B = linalg.inv(arm.mass_matrix())
     A = -B @ arm.stiffness()
     adjugate = np.array([[-A[1, 1], A[0, 1]], [A[1, 0], -A[0, 0]]]) @ B

@@ -2,8 +2,8 @@
 pose.
 
 This is its corrected form, second order with damping: (s^2 D + s F + K) q = tau on every line, with D and K of the arm
-linearised at (-pi/2, 0). It is valid for small swings without dry friction; for other motions it shows the error of
-linearisation. Zhu et al., Machines 10 (2022) 392, equations (13), (48), (52) to (69); docs/paper.md.
+linearised at (-pi/2, 0). It is valid for small swings without dry friction; for other motions it shows the
+linearisation error. Zhu et al., Machines 10 (2022) 392, equations (13), (48), (52) to (69); docs/paper.md.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class LinearisedEstimate:
     """Base parameters by name [SI]; the friction is purely viscous."""
     std: dict[str, float]
     remark: str
-    """Text that says how far each joint swings about the hanging pose."""
+    """How far each joint swings about the hanging pose, as text."""
 
 
 def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) -> LinearisedEstimate:

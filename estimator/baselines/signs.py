@@ -1,5 +1,4 @@
-"""Detection of reversed columns: torques or positions with the wrong sign, by inverse dynamics for each combination of
-signs.
+"""Detection of torque or position columns with the wrong sign, by inverse dynamics for each combination of signs.
 
 Angles that are measured from a fixed direction instead of from the previous link are detected in the same way.
 
@@ -136,7 +135,7 @@ def suspect_order(recordings: Sequence[Recording], torques: bool = True) -> tupl
 
 
 def _better_explained(recordings: Sequence[Recording], changed: Sequence[Recording]) -> tuple[float, float] | None:
-    """Relative RMS of the torque residual of two joints, worst joint, of the changed recordings and of those given;
+    """Return the worst joint's relative RMS torque residual, first with the changed recordings, then with those given;
     None if the change does not explain them much better.
     """
     as_given = Signs((1, 1), (1, 1))
@@ -148,7 +147,7 @@ def _better_explained(recordings: Sequence[Recording], changed: Sequence[Recordi
 
 
 def _combinations(joints: int) -> Iterator[Signs]:
-    """Yield all reversals, fewest columns first. A mirrored arm is equivalent, so joint 1's position keeps its sign."""
+    """Yield all combinations, fewest reversals first, except mirrored arms: joint 1's position keeps its sign."""
     every = (
         Signs(torque, (1, *position))
         for torque in product((1, -1), repeat=joints)

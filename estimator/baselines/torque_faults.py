@@ -1,5 +1,5 @@
 """Detection of motor torques that differ from the torque column: clipped by the drive, timestamped by a different
-clock, or late in one joint.
+clock, or delayed on one joint.
 
 As in the detection of reversed columns (`hil.estimator.baselines.signs`), the residual of inverse dynamics with the
 torque as given is compared with the residual with a modified torque.
@@ -17,7 +17,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 
 BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
-"""Clipping is tried at the torques that these fractions of the samples exceed."""
+"""Fractions of the samples that exceed the clipping levels to try."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
 LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
@@ -30,7 +30,7 @@ class Clipped:
     """A joint whose torque seems limited to `level` [N m], although the torque column exceeds it in a fraction `beyond`
     of the samples.
 
-    residual, residual_given: relative RMS residual of its torque, with the limit and as given.
+    residual, residual_given: relative RMS of the joint's torque residual, with the limit and as given.
     """
 
     joint: int
@@ -94,8 +94,8 @@ def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
 
 
 def suspect_late(recordings: Sequence[Recording]) -> Late | None:
-    """Return the joint whose torque is not delayed like that of the others, if a delay of its own explains the motion
-    much better than a common delay.
+    """Return the joint whose torque delay differs from that of the others, if a separate delay explains the motion much
+    better than a common one.
     """
     joints = recordings[0].joints
     if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
@@ -154,14 +154,14 @@ def suspect_drift(recordings: Sequence[Recording]) -> ClockDrift | None:
 
 
 def _shifted(recording: Recording, delay: float, relative: float) -> Recording:
-    """Return the recording with its torque delayed by `delay` in the middle, and increasingly so by `relative`."""
+    """Return the recording with its torque delayed by `delay` at mid-recording; it grows at the rate `relative`."""
     time = recording.time
     at = time - delay - relative * (time - 0.5 * (time[0] + time[-1]))
     return replace(recording, torque=np.stack([np.interp(at, time, torque) for torque in recording.torque]))
 
 
 def _residuals(recordings: Sequence[Recording]) -> Array | None:
-    """Relative RMS of the torque residual (joints,); None if inverse dynamics cannot be solved."""
+    """Return the relative RMS of the torque residual (joints,); None if inverse dynamics cannot be solved."""
     try:
         return fit_inverse_dynamics(recordings, CUTOFF, COULOMB_WIDTH).relative_residual
     except EstimationError:

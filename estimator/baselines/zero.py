@@ -21,8 +21,8 @@ SURE = 0.05  # fraction of the largest torque: weaker gravity does not reveal an
 def turned_zeros(recordings: Sequence[Recording]) -> Array | None:
     """Return the angles (joints,) [rad] to add to the recorded ones so that joint 1 is measured from the horizontal.
 
-    None if the recordings give no evidence of a different zero. The torque of gravity is regressed on cosine and sine
-    of the angle.
+    Returns None if the recordings give no evidence of a different zero. The gravity torque is regressed on the cosine
+    and sine of the angle.
     """
     joints = recordings[0].joints
     names = base_names(joints)

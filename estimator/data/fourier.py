@@ -36,9 +36,9 @@ def noise_power(lines: Lines) -> Array:
     """Return the mean |c|^2 of the noise per line (joints,), from the upper half of the lines, which are not
     excited.
 
-    The median of an exponentially distributed power is log 2 times its mean and robust to a few outlying lines. Odd and
-    even lines are evaluated separately: the rounding error of a motion whose second half mirrors its first has no even
-    lines at all.
+    The median of an exponentially distributed power is log 2 times its mean and is robust to a few outlying lines. Odd
+    and even lines are evaluated separately: the rounding error of a motion whose second half mirrors its first has no
+    even lines at all.
     """
     upper = np.abs(lines[:, lines.shape[1] // 2 :]) ** 2
     medians = [np.median(upper[:, first::2], axis=1) for first in (0, 1)]
@@ -71,7 +71,7 @@ def without_jump(position: Array) -> Array:
 
 
 def slow_part(position: Array, lines: int) -> Array:
-    """Return the part of a period (joints, samples) that its first `lines` Fourier lines describe, as samples."""
+    """Return the part of a period (joints, samples) that its first `lines` Fourier lines represent, as samples."""
     kept = np.fft.rfft(position, axis=1)
     kept[:, lines:] = 0.0
     return np.asarray(np.fft.irfft(kept, position.shape[1], axis=1))
@@ -85,7 +85,7 @@ def _upper_noise(position: Array) -> Array:
 
 
 def _interpolated_noise(valid: Mask) -> float:
-    """Return the estimate for white noise with a standard deviation of 1, interpolated except at `valid` (samples,)."""
+    """Return the noise estimated from unit white noise that is interpolated except at `valid` (samples,)."""
     if valid.all() or not valid.any():
         return 1.0
     return float(np.sqrt(np.mean(np.square(_upper_noise(interpolated_noise(valid))))))
@@ -102,7 +102,7 @@ def interpolated_noise(valid: Mask) -> Array:
 
 
 def _jump(position: Array) -> Array:
-    """Return by how much a period (joints, samples) fails to close (joints,), less the motion between two samples.
+    """Return the gap between the ends of a period (joints, samples), less the motion between two samples (joints,).
 
     At low rates a joint moves by many encoder steps from the last sample of a period to the first of the next.
     """

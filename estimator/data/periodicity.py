@@ -63,29 +63,29 @@ def settling_difference(former: Array, latest: Array) -> float:
 class Decay:
     """A change from period to period that decreases by about the same factor each time.
 
-    ratio: that factor. further: number of further periods until the change is within the tolerance.
+    ratio: that factor. further: number of further periods until the change is within tolerance.
     """
 
     ratio: float
     further: int
 
     def is_warming(self, correlation: float) -> bool:
-        """Whether the change looks like friction warming up rather than a transient that has not died out.
+        """Return whether the change looks like friction falling during warm-up rather than a transient.
 
-        Friction that warms up decreases over many periods, so that the motion keeps changing in the same direction. A
+        As the arm warms up, friction decreases over many periods, so the motion keeps changing in the same direction. A
         transient oscillates at the arm's own frequencies, or decays faster. correlation: see `correlation_of_changes`.
         """
         return self.ratio >= SLOWLY and correlation >= ALIKE
 
 
 def decay_of(differences: Sequence[float], within: float) -> Decay | None:
-    """Return how the relative differences of successive periods decrease, and how long it takes until they are at most
+    """Return the decay of the relative differences of successive periods, and how many periods it takes to reach
     `within`.
 
-    None if they do not decrease steadily: a transient only dies out and friction only warms up, whereas backlash, a
-    dragging cable or bumps make the differences irregular.
+    Returns None if the differences do not decrease steadily, as those of a transient or of warm-up do; backlash, a
+    dragging cable or bumps make them irregular.
 
-    differences: in the order of time; the first may contain the transient of the ramp.
+    differences: in chronological order; the first may contain the transient of the ramp.
     """
     falling = list(differences[1:])
     if len(falling) < 2 or not all(math.isfinite(each) and each > 0.0 for each in differences):
@@ -100,7 +100,7 @@ def decay_of(differences: Sequence[float], within: float) -> Decay | None:
 
 
 def correlation_of_changes(position: Array) -> float:
-    """Return the correlation of a period's change with the change before it; -1 for opposite changes.
+    """Return the correlation of a period's change with the previous change; -1 for opposite changes.
 
     position: the three latest periods (3, joints, samples) [rad]. Only the joint whose motion changes most, relative to
     that motion, is considered. As in `settling_difference`, only the second halves are compared. NaN if nothing can be

@@ -28,8 +28,8 @@ class Recording:
     """Torque and position of an arm in arbitrary motion: ramps, swing-ups, recordings by other tools.
 
     Missing positions are NaN. Raises ShapeError for incompatible arrays; RecordingError for times that do not increase,
-    non-finite values, gaps, and values that are implausible in SI units; StandstillError for a joint that moved by
-    hardly more than its encoder step.
+    non-finite values, gaps, and values that are implausible in SI units; StandstillError for a joint that moved by only
+    a few encoder steps.
     """
 
     time: Array
@@ -114,7 +114,7 @@ class Recording:
 def _white_noise(time: Array, row: Array) -> float:
     """Return the standard deviation of white noise [rad], from fourth-order differences of neighbouring samples.
 
-    The median over the recording is used, since motion too fast for a cubic to follow is only a small part of it.
+    The median over the recording is used, since motion too fast for a cubic makes up only a small part of it.
     """
     valid = np.isfinite(row)
     time, row = time[valid], row[valid]

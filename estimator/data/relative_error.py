@@ -1,4 +1,4 @@
-"""Error of a prediction relative to the motion that it predicts."""
+"""Error of a prediction relative to the predicted motion."""
 
 import numpy as np
 

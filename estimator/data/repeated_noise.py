@@ -1,8 +1,8 @@
-"""Noise of the angles from the difference between two passes of the same periodic motion.
+"""Noise of the angles, estimated from the difference between two passes of the same periodic motion.
 
 Whatever repeats with the motion cancels: the motion itself, however fast, and the error of any model of it. What
-remains of a rounded angle depends on its noise. Without noise, both passes are rounded alike and nothing remains; the
-more noise there is before rounding, the more of the rounding error differs as well. With independent Gaussian noise of
+remains of a rounded angle depends on its noise. Without noise, both passes are rounded identically and nothing remains;
+the more noise there is before rounding, the more the rounding errors differ. With independent Gaussian noise of
 standard deviation s, a slow drift d from one pass to the next, and angles spread evenly over the steps, half the mean
 square of the difference at high frequencies is
 
@@ -13,9 +13,9 @@ Widrow and I. Kollar, Quantization Noise, 2008). The drift is the difference at 
 changing friction. Solving for s gives the error variance of one reading, s^2 + 1/12. It is an upper bound, since other
 differences between the passes increase it.
 
-This applies to noise that is white before rounding. Noise that a servo has filtered is stronger at low frequencies. Its
-excess there over the noise at high frequencies is measured from the same difference, except at frequencies at which
-there may be drift (`coloured_noise`).
+This applies to noise that is white before rounding. Noise that a servo has filtered is stronger at low frequencies.
+This excess over the noise at high frequencies is measured from the same difference, except at frequencies that may
+contain drift (`coloured_noise`).
 """
 
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ _ORDERS = np.arange(1, 30)
 _HEIGHTS = 1.0 / (2.0 * np.pi**2 * _ORDERS**2)
 _HEIGHTS *= ROUNDING / _HEIGHTS.sum()  # the series is truncated
 _REPEATS = _HEIGHTS * np.exp(-((2.0 * np.pi * _ORDERS * _STD[:, None]) ** 2))
-"""Power of each order of the rounding error that repeats at each of `_STD`, without drift (stds, orders) [steps^2]."""
+"""Repeating power of each order of the rounding error, for each of `_STD`, without drift (stds, orders) [steps^2]."""
 _SLOW = 1.0 / 16.0  # fraction of the lines that drift may occupy
 _CHANGE = 0.03  # largest relative change of the motion from pass to pass
 _SURE = 3.0  # standard errors by which coloured noise must exceed white noise
@@ -90,8 +90,8 @@ def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
 
 
 def _excess(former: Array, later: Array) -> tuple[float, float]:
-    """Return the power of the difference of two passes (samples,) beyond white noise as in its fast part, and the
-    latter's.
+    """Return the power of the difference of two passes (samples,) in excess of white noise, and that of the white
+    noise.
     """
     difference = later - former
     valid = np.isfinite(difference)
@@ -111,20 +111,20 @@ def _excess(former: Array, later: Array) -> tuple[float, float]:
 
 
 def _spectrum(signal: Array) -> Array:
-    """Return the power of each line of signals (rows, samples), the mean of which is the variance of white noise."""
+    """Return the power of each line of signals (rows, samples); for white noise, its mean is the variance."""
     power: Array = np.square(np.abs(np.fft.rfft(signal, axis=1))) / signal.shape[1]
     return power
 
 
 def _fastest(power: Array) -> int:
-    """Return the first line of the fastest quarter of a spectrum (rows, lines)."""
+    """Return the index of the first line in the upper quarter of a spectrum (rows, lines)."""
     lines: int = power.shape[1]
     return 3 * lines // 4
 
 
 def _beyond_fast(power: Array, slow: int) -> Array:
-    """Return the power of signals beyond that of white noise as in their fastest quarter (rows,); power: their spectrum
-    (rows, lines), whose first `slow` lines may contain more than noise.
+    """Return the power of signals in excess of white noise at the level of their upper quarter (rows,); power: their
+    spectrum (rows, lines), whose first `slow` lines may contain more than noise.
     """
     fastest = _fastest(power)
     fast, above = power[:, fastest:].mean(axis=1), power[:, slow : 2 * slow].mean(axis=1)
@@ -165,8 +165,8 @@ def _power(difference: Array) -> Array:
 def _not_drifted(difference: Array, differs: Array) -> Array:
     """Return the fraction (joints, orders) of each order of the rounding error that repeats despite drift.
 
-    difference: between two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,); a fraction of it
-    is noise in the estimated drift, whose effect is divided out.
+    difference: difference of two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,); a fraction of
+    it is noise in the estimated drift, whose effect is divided out.
     """
     filled = _filled(difference)
     closed = without_jump(filled)
@@ -178,8 +178,8 @@ def _not_drifted(difference: Array, differs: Array) -> Array:
 
 
 def _repeating(differs: float, kept: Array) -> float:
-    """Return the power of the rounding error that repeats [steps^2], where half the mean square of the difference is
-    `differs` [steps^2] and drift leaves the fractions `kept` (orders,) of each order.
+    """Return the repeating power of the rounding error [steps^2]; differs: half the mean square of the difference
+    [steps^2]; kept: fraction of each order that drift leaves (orders,).
     """
     repeats = _REPEATS @ kept
     return float(np.interp(differs, np.maximum.accumulate(_STD**2 + ROUNDING - repeats), repeats))

@@ -20,24 +20,24 @@ DIFFERENCE = 1e-7  # s
 
 @dataclass(frozen=True)
 class RecordingSegment:
-    """A piece of a recording on its simulation grid."""
+    """A piece of a recording, on the recording's simulation grid."""
 
     recording: int
-    """Index of its recording."""
+    """Index of the recording."""
     first: int
-    """Grid point at its start."""
+    """Grid point at which the segment starts."""
     steps: int
     """Number of grid steps."""
     index: Indices
-    """Grid points around each of its samples (samples, 4), counted from `first`."""
+    """Grid points around each sample (samples, 4), counted from `first`."""
     weight: Array
     """Weights of the grid points in `index` for cubic interpolation (samples, 4)."""
     position: Array
     """Measured positions (joints, samples) [rad]."""
     state: Array
-    """Angles and velocities at its start, from a local fit (2, joints) [rad, rad/s]."""
+    """Angles and velocities at the segment's start, from a local fit (2, joints) [rad, rad/s]."""
     samples: slice
-    """The recording's samples that belong to it."""
+    """The recording's samples that belong to the segment."""
 
     def at_samples(self, grid: Array) -> Array:
         """Interpolate values on the grid (joints, grid points, ...) at the sampling times (joints, samples, ...)."""

@@ -30,8 +30,8 @@ class SettledPeriod:
     first command is preceded by the last one, as in a periodic signal. Missing samples are NaN.
 
     Raises ShapeError for incompatible arrays; RecordingError for non-finite values, for a rate or position step that is
-    not positive and for a period with too few samples; StandstillError for a joint that moved by hardly more than its
-    encoder step.
+    not positive and for a period with too few samples; StandstillError for a joint that moved by only a few encoder
+    steps.
     """
 
     rate: float
@@ -59,21 +59,21 @@ class SettledPeriod:
     stabiliser: Stabilised | None = None
     """The software stabiliser, if one produced part of `torque`.
 
-    A simulated arm may diverge from the real one without it.
+    Without it, a simulated arm may diverge from the real one.
     """
     before: Array | None = None
     """Angles and velocities one period before the first sample (2, joints) [rad, rad/s], as read by the encoders.
 
-    A motion counts as settled if it differs little from that of the period before; the rest of the transient can be
+    A motion counts as settled if it differs little from the previous period's; the rest of the transient can be
     predicted from this state.
     """
     valid: Mask = field(init=False)
     """Whether each sample was received (joints, samples)."""
     noise: Array = field(init=False)
-    """Standard deviation of one sample's error (joints,) [rad]: the measured white noise, but at least that of
-    rounding, and coloured noise.
+    """Standard deviation of one sample's error (joints,) [rad]: coloured noise, and the measured white noise, but at
+    least that of rounding.
 
-    At a low sampling rate, the highest lines of a motion are not only noise. The part of them that repeats from period
+    At a low sampling rate, the highest lines contain motion as well as noise. The part of them that repeats from period
     to period is then left out.
     """
 
@@ -118,8 +118,8 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
     Two distances of a reading are computed: from the median of itself and two neighbours on either side, and from a
     cubic through its neighbours. It is an outlier if both exceed SPIKE encoder steps and SPIKE times the typical
     distance from the median. At a low sampling rate, the median alone would take every fast reversal for an outlier,
-    since most readings of a steadily moving joint are the median themselves. If more than the fraction MOST_SPIKES of
-    the readings would be outliers, none is: the joint moves fast compared with the sample rate.
+    since most readings of a steadily moving joint are the median themselves. If this applies to more than the fraction
+    MOST_SPIKES of the readings, none is marked: the joint moves fast compared with the sample rate.
     """
     from scipy.ndimage import median_filter
 
@@ -137,7 +137,7 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
 
 
 def _bridged(row: Array, places: Indices, kept: Indices) -> Array:
-    """Return the value at each of `places` of the cubic through the two nearest of the `kept` samples on either side.
+    """Return the cubic through the two nearest `kept` samples on either side, evaluated at each of `places`.
 
     The row (samples,) is periodic.
     """

@@ -1,1 +1,1 @@
-"""Detection of defects in recordings, which differ in their effect on the residuals."""
+"""Detection of defects in recordings from their effects on the residuals."""

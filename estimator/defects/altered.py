@@ -1,4 +1,4 @@
-"""Fits that determine a defect of the recordings together with the parameters."""
+"""Fits that estimate a defect of the recordings together with the parameters."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -24,8 +24,8 @@ IGNORED = 1e-3  # weight of a segment in which a sudden change happens
 
 @dataclass(frozen=True)
 class AlteredFit:
-    """Result of a fit. values: parameters by name [SI]; unknowns: the unknowns that describe the defect; left: mean
-    square of the residual in units of the noise.
+    """Result of a fit. values: parameters by name [SI]; unknowns: those of the defect; left: mean square of the
+    residual in units of the noise.
     """
 
     values: dict[str, float]
@@ -34,7 +34,7 @@ class AlteredFit:
 
 
 class Altered:
-    """The segments of an estimate, with a defect's unknowns in addition to the parameters."""
+    """Segments of an estimate, with unknowns for a defect in addition to the parameters."""
 
     def __init__(self, recordings: Sequence[Recording], found: ShootingEstimate) -> None:
         self.estimate = estimate = _with_every_friction(found)
@@ -98,8 +98,8 @@ class Altered:
         return np.ones_like(value) if hypothesis.is_absolute else value
 
     def fit(self, hypothesis: Hypothesis | None, near: AlteredFit | None = None) -> AlteredFit:
-        """Fit parameters, zeros and the defect. near: fit with another defect, whose parameters are a further initial
-        guess. Raises ConvergenceError.
+        """Fit parameters, zeros and the defect. near: fit with another defect, used as a further initial guess. Raises
+        ConvergenceError.
         """
         key = None if hypothesis is None else (hypothesis.kind, hypothesis.joints, hypothesis.course)
         if key not in self._fits:
@@ -145,7 +145,7 @@ class Altered:
         )
 
     def _without(self, hypothesis: Hypothesis, unknowns: Array) -> Array | None:
-        """Parameters fitted to the part of the recordings that the defect hardly affects, or to scaled angles."""
+        """Return parameters fitted to rescaled angles, or where the defect hardly affects the recordings."""
         estimate, course = self.estimate, hypothesis.course
         factor = np.ones(estimate.model.joints)
         if hypothesis.kind == "scale":
@@ -189,7 +189,7 @@ class _Posed:
         return value if self._hypothesis is None else self._altered.sizes(self._hypothesis, value)
 
     def begun(self, value: Array, unknowns: Array) -> Array:
-        """Return the shared coordinates of the fit for these parameters and these unknowns of the defect."""
+        """Return the fit's shared coordinates for these parameters and unknowns of the defect."""
         return np.concatenate((self.coordinates.coordinates(value), self._altered.offsets, unknowns))
 
     def minimum(self, shared: Array, own: Array, ftol: float = OPTIONS.ftol_refine) -> Segmented:
@@ -241,21 +241,23 @@ class _Posed:
         return change
 
     def _moved(self, number: int, shared: Array) -> tuple[dict[str, float], Array]:
-        """Parameters by name, and offsets of the zeros, in a segment."""
+        """Return a segment's parameters by name, and the offsets of its zeros."""
         altered, value = self._altered, self._constant(shared)
         value = value + self._sizes(value) * self._change(number, shared)
         count = len(altered.estimate.names)
         return dict(zip(altered.names, value.tolist(), strict=True)), shared[count : count + altered.problem.zeros]
 
     def _factors(self, shared: Array) -> Array:
-        """Measured over true angle of each joint."""
+        """Ratio of measured to true angle for each joint."""
         factor = np.ones(self._altered.estimate.model.joints)
         for joint, change in zip(self._scaled, shared[shared.size - len(self._scaled) :], strict=True):
             factor[joint - 1] += change
         return factor
 
     def _scaled_rows(self, number: int, rows: Array, shared: Array) -> tuple[Array, Array]:
-        """The residual with scaled angles, and the simulated angles in units of the noise; each (joints, samples)."""
+        """Return the residual with scaled angles, and the simulated angles in units of the noise, each (joints,
+        samples).
+        """
         measured = self._altered.measured(number)
         known = np.isfinite(self._altered.problem.segments[number].position)
         angle = np.where(known, rows + measured, 0.0)
@@ -269,7 +271,7 @@ class _Posed:
 
 
 def _with_every_friction(found: ShootingEstimate) -> ShootingEstimate:
-    """The estimate with terms of dry friction that have no effect yet, so that no defect has to imitate them."""
+    """Return the estimate with all terms of dry friction, as yet without effect, so that no defect imitates them."""
     model = replace(found.model, friction=FRICTIONS[-1])
     values = {name: term_of(name).initial for name in model.names} | {
         f"load_{joint}": 0.0 for joint in range(1, model.joints + 1)

@@ -43,7 +43,7 @@ class Course:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A defect to be tested. joints: joints that it affects, counted from 1; empty for the whole arm."""
+    """A defect to be tested. joints: affected joints, counted from 1; empty for the whole arm."""
 
     kind: Kind
     joints: tuple[int, ...]
@@ -57,7 +57,7 @@ class Hypothesis:
 
     @property
     def is_absolute(self) -> bool:
-        """Whether the changes of the parameters are not relative to their values."""
+        """Whether the parameters change by absolute amounts instead of fractions."""
         return self.kind in {"offset", "scale"}
 
     @property
@@ -69,7 +69,7 @@ class Hypothesis:
 def hypotheses(
     recordings: Sequence[Recording], segments: Sequence[RecordingSegment], values: Mapping[str, float], gravity: bool
 ) -> list[Hypothesis]:
-    """Return all defects that are tried. values: parameters by name [SI]; gravity: whether it acts on the arm."""
+    """Return all defects to be tested. values: parameters by name [SI]; gravity: whether it acts on the arm."""
     joints = recordings[0].joints
     always = np.ones(len(segments))
     # Without gravity, the scale of the first joint's angle is that of its inertia and friction.
@@ -111,14 +111,14 @@ def _changes(
 
 
 def _load(joints: int) -> tuple[Direction, ...]:
-    """A mass anywhere on the last link. With two joints, its first and second moments act on the second joint."""
+    """Return the effects of a mass anywhere on the last link; with two joints, its moments act on the second joint."""
     if joints == 1:
         return ({"inertia_1": 1.0}, {"gravity_1": 1.0})
     return ({"inertia_1": 1.0}, {"gravity_1": 1.0}, {"gravity_2": 1.0, "coupling": 1.0}, {"inertia_2": 1.0})
 
 
 def _torque_gain(joint: int, values: Mapping[str, float]) -> Direction:
-    """More torque on the first joint than its column states has the effect of smaller values of everything else."""
+    """Return the effect of a torque above that in the joint's column; for joint 1, all other values appear smaller."""
     if joint > 1:
         return {"torque_scale_2": 1.0}
     less = [name for name in values if term_of(name).unit in TORQUE_UNITS or name == "torque_scale_2"]

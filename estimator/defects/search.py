@@ -1,9 +1,10 @@
-"""The most probable defect of recordings: score tests of many, then fits of the few that explain most.
+"""Search for the most probable defect of recordings: score tests of many, then fits of the best few.
 
 A correct model leaves residuals that do not depend on when they were recorded. If friction, load or torque changed, or
 angles have a wrong scale, additional unknowns explain part of the residual: one simulation with all derivatives gives
 the decrease of the sum of squares for each of them (a score test, as in `hil.estimator.selection.candidates`; for
-changes in time, as by Nyblom, J. American Statistical Association 84 (1989) 223). Those that explain most are fitted.
+changes in time, as by Nyblom, J. American Statistical Association 84 (1989) 223). Those that explain the most are
+fitted.
 """
 
 from collections.abc import Sequence
@@ -48,7 +49,7 @@ class Defect:
 @dataclass(frozen=True)
 class _Score:
     """A hypothesis with the expected sum of squares per sample, the fraction of the residual beyond the noise that it
-    explains, and the evidence for it: above 1 it is significant.
+    explains, and the evidence for it (significant above 1).
     """
 
     hypothesis: Hypothesis
@@ -90,7 +91,7 @@ def _searched(altered: Altered, every: Sequence[Hypothesis]) -> Defect | None:
 
 
 def _is_same(hypothesis: Hypothesis, other: Hypothesis, course: Course) -> bool:
-    """Return whether `other` is the same as `hypothesis` but for its `course`, both being sudden changes."""
+    """Return whether `hypothesis` and `other` are the same sudden change, except that `other` has this `course`."""
     return (
         hypothesis.course.kind == "step"
         and other.course == course
@@ -124,7 +125,7 @@ def _best(
     independent: float,
     near: AlteredFit | None = None,
 ) -> Defect | None:
-    """Return the hypothesis that is most probable when fitted. independent: number of independent samples."""
+    """Fit the `likely` hypotheses and return the most probable one. independent: number of independent samples."""
     found: list[Defect] = []
     for hypothesis in likely:
         with suppress(ConvergenceError):
@@ -170,11 +171,11 @@ class _Linear:
 
     @property
     def independent(self) -> float:
-        """Number of samples, reduced according to the correlation of the residual."""
+        """Number of samples, reduced for the correlation of the residual."""
         return float(self.samples.sum()) / self.colour
 
     def score(self, altered: Altered, hypothesis: Hypothesis, tried: int) -> _Score:
-        """Return the score test of a hypothesis; tried: number of hypotheses that are tested."""
+        """Return the score test of a hypothesis; tried: number of hypotheses tested."""
         base = np.eye(self.gradient.shape[1])[:, self.fitted]
         added = _added(hypothesis, altered, len(base))
         before = self._fall(base, None, hypothesis)
@@ -186,7 +187,7 @@ class _Linear:
         return _Score(hypothesis, max(left - fall, 0.0) / samples, explained, fall / max(float(chance), 1e-300))
 
     def _fall(self, base: Array, added: Array | None, hypothesis: Hypothesis) -> float:
-        """Return the decrease of the sum of squares if the unknowns `base`, and those `added`, are freed."""
+        """Return the decrease of the sum of squares if the unknowns `base` and `added` are freed."""
         used = np.where(hypothesis.used, 1.0, 0.0)
         parts = [(base, used)] if added is None else [(base, used), (added, used * hypothesis.strength)]
         blocks = [[a.T @ np.einsum("s,sij->ij", p * q, self.normal) @ b for b, q in parts] for a, p in parts]

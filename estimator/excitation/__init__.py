@@ -1,1 +1,1 @@
-"""Multisine excitation, and its optimisation to minimise the largest relative standard error."""
+"""Multisine excitation, optimised to minimise the largest relative standard error."""

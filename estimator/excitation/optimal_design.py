@@ -44,7 +44,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Design:
-    """A designed multisine and the plain one scaled to the limits, each with its largest relative standard error."""
+    """The designed multisine, and the plain one scaled to the limits, each with its largest relative standard error."""
 
     multisine: Multisine
     plain: Multisine
@@ -53,8 +53,8 @@ class Design:
 
 
 def smoothed(physics: Physics) -> Physics:
-    """Return the same arm with friction steps at least LEAST_WIDTH wide, which can be simulated faster and has nearly
-    the same optimal excitation.
+    """Return the arm with friction steps at least LEAST_WIDTH wide, which is faster to simulate and has nearly the same
+    optimal excitation.
     """
     vector = physics.vector.copy()
     for joint in (1, 2):
@@ -109,7 +109,7 @@ class DesignProblem:
         return np.maximum(np.abs([known[name] for name in against]), 1e-9)
 
     def shares(self, wave: Multisine) -> Array:
-        """Return the fraction of the limits that each joint uses (joints,), over transient and settled period."""
+        """Return the fraction of its limits that each joint uses (joints,) in transient and settled period."""
         response = self._two_periods(wave)
         limits, pose = self.limits, self.pose
         up = (response.position.max(axis=1) - pose) / (limits.high - pose)
@@ -153,7 +153,7 @@ class DesignProblem:
         return respond(physics, start, wave.torque, wave.rate, self.feedback).position
 
     def _columns(self, wave: Multisine, start: Array, nominal: Array) -> Array:
-        """Return the derivatives of all positions, in units of rounding, with respect to parameters, nuisance
+        """Return the derivatives of all positions, in units of the rounding error, with respect to parameters, nuisance
         parameters and initial state.
         """
         noise = (self.position_step / np.sqrt(12.0))[:, None]
@@ -186,7 +186,7 @@ class DesignProblem:
 
 @one_blas_thread
 def design_optimal(plain: Multisine, problem: DesignProblem, seed: int) -> Design:
-    """Improve `plain`, keeping its lines and period, with respect to the standard errors that `problem` defines.
+    """Reduce the standard errors that `problem` defines, starting from `plain` and keeping its lines and period.
 
     The same seed gives the same wave.
     """
@@ -214,7 +214,7 @@ def design_optimal(plain: Multisine, problem: DesignProblem, seed: int) -> Desig
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A candidate of the search.
+    """A candidate in the search.
 
     shape: log amplitudes at the knots (joints, KNOTS).
     phases: phases of each joint's lines [rad].
@@ -255,7 +255,7 @@ def _times(wave: Multisine, factor: Array) -> Multisine:
 
 
 def _moved(physics: Physics, name: str) -> tuple[Physics, float]:
-    """Return the physics with one constant slightly increased, and the increase."""
+    """Return the physics with the constant `name` slightly increased, and the increase."""
     if name == "lag":
         change = 1e-5
         return Physics(physics.vector, physics.delay, physics.lag + change), change

@@ -1,9 +1,9 @@
 """The step that minimises a convex quadratic function within bounds: a primal active-set method.
 
-The alternative, to clip the unconstrained step and solve again for the coordinates that are still free, would hold some
-coordinates at bounds that are not active at the constrained minimum. In a narrow valley such a step can even lead
-uphill, and an iteration that stops where no decrease is predicted then ends far from the minimum (Nocedal and Wright,
-Numerical Optimization, section 16.5).
+The alternative, clipping the unconstrained step and solving again for the coordinates that remain free, would hold some
+coordinates at bounds that are inactive at the constrained minimum. In a narrow valley such a step can even lead uphill,
+and an iteration that stops where no decrease is predicted then ends far from the minimum (Nocedal and Wright, Numerical
+Optimization, section 16.5).
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ TOLERANCE = 1e-9
 
 
 def bounded_step(matrix: Array, slope: Array, least: Array, most: Array) -> Array:
-    """Return the s (coordinates,) within `least` and `most` that minimises s'Ms / 2 + g's.
+    """Return the step s (coordinates,) within `least` and `most` that minimises s'Ms / 2 + g's.
 
     Every iterate is feasible and no worse than s = 0, so that the result is a descent step even if it is not exact.
 
@@ -53,7 +53,7 @@ def bounded_step(matrix: Array, slope: Array, least: Array, most: Array) -> Arra
 
 
 def _share_until_bound(step: Array, direction: Array, least: Array, most: Array) -> tuple[float, int | None]:
-    """Return the fraction of `direction` that stays within the bounds, and the coordinate that ends it, if any."""
+    """Return the fraction of `direction` within the bounds, and the coordinate that limits it, if any."""
     room = np.where(direction > 0.0, most - step, least - step)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(direction != 0.0, room / direction, np.inf)
@@ -62,7 +62,7 @@ def _share_until_bound(step: Array, direction: Array, least: Array, most: Array)
 
 
 def _wrongly_held(slope: Array, step: Array, most: Array, held: Mask, tolerance: float) -> int | None:
-    """Return the coordinate held at a bound along which the function decreases fastest inwards, or None."""
+    """Return the held coordinate along which the function decreases fastest away from its bound, or None."""
     inwards = np.where(step >= most, slope, -slope)
     inwards = np.where(held, inwards, -np.inf)
     best = int(np.argmax(inwards))

@@ -7,9 +7,9 @@ sum, over all windows of L samples, of the outer product of the window's score w
 pass for any L.
 
 A model error is not only correlated: it repeats at every reversal, so averaging does not remove it, and the part that
-resembles a parameter leaves no residual at all. Therefore the non-white part of the residual widens the errors further:
-1.4 standard deviations cover every change of the parameters that alters the motion (RMS) by no more than that part
-(a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
+resembles the effect of a parameter leaves no residual at all. Therefore the non-white part of the residual widens the
+errors further: 1.4 standard deviations cover every change of the parameters that alters the motion (RMS) by no more
+than that part (a set-membership bound; Milanese and Vicino, Automatica 27 (1991) 997).
 """
 
 from collections.abc import Sequence
@@ -30,9 +30,7 @@ VANISHED = 1e-3  # slope relative to its value below which a parameter has run i
 
 
 class Scatter:
-    """Computes S from a score (samples, coordinates) that is given piece by piece; lags: length of the windows
-    [samples].
-    """
+    """Accumulates S from a score (samples, coordinates) given piece by piece; lags: length of the windows [samples]."""
 
     def __init__(self, causes: int, lags: int) -> None:
         self._lags = lags
@@ -106,14 +104,14 @@ def robust_covariance(
     structured: float = 0.0,
     expected: Array | None = None,
 ) -> Array:
-    """Return the covariance of the first `count` coordinates (count, count) if all coordinates are unknown.
+    """Return the covariance of the first `count` coordinates (count, count), with all coordinates unknown.
 
     It is the larger of the sandwich and the covariance for independent errors, direction by direction, since a short
     recording cannot prove that its errors cancel. It is infinite for a coordinate without influence on the residual.
 
     Args:
         at: the sum of squares at the minimum.
-        scatter: scatter of the score; without it, the errors are taken as independent with variance 1.
+        scatter: scatter of the score; without it, errors are assumed independent with variance 1.
         samples: number of samples.
         count: number of coordinates to return.
         structured: part of the sum of squares that is due to model errors.
@@ -147,7 +145,7 @@ def is_unpredictable(at: Quadratic, samples: int) -> bool:
 
 
 def inflation(at: Quadratic, scatter: Array | None, samples: int, structured: float, expected: Array) -> Array:
-    """Return the factor (coordinates,) by which each coordinate's variance exceeds that under independent errors.
+    """Return the factor (coordinates,) by which each coordinate's variance exceeds that for independent errors.
 
     That is the ratio of the variances from the data alone, with and without the contributions that `robust_covariance`
     adds for correlated errors and model errors. Arguments as in `robust_covariance`.
@@ -165,8 +163,8 @@ def _measured(
 ) -> tuple[Mask, Array, Array, Array]:
     """Return two covariances from the data alone: one for independent errors, and a robust one.
 
-    The mask that is returned first shows which coordinates they cover: those that influence the residual. Both are
-    relative to the scale that is returned next.
+    The mask, returned first, selects the coordinates that they cover: those that influence the residual. Both are
+    relative to the scale, returned second.
     """
     norm = np.sqrt(np.diag(at.normal))
     seen: Mask = norm > 1e-12 * norm.max()
@@ -186,8 +184,8 @@ def _inverse(information: Array) -> Array:
     """Return the inverse of a matrix with diagonal elements of at most 1.
 
     Coordinates that only matter together, such as a constant friction and one that varies beyond the speeds of the
-    motion, leave an eigenvalue that is zero but for rounding. A pseudoinverse would take their difference as known
-    exactly, although it is unknown.
+    motion, leave an eigenvalue that is zero except for rounding. A pseudoinverse would treat their unknown difference
+    as known exactly.
     """
     size, directions = linalg.eigh(information)
     inverse: Array = (directions / np.maximum(size, LEAST_INFORMATION)) @ directions.T

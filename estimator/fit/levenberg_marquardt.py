@@ -113,13 +113,13 @@ def minimise(
 
 
 def step_limits(x: Array, options: MinimiserOptions) -> tuple[Array, Array]:
-    """Return the minimum and maximum change of each coordinate of `x` in one step, if nothing else limits it."""
+    """Return the default minimum and maximum change of each coordinate of `x` in one step."""
     return np.full(x.size, -options.max_step), np.full(x.size, options.max_step)
 
 
 @dataclass
 class _Trials:
-    """Damped steps from one point; `evaluations` counts how often normal equations were computed for them."""
+    """Damped steps from one point; `evaluations` counts the computations of normal equations."""
 
     x: Array
     at: Quadratic
@@ -152,7 +152,7 @@ class _Trials:
         return None, damping
 
     def _bolder(self, moved: Array, gained: float, damping: float, options: MinimiserOptions) -> tuple[Array, float]:
-        """Return the best of successively less damped steps, and its damping."""
+        """Return the best point of successively less damped steps, and its damping."""
         while damping > options.min_damping:
             less = max(options.min_damping, 0.1 * damping)
             further, _ = self._moved(less)
@@ -183,8 +183,8 @@ class _Trials:
 def _step(normal: Array, gradient: Array, damping: float, least: Array, most: Array) -> Array:
     """Return the damped step, with every coordinate's change between `least` and `most`.
 
-    Only the coordinates that reach their limit are held there: scaling the whole step would let an almost flat
-    coordinate, such as the logarithm of a value near zero, stop all others.
+    Only the coordinates that reach their limits are held there: if the whole step were scaled, an almost flat
+    coordinate, such as the logarithm of a value near zero, would stop all others.
     """
     scale = np.sqrt(np.diag(normal))
     scale = np.maximum(scale, 1e-12 * scale.max())

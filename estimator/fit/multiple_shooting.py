@@ -9,8 +9,8 @@ state between them.
 Short segments are fitted first, since they converge even from a poor initial guess; a subset of them suffices to get
 close to the minimum. Longer segments then refine the result, first with coarse integration steps. A segment whose
 residual is larger than usual is downweighted accordingly. An example is a segment in which a joint stuck, which no
-smooth friction law reproduces. With equal weights, the segments that the model explains worst would dominate. The
-typical size of small terms (`Term.spread`) serves as a prior, weighted relative to the residual.
+smooth friction law reproduces; with equal weights, such segments would dominate. The typical size of small terms
+(`Term.spread`) serves as a prior, weighted relative to the residual.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -65,7 +65,7 @@ class ShootingEstimate:
     residual_over_noise: Array
     """RMS residual in units of the noise (joints,)."""
     own: Array
-    """Each segment's state at its start (segments, 2 joints), in units of `Shooting.state_scale`."""
+    """Initial state of each segment (segments, 2 joints), in units of `Shooting.state_scale`."""
     fitted: slice = field(default_factory=lambda: ALL)
     """Which segments of each recording were fitted."""
 
@@ -98,7 +98,7 @@ class Shooting:
     ) -> None:
         """Cut the recordings into segments.
 
-        most: maximum number of segments, evenly spread; by default all. step: longest integration step [s].
+        most: maximum number of segments, evenly distributed; by default all. step: longest integration step [s].
         """
         self._options = options
         self._recordings = recordings
@@ -152,7 +152,7 @@ class Shooting:
         return self._rows(number, position)
 
     def derivative(self, coordinates: Coordinates, number: int, shared: Array, own: Array) -> tuple[Array, Array]:
-        """Return the residual and its derivatives with respect to the shared, then the segment's own coordinates (rows,
+        """Return the residual and its derivatives with respect to the shared coordinates, then the segment's own (rows,
         all).
         """
         count = len(coordinates.names)
@@ -242,7 +242,7 @@ class Shooting:
         return np.stack([(segment.state / self.state_scale).reshape(-1) for segment in self.segments])
 
     def _zeros_of(self, segment: RecordingSegment) -> slice:
-        """Return the indices of a segment's encoder zeros among those of all recordings; empty if they are known."""
+        """Return the indices of a segment's encoder zeros among those of all recordings; empty if not estimated."""
         if not self.zeros:
             return slice(0, 0)
         first = segment.recording * self._model.joints
@@ -339,7 +339,7 @@ def estimate_by_shooting(
 def _from_guesses(
     short: Shooting, long: Shooting, coordinates: Coordinates, model: Model, start: Array, options: ShootingOptions
 ) -> Array:
-    """Return shared coordinates near the best minimum, from several guesses: Stribeck friction causes local minima."""
+    """Return shared coordinates near the best minimum, from several guesses; Stribeck friction causes local minima."""
     ends: list[Segmented] = []
     lost: list[ConvergenceError] = []
     for x in _initial_guesses(short, coordinates, model, start, options):
@@ -412,7 +412,7 @@ def _samples(segment: RecordingSegment) -> Array:
 def _initial_guesses(
     problem: Shooting, coordinates: Coordinates, model: Model, base: Array, options: ShootingOptions
 ) -> Iterator[Array]:
-    """Yield initial shared coordinates: `base`, completed by guesses for friction."""
+    """Yield initial shared coordinates: `base`, completed with guesses for friction."""
     known = dict(zip(model.base_names, base.tolist(), strict=True))
     known |= dict.fromkeys((f"coulomb_width_{joint + 1}" for joint in range(model.joints)), options.initial_width)
     for joint in range(1, model.joints + 1):

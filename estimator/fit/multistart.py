@@ -1,6 +1,6 @@
 """Minimisation of the likelihood from several initial guesses, with coarse integration steps first.
 
-Most iterations use coarse integration steps; fine steps decide between minima that the coarse ones cannot separate. The
+Most iterations use coarse integration steps; fine steps decide between minima that coarse ones cannot separate. The
 noise level of each joint is itself estimated before the final iterations, in which outliers are downweighted (Huber),
 so that a few corrupted readings do no harm.
 """
@@ -38,7 +38,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Refined:
-    """The best fit with fine integration steps, its samples weighted according to its residual."""
+    """The best fit with fine integration steps and samples weighted by the residual."""
 
     weighted: Objective
     outliers: int
@@ -50,11 +50,11 @@ class Refined:
 
 @dataclass(frozen=True)
 class Search:
-    """The search for the most likely parameters for one set of periods."""
+    """Search for the maximum-likelihood parameters of one set of periods."""
 
     periods: Sequence[SettledPeriod]
     fine: Objective
-    """The objective with the integration steps of the result."""
+    """The objective with the (fine) integration steps of the result."""
     rough: Objective
     """The objective with coarse integration steps."""
     options: LikelihoodOptions
@@ -88,7 +88,7 @@ class Search:
         return self._undisguised(refined, replace(minimum, iterations=spent))
 
     def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
-        """Return the minimum without friction terms that the motion cannot separate, unless that explains less."""
+        """Return the minimum with constant Stribeck rises turned into Coulomb friction, unless it explains less."""
         if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
             return refined, minimum
         try:
@@ -113,7 +113,7 @@ class Search:
         return refined, replace(minimum, iterations=found.iterations + refined.iterations + minimum.iterations)
 
     def _multistart(self, guesses: Sequence[Array], springs: Array) -> list[Start]:
-        """Try one guess after the other until the motion is explained. Raises ConvergenceError if none converges."""
+        """Try the guesses in turn until the motion is explained. Raises ConvergenceError if none converges."""
         starts: list[Start] = []
         lost = ConvergenceError("no initial guess was given")
         enough = (self.options.hopeless_cost if self.coarse else 1.0) * self.options.explained_cost * self.samples
@@ -154,11 +154,11 @@ class Search:
         return Start(tracking.x, replace(_best(ends), iterations=spent))
 
     def _refine(self, starts: Sequence[Start], wide: Array) -> Refined:
-        """Refine the best of `starts`, and variants with other friction near standstill, with fine steps.
+        """Refine the best of `starts`, and variants with different friction near standstill, using fine steps.
 
-        A fit that explains the motion may still have this friction wrong, at the cost of a slightly larger sum. The
-        tracking fit determines it well, and no path leads from a narrow step to a wide one, so both variants are tried:
-        that of the tracking fit and that of `wide` (coordinates).
+        A fit that explains the motion may still have the wrong friction there, with a slightly larger sum of squares.
+        The tracking fit determines it well, and fits do not get from a narrow step to a wide one, so the friction of
+        the tracking fit and that of `wide` (coordinates) are both tried.
         """
         options = self.options
         ftol = options.ftol_coarse if self.coarse else options.ftol_start
@@ -190,7 +190,7 @@ class Search:
         return replace(refined, iterations=spent)
 
     def _polish(self, x: Array, ftol: float, likely: float) -> Minimum:
-        """Fit from `x` until little is left to gain, and further if the sum of squares is below `likely`."""
+        """Fit from `x` with tolerance `ftol`, and then more precisely if the sum of squares is below `likely`."""
         found = self.rough.minimise(x, ftol)
         if found.at.cost >= likely:
             return found
@@ -198,7 +198,7 @@ class Search:
         return replace(near, iterations=found.iterations + near.iterations)
 
     def _compare(self, tries: Sequence[Minimum], ftol: float) -> Refined:
-        """Fit `tries` with fine steps, with samples weighted by the residual of the best; return the best."""
+        """Fit `tries` with fine steps and samples weighted by the residual of the best; return the best fit."""
         positions = self.fine.positions(_best(tries).x)
         weights, outliers = noise_weights(self.periods, positions, self.options.outlier_threshold)
         weighted = replace(self.fine, weights=weights)
@@ -218,7 +218,7 @@ class Search:
         return distinct
 
     def _with_friction_of(self, x: Array, other: Array, kinds: tuple[str, ...] = STANDSTILL_TERMS) -> Array:
-        """Return the coordinates `x`, with these kinds of parameters taken from the coordinates `other`."""
+        """Return the coordinates `x`, with parameters of these `kinds` taken from the coordinates `other`."""
         chosen = [kind_of(name) in kinds for name in self.fine.coordinates.names]
         changed = x.copy()
         changed[: len(chosen)][chosen] = other[: len(chosen)][chosen]
@@ -227,7 +227,7 @@ class Search:
     def _at_once(self, fits: Sequence[Callable[[], Minimum]]) -> list[Minimum]:
         """Run independent fits in threads; compiled code releases the GIL.
 
-        Fits that do not converge are ignored if any other does; otherwise raises ConvergenceError.
+        Fits that do not converge are ignored if any other does; otherwise, ConvergenceError is raised.
         """
         found: list[Minimum] = []
         lost = ConvergenceError("no fit was started")

@@ -26,7 +26,7 @@ def normal_equations(jacobian: Array, residual: Array, weight: Array | None = No
 
 
 class Products:
-    """Normal equations of rows that are added in several parts."""
+    """Normal equations accumulated from several sets of rows."""
 
     def __init__(self, columns: int) -> None:
         self._product = np.zeros((columns, columns + 1))

@@ -43,7 +43,7 @@ class Objective:
     fixed_parameters: bool = False
     """Whether only the initial states are fitted."""
     lever: Lever | None = None
-    """Prior on coupling and gravity_2 together."""
+    """Prior on coupling relative to gravity_2."""
 
     @property
     def count(self) -> int:
@@ -88,7 +88,7 @@ class Objective:
         return total
 
     def _expected(self, x: Array) -> Quadratic:
-        """Return the contribution of the prior."""
+        """Return the contribution of the priors."""
         normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
         normal[: self.count, : self.count] = np.diag(self.prior.precision)
         gradient[: self.count] = self.prior.precision * (x[: self.count] - self.prior.centre)
@@ -106,7 +106,7 @@ class Objective:
         return self._expected(x).normal[: self.count, : self.count]
 
     def with_prior_weighted(self, factor: Array) -> "Objective":
-        """Return this objective with the precision of each parameter's prior multiplied by `factor` (parameters,)."""
+        """Return this objective with each parameter's prior precision multiplied by `factor` (parameters,)."""
         lever = self.lever
         if lever is not None:
             lever = replace(lever, std=lever.std / float(np.sqrt(factor[[lever.coupling, lever.gravity]].min())))

@@ -51,7 +51,7 @@ class Coordinates:
         return value
 
     def coordinates(self, value: Array) -> Array:
-        """Return the coordinates of the parameters `value` (parameters,), moved into the physical range."""
+        """Return the coordinates of the parameters `value` (parameters,), clipped to the physical range."""
         above = np.maximum(np.minimum(value, self._highest) - self._floors, self.options.min_initial * self.scales)
         x = np.where(self._either_sign, value / self.scales, np.log(above))
         for share, first, second in self._shares:
@@ -61,7 +61,7 @@ class Coordinates:
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
-        """Return the point reached by `step` (coordinates,) from `x`; other coordinates may follow in both arrays.
+        """Return the point that `step` (coordinates,) reaches from `x`; both arrays may end with other coordinates.
 
         A step changes a width itself rather than its logarithm, since the motion depends linearly on the width. With
         exponential steps the width would never reach its floor, and the parameters that compensate for it would
@@ -91,7 +91,7 @@ class Coordinates:
             most[index] = min(most[index], room if self._floors[index] else np.log1p(room))
 
     def undisguised(self, x: Array) -> Array:
-        """Return `x` with constant Stribeck rises turned into Coulomb friction; other coordinates may follow in `x`.
+        """Return `x` with constant Stribeck rises turned into Coulomb friction; `x` may end with other coordinates.
 
         Where the Stribeck velocity is beyond all speeds of the motion, only the sum of rise and Coulomb friction is
         determined, and a fit that has drifted there rarely returns to lower Stribeck velocities.
@@ -150,7 +150,7 @@ class Coordinates:
 
     @cached_property
     def _shares(self) -> list[tuple[int, int, int]]:
-        """Indices of parameters bounded by the geometric mean of two others, each with those two."""
+        """Index triples: a parameter bounded by the geometric mean of two others, and those two."""
         shares = []
         for share, name in enumerate(self.names):
             bounds, joint = term_of(name).share_of, joint_of(name)
@@ -195,7 +195,7 @@ class CoordinatePrior:
 
 @dataclass(frozen=True)
 class Lever:
-    """Prior on two parameters together: coupling is expected to be `ratio` times gravity_2."""
+    """Prior that relates two parameters: coupling is expected to be `ratio` times gravity_2."""
 
     coupling: int
     gravity: int
@@ -207,7 +207,9 @@ class Lever:
 
     @classmethod
     def of(cls, model: Model, gravity_2: float, sizes: "Sizes") -> "Lever | None":
-        """Return the prior if `model.lever` is known, otherwise None; gravity_2: rough value [N m], used as a scale."""
+        """Return the prior if `model.lever` is known, otherwise None; gravity_2: approximate value [N m], used as a
+        scale.
+        """
         if model.lever is None or model.joints != 2:
             return None
         std = LEVER_STD * model.lever * max(abs(gravity_2), LEAST_WEIGHT * sizes.torque)
@@ -232,7 +234,7 @@ class Sizes:
     """Typical inertia [kg m^2]."""
 
     def of(self, scale: Scale | float) -> float:
-        """Return the value of a declared scale for this arm."""
+        """Return the value of a term's declared scale for this arm."""
         if not isinstance(scale, str):
             return scale
         return {
@@ -248,7 +250,7 @@ class Sizes:
 
 
 def highest_values(names: tuple[str, ...], speeds: Array) -> Array:
-    """Return the upper bounds that `Term.fastest` declares (parameters,), inf for other parameters; speeds: the highest
+    """Return the upper bounds that `Term.fastest` declares (parameters,), inf for other parameters; speeds: highest
     speed of each joint (joints,) [rad/s].
     """
     times = [(term_of(name).fastest, joint_of(name) or 1) for name in names]

@@ -1,8 +1,8 @@
 """Period of torque ripple and cogging over the joint angle: a scan that needs no initial guess.
 
 For each number of cycles per turn, torque times the sine and cosine of the angle are two additional columns of the
-regression on Fourier lines; for cogging, the columns are the sine and cosine themselves. The number that explains most
-of the residual of dynamics and friction is the likelihood's initial guess.
+regression on Fourier lines; for cogging, the columns are the sine and cosine themselves. The number that explains the
+most of the residual of dynamics and friction is the likelihood's initial guess.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from hil.estimator.options import LinearOptions
 
 Wave = Literal["ripple", "cogging"]
 WAVES: tuple[Wave, ...] = get_args(Wave)
-"""Options that are waves over the joint's angle: a torque proportional to the motor's (ripple) or independent of it
+"""Options that add waves over the joint angle: a torque proportional to the motor's (ripple) or independent of it
 (cogging).
 """
 CYCLES = np.arange(3.0, 40.01, 0.25)  # per turn of the joint; slower variations come from gravity, cables, encoders
@@ -61,7 +61,7 @@ def _parts(each: list[tuple[Array, Array, Array, Array]]) -> list[tuple[Array, i
 def _prepared(
     period: SettledPeriod, motion: PeriodicMotion, harmonics: int, joint: int, delay: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return columns and torque of one joint's lines as real numbers, and its torque and angle over time (samples,)."""
+    """Return one joint's columns and torque on the lines, as reals, and its torque and angle in time (samples,)."""
     Y = regressor(motion.position, motion.velocity, motion.acceleration, COULOMB_WIDTH)[joint]
     velocity = motion.velocity[joint]
     sign = np.tanh(velocity / COULOMB_WIDTH)

@@ -1,7 +1,7 @@
-"""Nonlinear least squares with unknowns shared by all segments and unknowns of each segment.
+"""Nonlinear least squares with some unknowns shared by all segments and others specific to each segment.
 
 A segment's own unknowns only affect its own residuals, so the normal equations have an arrowhead structure: each
-segment's block is eliminated by itself (Schur complement), and the corresponding columns of the Jacobian are computed
+segment's block is eliminated separately (Schur complement), and the corresponding columns of the Jacobian are computed
 for all segments at once. Hundreds of initial states cost as much as four.
 """
 
@@ -22,8 +22,8 @@ Residual = Callable[[int, Array, Array], Array]
 """Returns the residuals (rows,) of one segment at the shared coordinates (shared,) and its own (own,)."""
 
 Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
-"""Returns the residuals of one segment as `Residual` does, and their derivatives with respect to the shared, then its
-own coordinates (rows, shared + own).
+"""Returns the residuals of one segment as `Residual` does, and their derivatives with respect to the shared
+coordinates, then its own (rows, shared + own).
 """
 
 DEFAULTS = SegmentedMinimiserOptions()
@@ -81,11 +81,12 @@ class Segmented:
         It is valid if residuals within a segment are correlated, as model errors are: Liang and Zeger, "Longitudinal
         data analysis using generalized linear models", Biometrika 73 (1986) 13. With fewer segments than MIN_SEGMENTS
         times the number of coordinates, correlations cannot be estimated; then a single factor scales the covariance
-        for white noise. Infinite for coordinates that can change, alone or together, without affecting the residual.
+        for white noise. The covariance is infinite for coordinates that can change, alone or together, without
+        affecting the residual.
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.
-        own: number of coordinates, at the end, that belong to one recording each.
+        own: number of coordinates at the end, each of which belongs to a single recording.
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))
@@ -116,7 +117,7 @@ def _size(scores: Array, bread: Array) -> float:
 def _inverse(matrix: Array) -> tuple[Array, Array]:
     """Return the pseudo-inverse of a positive semidefinite matrix, and which coordinates it leaves undetermined.
 
-    Directions without effect on the residual are left out; a coordinate with a component in one is undetermined.
+    Directions without effect on the residual are omitted; a coordinate with a component in any of them is undetermined.
     """
     size, direction = linalg.eigh(matrix)
     seen = size > MIN_EIGENVALUE * size[-1]
@@ -141,8 +142,8 @@ class _Blocks:
     """J'r of the own coordinates (segments, own)."""
 
     def reduced(self, damping: float) -> tuple[Array, Array, Array, Array]:
-        """Return information and scores with own coordinates eliminated, and the two terms from which these are
-        recovered.
+        """Return information and scores with own coordinates eliminated, and two terms for recovering those
+        coordinates.
         """
         eye = np.eye(self.own.shape[1])
         scale = np.diagonal(self.own, axis1=1, axis2=2).max(axis=1)[:, None, None] * 1e-14

@@ -26,7 +26,7 @@ PIECE = 8192  # samples; the derivatives of one piece are a few MiB
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """The input of a run's simulation, from its recording."""
+    """Inputs for simulating a recorded run."""
 
     command: Array
     """Commanded torque (joints, samples) [N m], periodic."""

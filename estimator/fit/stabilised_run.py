@@ -1,13 +1,13 @@
 """Simulation of a stabilised run for the likelihood: held to the measured motion by the stabiliser's own springs.
 
 A stabiliser with stiffness k applied the torque k (pose - measured). In closed loop, the simulated arm would receive k
-(pose - simulated) instead, which equals the commanded torque plus that of a spring, k (measured - simulated). So the
-simulation uses the commanded torque and this spring instead of the loop. An arm that is unstable on its own then stays
-close to the real one, and if model and arm agree, the spring has no effect. The stabiliser's damper is left out: it
-only determines how fast deviations decay.
+(pose - simulated) instead, which equals the commanded torque plus that of a spring, k (measured - simulated). The
+simulation therefore uses the commanded torque and this spring instead of the loop. An arm that is unstable on its own
+then stays close to the real one, and if model and arm agree, the spring has no effect. The stabiliser's damper is left
+out: it only determines how fast deviations decay.
 
-The springs pull the simulated joints to where the real ones were. Therefore the encoder errors that the model includes
-are removed from the measured angles; otherwise a spring would exert a torque that never acted on the arm.
+The springs pull the simulated joints to where the real ones were. Therefore any encoder errors in the model are removed
+from the measured angles; otherwise a spring would exert a torque that never acted on the arm.
 """
 
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ from hil.estimator.simulation.closed_loop import Stabilised
 
 @dataclass(frozen=True)
 class StabilisedRun:
-    """The input of a run's simulation, from its recording."""
+    """Inputs for simulating a recorded run with its stabiliser."""
 
     run: SimulatedRun
     """The run without the stabiliser. Its `pulled_to` holds the readings to which the springs pull."""

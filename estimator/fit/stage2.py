@@ -37,7 +37,7 @@ from hil.estimator.simulation.back_emf import limited
 
 DEFAULTS = LikelihoodOptions()
 HARDLY = 0.05
-"""Fraction of a term's usual initial guess that is used near the minimum of a model without the term."""
+"""Fraction of a term's usual initial guess with which to start near the minimum of a model without the term."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def fit_runs(
         model: the model to fit.
         linear: stage 1's estimate for the same periods.
         coarse: whether to stop early if the residual is well above the noise, which suffices to compare models.
-        starts: parameters by name [SI], additional initial guesses that are tried before all others.
+        starts: additional initial guesses, parameters by name [SI], tried before all others.
         near: point known to be close to a minimum, used as the only initial guess.
         options: tolerances and limits.
 
@@ -127,7 +127,7 @@ def _near_values(
 
 
 def _is_nothing_when_small(name: str) -> bool:
-    """Return whether a parameter's term vanishes as it goes to zero, and whether it has an initial guess."""
+    """Return whether a parameter has an initial guess and its term vanishes as the parameter goes to zero."""
     term = term_of(name)
     return term.range == "positive" and term.part in FRICTIONS and not term.standstill and bool(term.initial)
 
@@ -186,7 +186,7 @@ def _initial_guesses(
     starts: Sequence[Mapping[str, float]],
     options: LikelihoodOptions,
 ) -> list[Array]:
-    """Return initial guesses in coordinates: the caller's, then stage 1's with narrow and with wide friction."""
+    """Return initial guesses (coordinates): the caller's, then stage 1's with a narrow and a wide friction step."""
     waves: dict[str, float] = {}
     for wave in WAVES:
         waves |= find_waves(periods, linear, wave) if wave in model.options else {}
@@ -197,7 +197,7 @@ def _initial_guesses(
 
 
 def _standstill_guesses(linear: LinearEstimate, options: LikelihoodOptions) -> list[dict[str, float]]:
-    """Return initial guesses of friction near standstill, for every joint: narrow and wide."""
+    """Return initial guesses of friction near standstill for every joint, first narrow, then wide."""
     viscous, coulomb = (
         float(np.mean([abs(linear.value[i]) for i, name in enumerate(linear.names) if name.startswith(kind)]))
         for kind in ("viscous", "coulomb")
@@ -226,7 +226,7 @@ def _guess(
 
 @dataclass(frozen=True)
 class _Errors:
-    """What remains unexplained at a minimum, as judged by `hil.estimator.fit.covariance`."""
+    """Model error and correlation of the residual at a minimum, according to `hil.estimator.fit.covariance`."""
 
     lags: int
     samples: int
@@ -311,12 +311,12 @@ def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Arr
 def _tempered(
     objective: Objective, minimum: Minimum, errors: _Errors, options: LikelihoodOptions, ftol: float
 ) -> Minimum:
-    """Return the minimum with priors reweighted by the data's actual information, or `minimum` if that is the same.
+    """Return the minimum with priors reweighted by the data's actual information; `minimum` if nothing changes.
 
     The sum of squares treats the errors of all samples as independent. A model error repeats at every reversal, so the
-    data constrain a parameter far less than that implies, as its standard error shows, and the fit would override any
-    prior, giving for example a torque constant of half the smallest plausible value. Therefore each prior's precision
-    is multiplied by the factor by which the data's variance exceeds that of independent errors.
+    data constrain a parameter far less than that implies, as its standard error shows. The fit would override any prior
+    and yield, for example, a torque constant of half the smallest plausible value. Therefore each prior's precision is
+    multiplied by the factor by which the data's variance exceeds that of independent errors.
     """
     count, prior = objective.count, objective.prior
     if objective.lever is None and not prior.precision.any():

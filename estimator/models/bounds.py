@@ -40,7 +40,8 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
 
 
 def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Array) -> Mask:
-    """Return which parameters (parameters,) lie at a bound, `lower` or `upper`, and are driven beyond it by the data.
+    """Return which parameters (parameters,) lie at a bound, `lower` or `upper`, although the data favour values beyond
+    it.
 
     std: standard errors for independent errors. Standard errors widened for the misfit would hide such a parameter if
     its bound itself causes the misfit.
@@ -52,8 +53,8 @@ def beyond_range(value: Array, step: Array, std: Array, lower: Array, upper: Arr
 
 
 def finite_std(std: Array, white: Array) -> Array:
-    """Return the standard errors `std` (parameters,), with finite values in place of infinite ones, such as those at a
-    bound.
+    """Return the standard errors `std` (parameters,), with infinite ones, such as those at a bound, replaced by finite
+    ones.
 
     white: standard errors for independent errors. They replace infinite ones, widened by the same factor as those of
     the other parameters.
@@ -67,15 +68,15 @@ def finite_std(std: Array, white: Array) -> Array:
 def matters(names: tuple[str, ...], beyond: Mask, step: Array, std: Array) -> bool:
     """Return whether parameters at their bounds affect the base parameters.
 
-    They do if a base parameter other than an offset is at its bound (`beyond`), or would move by more than its standard
-    error `std` without the bounds. `std` includes the misfit, which a bound may itself have caused.
+    They do if a base parameter other than an offset is at its bound (`beyond`), or would change by more than its
+    standard error `std` without the bounds. `std` includes the misfit, which a bound may itself have caused.
     """
     base = np.array([term_of(name).part == "base" and kind_of(name) != "offset" for name in names])
     return bool(beyond[base].any() or np.any(np.abs(step[base]) > MOVED * std[base]))
 
 
 def bound_sentence(names: Sequence[str]) -> str:
-    """Return the sentence on parameters at a bound; empty if there are none."""
+    """Return a sentence about parameters at a bound; empty if there are none."""
     if not names:
         return ""
     late = any(kind_of(name) == "back_emf" for name in names)

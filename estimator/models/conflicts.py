@@ -1,7 +1,7 @@
-"""Values that contradict prior knowledge: many standard deviations from configured or typical values.
+"""Values that contradict prior knowledge: those many standard deviations from configured or typical values.
 
-If the model lacks an effect, such as gear backlash, other parameters of the fit imitate it. Some of these are known
-beforehand, and a value far from the known one reveals the imitation, which standard errors do not.
+If the model lacks an effect, such as gear backlash, other parameters of the fit imitate it. The true values of some are
+known beforehand; a large deviation then reveals the imitation, unlike standard errors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,8 +15,8 @@ from hil.estimator.models.terms import kind_of, term_of
 
 FAR = 4.0  # standard deviations
 LARGE_RATIO, LARGE_ANGLE = 0.35, 0.3
-"""Relative and absolute deviations [1, rad] from a configured value that are too large to be due to a magnet's
-temperature, a tolerance, or a horn fitted one tooth off.
+"""Relative and absolute deviations [1, rad] from a configured value that are too large for magnet temperature,
+tolerances or a horn fitted one tooth off.
 """
 LARGE_SPREAD = 0.3  # standard deviation of a logarithm that is printed as a factor
 Trust = Literal["yes", "with care", "no"]
@@ -25,8 +25,8 @@ Source = Literal["file", "description", "servos"]
 _GIVEN = ("torque_scale", "zero")
 """Terms whose expected values come from the configuration: torque_constant and zero_ticks."""
 _SOURCES: dict[Source, str] = {
-    "file": "as implied by the configuration",
-    "description": "as implied by the description of the arm",
+    "file": "implied by the configuration",
+    "description": "implied by the description of the arm",
     "servos": "typical of servos",
 }
 _CHECKS = {
@@ -43,7 +43,7 @@ _LINK = "correct that link's mass, centre of mass and inertia in the description
 
 @dataclass(frozen=True)
 class Conflict:
-    """One value that is far from what was known beforehand."""
+    """A value that is far from the one known beforehand."""
 
     name: str
     value: float
@@ -66,7 +66,7 @@ class Conflict:
 
     @property
     def said(self) -> str:
-        """A sentence with the values and what to check."""
+        """A sentence with the values and a hint on what to check."""
         spread = f"+- {self.spread:.2g}"
         if self.relative:
             wide = self.spread > LARGE_SPREAD
@@ -75,7 +75,7 @@ class Conflict:
         advice = next((check for kind, check in _CHECKS.items() if self.name.startswith(kind)), usual)
         return (
             f"{self.name} is {self.value:.3g} +- {self.std:.1g}, {self.deviations:.0f} standard deviations from "
-            f"{self.expected:.3g} ({spread}), {_SOURCES[self.source]}: {advice}."
+            f"the {self.expected:.3g} ({spread}) {_SOURCES[self.source]}: {advice}."
         )
 
 
@@ -103,8 +103,8 @@ def conflicts(
 ) -> tuple[Conflict, ...]:
     """Return the contradictions among the parameters of a planar arm, the largest first.
 
-    torque_scale_std: relative standard deviation of the ratio of torque constants, by parameter, if the configuration
-    gives it; otherwise, that of `hil.estimator.models.terms`.
+    torque_scale_std: relative standard deviation of the ratio of torque constants, by parameter, if configured; the
+    default is that of `hil.estimator.models.terms`.
     """
     found = []
     for name, each, error in zip(names, value.tolist(), std.tolist(), strict=True):
@@ -119,7 +119,7 @@ def conflicts(
 
 
 def worst_first(found: Sequence[Conflict | None]) -> tuple[Conflict, ...]:
-    """Return the deviations in `found` that are contradictions, the largest first."""
+    """Return the contradictions in `found`, the largest first."""
     return tuple(sorted((each for each in found if each is not None), key=lambda each: -each.deviations))
 
 
@@ -127,7 +127,7 @@ def contradicted(found: Sequence[Conflict], explained: bool) -> str:
     """Return the best verdict that the contradictions allow: "no", "with care", or "" if they allow any verdict.
 
     explained: whether the model explains the motion. If it does not, and a known value is far off, an effect missing
-    from the model has distorted it, and presumably all others as well.
+    from the model has distorted that value, and presumably all others as well.
     """
     of_file = [each for each in found if each.source == "file"]
     if of_file:
@@ -136,7 +136,7 @@ def contradicted(found: Sequence[Conflict], explained: bool) -> str:
 
 
 def lowered(trust: Trust, at_most: str) -> Trust:
-    """Return the lower of a verdict and the result of `contradicted`."""
+    """Return the less favourable of `trust` and the result of `contradicted`."""
     if at_most == "no":
         return "no"
     return "with care" if at_most and trust == "yes" else trust

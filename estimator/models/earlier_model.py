@@ -1,11 +1,11 @@
-"""Compares the mean torque of the last few tenths of a second with that of the model as it was before them.
+"""Comparison of the mean torque over the last few tenths of a second with the model from before that time.
 
-A push or grip that begins while the arm is still being learnt changes what is learnt: sample by sample, parameters and
-noise follow it, and no residual stands out. The model from before the disturbance does not follow. Its prediction for
-all samples since then is therefore compared with the mean torque over that time: over the last 5, 10 and 20 lessons
-(updates of the model), which are 0.1, 0.2 and 0.4 s. In the mean, effects that alternate with the motion (noise, play,
-ripple) cancel, and a push does not. Where the joint has hardly moved in that time, friction may have held it back: a
-gear gives way elastically before it slides.
+A push or grip that begins while the model is still being learnt distorts it: sample by sample, parameters and noise
+follow the disturbance, and no residual stands out. The model from before the disturbance does not follow it. Its
+prediction for all samples since then is therefore compared with the mean torque over that time: over the last 5, 10 and
+20 lessons (updates of the model), which are 0.1, 0.2 and 0.4 s. In the mean, effects that alternate with the motion
+(noise, play, ripple) cancel, but a push does not. If the joint has hardly moved in that time, friction may have held it
+back: a gear yields elastically before it slides.
 
 The terms of a joint's equation, `torque - row theta`, are summed over time, so that the mean between any two stored
 moments requires one subtraction. These functions are part of compiled loops.
@@ -22,7 +22,7 @@ BACK = (5, 10, 20)
 """Numbers of lessons (updates of the model) over which the mean is taken."""
 
 TIMES = 3.5
-"""Number of standard deviations beyond which the earlier model does not explain the mean residual torque."""
+"""Number of standard deviations beyond which a mean residual torque counts as unexplained by the earlier model."""
 
 RELATIVE_STD = 0.1
 """Relative standard deviation of each term of the mean (inertia, gravity, friction), since a model that fits one motion
@@ -33,8 +33,8 @@ IN_A_ROW = 2
 """Number of successive lessons (updates of the model) after which an unexplained mean residual torque is reported."""
 
 ELASTIC_RAD = 0.03
-"""Distance after a reversal over which dry friction approaches its value in sliding [rad]. The difference between the
-two may at first be as large as static friction, and falls exponentially with the distance covered.
+"""Distance after a reversal over which dry friction approaches its sliding value [rad]. The difference between the two
+may at first be as large as static friction, and falls exponentially with the distance covered.
 """
 
 _SLOTS = max(BACK)
@@ -53,7 +53,7 @@ def memory(count: int) -> Array:
 
 
 def forget(past: Any) -> None:
-    """Discard the stored moments: what happened since the previous sample is unknown."""
+    """Discard the stored moments, since the motion since the previous sample is unknown."""
     past[_SLOTS + 1] = 0.0
 
 
@@ -74,13 +74,13 @@ def add(past: Any, j: int, torque: float, stands: float, velocity: float, row: A
 
 
 def describe(past: Any, j: int, count: int, noise: float, friction: float) -> None:
-    """Set joint `j`'s noise variance and static friction [N m], which are stored with the next moment."""
+    """Set joint `j`'s noise variance and static friction [N m], to be stored with the next moment."""
     at = 1 + 2 * (_ROW + count)
     past[_SLOTS, at + j], past[_SLOTS, at + 2 + j] = noise, friction
 
 
 def store(past: Any, theta: Any, covariance: Any) -> None:
-    """Store the present moment with the parameters `theta` and their `covariance`."""
+    """Store the current moment with the parameters `theta` and their `covariance`."""
     count, head = theta.size, past[_SLOTS + 1]
     row = past[int(head[_NEXT])]
     at = 1 + 2 * (_ROW + count) + 4

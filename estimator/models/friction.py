@@ -1,7 +1,7 @@
 """Friction of one joint at given velocities, in numpy, for computations with identified parameters.
 
 The law is that of `hil.estimator.simulation.arm`, whose compiled loop also computes its derivatives. `values` are
-parameters by name [SI]; terms that are not among them are absent.
+parameters by name [SI]; missing terms have no effect.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ def direction(v: Array, width: float) -> Array:
 
 
 def viscous(values: Values, joint: int, v: Array, step: Array) -> Array:
-    """Return the friction of `joint` (from 1) that grows with speed [N m]; step: its `direction`."""
+    """Return the speed-dependent friction of `joint` (from 1) [N m]; step: the joint's `direction`."""
     moving = values.get(f"viscous_{joint}", 0.0) * v
     asymmetry = values.get(f"viscous_asymmetry_{joint}", 0.0)
     return np.asarray(moving + asymmetry * v * step if asymmetry else moving)

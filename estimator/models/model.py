@@ -24,7 +24,7 @@ motion, which depends on the configured tilt.
 
 @dataclass(frozen=True)
 class Model:
-    """The arm's equations with the terms chosen here, which `hil.estimator.models.terms` declares.
+    """The arm's equations with a choice of the terms declared in `hil.estimator.models.terms`.
 
     Friction: `coulomb` is viscous v + coulomb tanh(v / coulomb_width); `stribeck` multiplies coulomb by 1 +
     stribeck_rise exp(-(v / stribeck_velocity)^2); `stribeck_load` adds load |motor torque| to that level.
@@ -62,14 +62,14 @@ class Model:
     by_voltage: Collection[int] = frozenset()
     """Joints (from 1) that are driven by voltage.
 
-    A share `back_emf` of their viscous friction is subject to the drive's lag (`hil.estimator.simulation.back_emf`).
+    A fraction `back_emf` of their viscous friction is subject to the drive's lag (`hil.estimator.simulation.back_emf`).
     Always a frozenset after construction.
     """
     lever: float | None = None
     """Measured length of link 1 divided by gravity [s^2], if known.
 
-    Coupling is expected to be this times gravity_2, within `LEVER_STD`. This prior only matters if the motion does not
-    determine the two.
+    Coupling is expected to be this value times gravity_2, to within `LEVER_STD`. This prior only matters if the motion
+    does not determine both.
     """
 
     def __post_init__(self) -> None:
@@ -87,11 +87,11 @@ class Model:
             raise ModelError("torque_scale compares two joints' torque constants: it needs two joints")
 
     def having(self, *options: Option) -> "Model":
-        """Return this model with these options added."""
+        """Return this model with `options` added."""
         return replace(self, options={*self.options, *options})
 
     def without(self, *options: Option) -> "Model":
-        """Return this model without these options."""
+        """Return this model without `options`."""
         return replace(self, options=set(self.options) - set(options))
 
     @property

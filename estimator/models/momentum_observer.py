@@ -1,4 +1,4 @@
-"""Checks sample by sample, without accelerations, whether an arm's motion is consistent with its model.
+"""Sample-by-sample check, without accelerations, that an arm's motion is consistent with its model.
 
 The planar arm's equations, integrated once, are linear in its parameters and contain only angles, velocities and
 torques:
@@ -19,16 +19,15 @@ widen the admissible range. A deviation that may become an alarm enters that est
 alarm; otherwise a joint that is held for a long time would widen the range until nothing exceeded it. While a joint
 stands still, its noise is lower, since most of the noise only arises in motion.
 
-What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which
-the gear's presliding softens every reversal, dry friction looks viscous, and yet it holds the joint once the joint has
-stopped.
+What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which the
+gear's presliding softens every reversal, dry friction looks viscous but still holds the joint once it has stopped.
 
 While little is known about an arm, the updates of the parameters follow a disturbance as if it were a property of the
 arm. Therefore the mean torque over the last few tenths of a second is then also compared with an earlier state of the
 model (`earlier_model`).
 
-Errors of the model last longer than the interval between two updates, and so does the rounding of a velocity that stays
-below one tick: they are not new information each time. Therefore each update counts only as a fraction of one.
+Model errors, and the rounding of a velocity that stays below one tick, persist over many updates, so successive updates
+are not independent. Therefore each one has only a fraction of the full weight.
 """
 
 import math
@@ -101,9 +100,9 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: the thresholds follow from `largest`, or from this multiple of the dry friction in `mean` if that is
-    larger: near standstill, friction behaves differently from the model.
-    hardly_known: whether only the torque is known beforehand; mean torques are then also compared with the earlier
+    frictions: multiple of the dry friction in `mean` from which thresholds are derived if it exceeds `largest`, since
+    friction near standstill differs from the model.
+    hardly_known: whether only the torque is known beforehand; if so, mean torques are also compared with the earlier
     model.
     """
 
@@ -139,7 +138,7 @@ class MomentumObserver:
         self._constants = np.concatenate(([joints, interval, *floor], *further))
         self._past = earlier_model.memory(_COUNT)
         self.memory = self._memory, self._rests, self._past, self._constants
-        """What `observe`, the compiled loop, is given before the sample."""
+        """Arguments of `observe`, the compiled loop, that precede the sample."""
         self.observe(
             (0.0,) * joints, (0.0,) * joints, (0.0,) * joints, math.inf
         )  # compiles the loop and initialises the memory
@@ -189,7 +188,7 @@ def _regressors(momentum: Any, rest: Any, q1: float, q2: float, v1: float, v2: f
 
 # Compiled code takes its arguments by position; m is the observer's memory, k its constants, j a joint.
 def _begin_anew(m: Any, momentum: Any, rest: Any, t1: float, t2: float) -> None:
-    """Restart: nothing is known about the motion since the previous sample."""
+    """Restart, since nothing is known about the motion since the previous sample."""
     single = m[_SINGLE]
     for j in range(2):
         for i in range(_COUNT):
@@ -215,7 +214,7 @@ def _filter(m: Any, j: int, momentum: Any, rest: Any, torque: float, fallen: flo
 
 
 def _lacks(m: Any, j: int, row: Any) -> tuple[float, float]:
-    """Return the residual torque, and its variance due to the parameters. Most terms are zero, and are left out."""
+    """Return the residual torque, and its variance due to the parameters, omitting terms that are zero."""
     lacking = m[_SINGLE, _TORQUE + j]
     left_open = 0.0
     for i in range(_COUNT):
@@ -251,7 +250,7 @@ def _keep_dissipative(m: Any) -> None:
 
 
 def _static_friction(m: Any, rest: Any, j: int) -> float:
-    """Return the torque that friction may hold at standstill [N m]."""
+    """Return the largest torque that friction may hold at standstill [N m]."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
     viscous = m[_THETA, 6 + j] - math.sqrt(max(m[_COVARIANCE + 6 + j, 6 + j], 0.0))
     peak = math.sqrt(2.0 * m[_PENDING, _SQUARED + j])  # velocity of a sine
@@ -270,7 +269,7 @@ def _is_blocked(
     rounding: float,
     dt: float,
 ) -> bool:
-    """Return whether joint j stands still under a range of torques that friction cannot hold.
+    """Return whether joint j stands still although its torque has varied by more than friction can hold.
 
     distance: result of `standstill.look`. held: torque that certainly acts on it now. floor: smallest tolerance.
     noise, rounding: variances of one sample's residual torque at standstill. All in SI units.
@@ -300,7 +299,7 @@ def _second_moment(m: Any, weight_1: float, coupling: float, weight_2: float, ar
 def _of_rounding(m: Any, j: int, slope: float, cos_2: float) -> float:
     """Return the variance of the residual torque due to the rounding of both velocities to ticks.
 
-    As long as the inertias are unknown, each counts with its largest possible value.
+    While the inertias are unknown, each is assumed to have its largest possible value.
     """
     across = _second_moment(m, 0.0, cos_2, 1.0, 0.0)
     own = _second_moment(m, 1.0, 2.0 * cos_2, 1.0, 0.0) if j == 0 else _second_moment(m, 0.0, 0.0, 1.0, 1.0)
@@ -309,7 +308,7 @@ def _of_rounding(m: Any, j: int, slope: float, cos_2: float) -> float:
 
 
 def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
-    """Return whether the residual torque exceeds its threshold long enough; a larger excess needs less time.
+    """Return whether the residual torque has exceeded its threshold for long enough; a larger excess needs less time.
 
     share: residual torque relative to the threshold. dt: time since the previous sample [s].
     """
@@ -324,7 +323,7 @@ def _alarms(single: Any, j: int, share: float, dt: float) -> bool:
 
 
 def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> None:
-    """Update the noise variance; the contribution of a possible alarm waits until the alarm has ended."""
+    """Update the noise variance; the contribution of a possible alarm is deferred until it has ended."""
     for_later = m[_PENDING]
     if pending:
         for_later[_TAUGHT + j] += taught * dt
@@ -361,7 +360,7 @@ def _look_back(
     rounding: float,
     dt: float,
 ) -> float:
-    """Process joint j's sample; return its mean residual torque if the earlier model has not explained it for long
+    """Process joint j's sample; return its mean residual torque if the earlier model has failed to explain it for long
     enough, otherwise 0.
 
     stands: filtered indicator of standstill. friction: static friction [N m]. rounding: variance of the residual.

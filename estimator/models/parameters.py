@@ -1,4 +1,4 @@
-"""The full set of physical constants that one simulation needs, including those that the model leaves out."""
+"""The full set of physical constants for one simulation, including those of terms that the model omits."""
 
 import math
 from collections.abc import Mapping
@@ -12,8 +12,7 @@ from hil.estimator.models.terms import TERMS, constants, term_of
 CONSTANTS = constants()
 """Names of the constants, in the order in which the compiled simulation takes them."""
 ABSENT = {name: term_of(name).absent for name in CONSTANTS}
-"""Values that disable a term that the model lacks; a one-joint arm gets a second joint that moves freely.
-"""
+"""Values that disable terms missing from the model; a one-joint arm gets a second joint that moves freely."""
 ENCODER = tuple(name for name, term in TERMS.items() if term.part == "encoder")
 """Terms of the encoder errors that are periodic over a turn."""
 LEAST_LAG = 1e-6  # s
@@ -25,9 +24,8 @@ LEAST_INERTIA = 0.2
 
 
 def place_of(term: str) -> int:
-    """Return the index of a term's constant in `Physics.vector`.
-
-    For a term that each joint has, it is the index for joint 1; the index for joint 2 follows.
+    """Return the index of a term's constant in `Physics.vector`. For a term with one constant per joint, this is joint
+    1's index; joint 2's follows.
     """
     return CONSTANTS.index(term if TERMS[term].scope == "arm" else f"{term}_1")
 
@@ -57,7 +55,7 @@ class Physics:
 
     @classmethod
     def of(cls, parameters: Mapping[str, float]) -> "Physics":
-        """Return the constants for parameters given by name; terms that are not named are disabled.
+        """Return the constants for parameters given by name; all other terms are disabled.
 
         Friction with presliding has no velocity step; code that needs a width uses SLIDING.
         """
@@ -78,7 +76,7 @@ class Physics:
 
     @property
     def lags(self) -> Array:
-        """Time constants of the joints' lags (2,) [s]; the second joint's stays above 0 if there is any lag."""
+        """Time constant of each joint's lag (2,) [s]; joint 2's stays above 0 if there is any lag."""
         other = max(self.lag + self.lag_difference, LEAST_LAG if self.lag_difference else 0.0)
         return np.array([self.lag, other])
 
@@ -89,8 +87,8 @@ class Physics:
         return late
 
     def crossing_times(self) -> tuple[float, float]:
-        """Return the time in which a reversal of friction takes each joint through its Coulomb step or bristle
-        deflection [s].
+        """Return the time in which a friction reversal takes each joint through its Coulomb step or bristle deflection
+        [s].
         """
         constant = dict(zip(CONSTANTS, self.vector.tolist(), strict=True))
         inertia = self.free_inertias()

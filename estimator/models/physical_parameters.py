@@ -1,8 +1,8 @@
-"""Masses, centres of mass and inertias from base parameters, given other knowledge of the arm.
+"""Masses, centres of mass and inertias from base parameters and other known quantities of the arm.
 
 Torque and position determine six combinations of ten quantities (for one joint, two combinations of four). Each known
 length, mass or rotor inertia reduces the unknowns by one. What remains undetermined is the null space of the equations:
-a quantity without a component in it is determined; the others form groups within which they cannot be separated.
+a quantity without a component in it is determined; the others form groups of inseparable quantities.
 """
 
 from collections.abc import Mapping
@@ -54,7 +54,7 @@ class Quantities:
     groups: tuple[tuple[str, ...], ...]
     """Groups of quantities that cannot be separated; at least one more quantity of each group must be known."""
     doubts: tuple[str, ...]
-    """Warnings as text: known quantities that contradict the data, and physically impossible quantities."""
+    """Warnings about known quantities that contradict the data, and about physically impossible quantities."""
 
 
 def base_of(quantities: Mapping[str, float], gravity: float, joints: int) -> Array:
@@ -142,7 +142,7 @@ def _check(known: Mapping[str, Known], joints: int) -> None:
         if not np.isfinite(item.value) or item.std < 0.0 or (positive and item.value <= 0.0):
             raise ModelError(
                 f"known.{name} = {item.value:g}, std {item.std:g}: lengths and masses must be positive, "
-                "and no std negative"
+                "and std must not be negative"
             )
 
 
@@ -163,7 +163,7 @@ def _guess(name: str, base: Mapping[str, float], known: Mapping[str, Known], gra
 
 
 def _slope(function: object, x: Array, size: Array) -> Array:
-    """Return derivatives with respect to x / size, by central differences."""
+    """Return the derivatives of `function` with respect to x / size, by central differences."""
     assert callable(function)
     columns = []
     for i in range(x.size):
@@ -190,7 +190,7 @@ def _spread(slope: Array) -> Array:
 
 
 def _groups(names: list[str], null: Array) -> tuple[tuple[str, ...], ...]:
-    """Return groups of names that share a direction of the null space, directly or through others."""
+    """Return groups of names that are linked, directly or indirectly, by directions of the null space."""
     tied = np.abs(null @ null.T) > OPEN
     groups: list[tuple[str, ...]] = []
     left = set(range(len(names)))

@@ -9,7 +9,7 @@ sign of velocity:
     tau2 = (inertia_2 + coupling cos q2) q1'' + (inertia_2 + armature_2) q2''
            + coupling sin q2 q1'^2 + gravity_2 cos(q1 + q2) + viscous_2 q2' + coulomb_2 s2 + offset_2
 
-An arm with one joint only has the terms inertia_1, gravity_1 and friction of joint 1.
+A one-joint arm has only the terms inertia_1, gravity_1 and the friction of joint 1.
 """
 
 import numpy as np

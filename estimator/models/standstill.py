@@ -1,10 +1,10 @@
-"""Detects a blocked joint by the range of torque that acts on it without moving it.
+"""Detection of a blocked joint from the range of torque that acts on it without moving it.
 
 Dry friction holds a joint at rest while the torque on it stays within a band as wide as twice the static friction.
 Where the band lies depends on gravity and offsets, which may be poorly known; its width does not. Therefore the torque
 is compared with the largest and the smallest one since the joint came to rest: at an unchanged angle, gravity and
-offset cancel in these differences, and so do their errors. Only the changes due to the motion of other joints have to
-be modelled.
+offset cancel in these differences, and so do their errors. Only changes due to the motion of other joints have to be
+modelled.
 
 A torque outside the band accelerates a free joint. The joint counts as blocked once a free joint would have gained
 enough momentum to show in the velocity register. Twice that momentum is required, because only half of the excess is
@@ -25,8 +25,8 @@ WITHIN_RAD = 0.004
 """Largest change of the angle of a joint that is at rest [rad]; covers encoder noise and gear play."""
 
 AT_REST = 0.95
-"""Filtered indicator of standstill above which a joint counts as at rest; by then, its deceleration has decayed in the
-filters.
+"""Filtered indicator of standstill above which a joint counts as at rest; by then, the filtered deceleration has
+decayed.
 """
 
 HOLD_S = 0.03
@@ -55,7 +55,7 @@ def is_suspect(rest: Any) -> bool:
 
 
 def forget(rest: Any) -> None:
-    """Discard the present standstill: what happened since the previous sample is unknown."""
+    """Discard the current standstill, since the motion since the previous sample is unknown."""
     rest[_SEEN] = rest[_RANGE] = rest[_UP] = rest[_DOWN] = rest[_LASTS] = 0.0
 
 
@@ -94,10 +94,10 @@ def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta:
 
 
 def keep(rest: Any, first: int, row: Any) -> None:
-    """Store an equation from column `first` on.
+    """Store a joint's equation in columns from `first` on.
 
-    The elements are copied in a loop: numba would need 2 s more to compile the assignment of a slice, because of its
-    error message about shapes.
+    The elements are copied in a loop: a slice assignment, with its error message about shapes, would take numba 2 s
+    longer to compile.
     """
     for i in range(row.size):
         rest[first + i] = row[i]

@@ -92,7 +92,7 @@ class Term:
     """
     scope: Scope = "joint"
     first_joint: int = 1
-    """First joint that has this term: 2 if it is relative to joint 1, or if joint 1's is part of another term."""
+    """First joint with this term: 2 if the term is relative to joint 1, or if joint 1's is part of another term."""
     range: Range = "positive"
     """Range of values.
 
@@ -100,8 +100,7 @@ class Term:
     sign, of the geometric mean of the two terms in `share_of`.
     """
     share_of: tuple[str, str] | None = None
-    """Names of the two terms of which this one is a share; if each joint has such a term, the terms of the same
-    joint.
+    """Names of the two terms whose geometric mean bounds this one; those of the same joint if each joint has this term.
     """
     scale: Scale | float = 1.0
     """Typical change in the fit: the name of a scale of the arm and its motion, or a number [unit]."""
@@ -112,18 +111,18 @@ class Term:
     fastest: float | None = None
     """Upper bound of a term that is a speed, as a multiple of the joint's highest speed; None for no bound.
 
-    A term that hardly changes over all speeds of the motion is equivalent to another term: a Stribeck rise that never
-    falls is Coulomb friction, a Coulomb step that is never complete is viscous friction.
+    A term that hardly changes over the speeds of the motion is equivalent to another term: a Stribeck rise that never
+    falls is Coulomb friction, and a Coulomb step that is never completed is viscous friction.
     """
     max_step: float | None = None
-    """Maximum change of its coordinate (for positive terms, of the logarithm) per iteration; None: the fit's limit."""
-    standstill: bool = False
-    """Whether it shapes friction near standstill: its fit has local minima and is started from several initial guesses.
+    """Maximum change of the term's coordinate (for positive terms, a logarithm) per iteration; None: the fit's limit.
     """
+    standstill: bool = False
+    """Whether the term shapes friction near standstill: its fit has local minima and needs several initial guesses."""
     replaced_by: str | None = None
     """The option that replaces this term."""
     simulated: bool = True
-    """Whether it is a constant of the equations of motion, rather than of the drive or of the encoders."""
+    """Whether the term belongs to the equations of motion rather than to the drive or the encoders."""
     spread: Scale | float | None = None
     """Typical deviation from its `absent` value among real arms, as a scale or a number [unit]; None if unknown."""
     log_spread: float | None = None
@@ -131,7 +130,7 @@ class Term:
 
     @property
     def of_torque(self) -> bool:
-        """Whether the parameter doubles if all torques are twice as large as assumed."""
+        """Whether the parameter is proportional to torque: it doubles if all torques are twice as large as assumed."""
         return self.unit.startswith(("N m", "kg m^2"))
 
 

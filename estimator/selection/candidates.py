@@ -1,8 +1,8 @@
 """Missing model terms, judged without fitting them: score tests, and the effect of omission on standard errors.
 
 Near an estimate the motion is linear in small changes of any parameter, including the parameters of terms that the
-model lacks. One simulation with the derivatives with respect to all of them yields the decrease of the sum of squares
-if a term were added (C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the
+model lacks. One simulation with derivatives with respect to all of them yields the decrease of the sum of squares that
+each term would bring (C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the
 fitted parameters. Terms that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the
 standard errors even if the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control
 Systems 3 (1966) 293), with their typical size as the prior, to which the information from the motion is added.
@@ -37,7 +37,7 @@ SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable", "encoder")
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model with one more term than the estimate's, and its score test."""
+    """A model with one term more than the estimate's, and the term's score test."""
 
     model: Model
     part: str
@@ -76,7 +76,7 @@ class Linearised:
     precision: Array
     """Inverse prior variances of the parameters (parameters,), 0 without a prior."""
     lever: Lever | None = None
-    """Prior on coupling and gravity_2 together."""
+    """Prior on coupling relative to gravity_2."""
 
     @cached_property
     def expected(self) -> Array:
@@ -99,7 +99,8 @@ class Linearised:
         return [self.names.index(name) for name in names]
 
     def fall(self, names: Sequence[str]) -> tuple[float, Array]:
-        """Return the decrease of the sum of squares if these parameters are freed, and the changes in their values.
+        """Return the decrease of the sum of squares if the parameters `names` are freed, and the changes in their
+        values.
 
         The initial state is freed as well.
         """
@@ -117,8 +118,8 @@ def linearised(
 ) -> Linearised:
     """Expand the sum of squares of `period` about `estimate`, which was fitted to it.
 
-    `names`: additional parameters; they are expanded about their value in `known` or, without one, about the value at
-    which they have no effect.
+    `names`: additional parameters, expanded about their value in `known` or, without one, about the value at which they
+    have no effect.
     """
     used = without_spikes(period)
     added = [name for name in names if name not in estimate.names]
@@ -169,7 +170,7 @@ def candidates(period: SettledPeriod, estimate: Estimate, known: Mapping[str, fl
 def ranked(
     about: Linearised, fitted: Sequence[str], richer: Mapping[str, Model], known: Mapping[str, float]
 ) -> list[Candidate]:
-    """Return the score tests of the models `richer`, keyed by the part that each adds to the parameters `fitted`."""
+    """Return the score tests of the models `richer`, which are keyed by the part that each adds to `fitted`."""
     new = {part: tuple(n for n in more.names if n not in fitted) for part, more in richer.items()}
     base, _ = about.fall(fitted)
     found = []
@@ -195,8 +196,8 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
     """Return the estimate's covariance (parameters, parameters) [SI], including the effect of omitted terms that cannot
     be ruled out.
 
-    Each such parameter is described by its prior and the information from the motion, as if it were fitted as well.
-    Since it is not fitted, the change that fitting it would make counts as an error, too.
+    Each of their parameters is described by its prior and the information from the motion, as if it were fitted as
+    well. Since it is not, the change that fitting it would cause also counts as an error.
     """
     left_out = unruled(estimate.model)
     if not left_out:
@@ -205,7 +206,7 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def unruled(model: Model) -> list[str]:
-    """Return the parameters that the model lacks and whose typical size is known."""
+    """Return the parameters missing from the model whose typical size is known."""
     absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
     left_out = [name for name in model.having(*absent).names if name not in model.names] if absent else []
     return [name for name in left_out if term_of(name).spread is not None]
@@ -234,14 +235,14 @@ def widened(about: Linearised, names: Sequence[str], covariance: Array, left_out
 
 
 def simulated_run(period: SettledPeriod) -> Run:
-    """Return a period's simulation with the integration steps of a fit's result."""
+    """Return the simulation of a period with the integration steps of final fits."""
     if period.stabiliser is None:
         return SimulatedRun.of(period, INTEGRATION)
     return StabilisedRun.of(period, period.stabiliser, INTEGRATION)
 
 
 def colour(residual: Array) -> float:
-    """Return the integrated autocorrelation of a residual (joints, samples), for the worst joint; 1 is white.
+    """Return the worst joint's integrated autocorrelation of a residual (joints, samples); 1 for white noise.
 
     Missing samples count as 0.
     """

@@ -1,12 +1,12 @@
 """Noise, nonlinear distortion and model error, separated by the lines on which they appear.
 
-The method is that of Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. If an arm is excited on
-odd lines only, it responds on these and, because it is nonlinear, also on others. Effects that change sign with the
-motion (friction, gravity about a hanging pose) produce odd lines; others (an offset, direction-dependent friction, any
-other pose) produce even lines. Some odd lines, the detection lines, are left unexcited to observe the effects of the
-first kind. If even lines are excited too, odd distortion appears on all lines, so the unexcited lines cannot be
-separated into odd and even and form a single group. The residual of a fit on each group, beyond the noise, is the model
-error of that group.
+The method is that of Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. An arm excited on odd
+lines only responds on these and, because it is nonlinear, also on others. Effects that change sign with the motion
+(friction, gravity about a hanging pose) produce odd lines; others (an offset, direction-dependent friction, any other
+pose) produce even lines. Some odd lines, the detection lines, are left unexcited to observe the effects of the first
+kind. If even lines are excited too, odd distortion appears on all lines, so the unexcited lines cannot be separated
+into odd and even and form a single group. The residual of a fit on each group, beyond the noise, is the model error of
+that group.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class Distortion:
     """RMS per line for each group of lines, in encoder steps (joints,)."""
 
     noise: Array
-    """Noise per line: from the scatter between periods or the fastest lines, whichever is larger."""
+    """Noise per line, from the scatter between periods or from the highest lines, whichever is larger."""
     excited: LineGroup
     """Lines on which some joint was excited."""
     odd: LineGroup | None
@@ -60,7 +60,7 @@ def excited_lines(period: SettledPeriod) -> Mask:
 
 
 def distortion(period: SettledPeriod, estimate: Estimate) -> Distortion:
-    """Return the levels of one period and of the residual of `estimate`."""
+    """Return the levels of motion, noise and residual of `estimate` in one period."""
     lines = lines_of(period.filled())
     left = lines_of(np.nan_to_num(estimate.residual))
     order = np.arange(lines.shape[1])

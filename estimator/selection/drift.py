@@ -1,4 +1,4 @@
-"""Changes of friction while the arm moved: as grease warms up, friction falls by a few percent within minutes.
+"""Changes of friction during motion: as grease warms up, friction falls by a few percent within minutes.
 
 A fit of one period, or of the mean of several, is valid for the middle of their time span. Other periods then show
 whether friction was larger or smaller: the difference in motion is nearly linear in one factor per joint, for viscous
@@ -49,8 +49,8 @@ class Drift:
         return bool(np.any((np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > LEAST)))
 
     def after_correction(self) -> "Drift":
-        """Return the change that may remain after a correction: the error of the measured change, and the part of the
-        change that is not linear in time.
+        """Return the change that may remain after a correction: the error of the measured change, and its part that is
+        not linear in time.
         """
         return replace(self, change=np.hypot(self.std, UNEVEN * self.change))
 
@@ -100,7 +100,7 @@ def friction_change(period: SettledPeriod, estimate: Estimate, seconds: float) -
 
     It is found by Gauss-Newton iterations on one factor per joint and the initial state; all other parameters are
     fixed. A step that does not improve the prediction is shortened. If no simulation from the period's start stays
-    finite, nothing is known about a change: its standard error is infinite.
+    finite, the standard error is infinite.
     """
     change, std, left = _fitted(_Later.of(period, estimate, SCALED), period, MOST)
     return Drift(change, std, seconds, left)
@@ -137,7 +137,7 @@ def torque_change(period: SettledPeriod, estimate: Estimate) -> TorqueChange:
 
 
 def _fitted(later: "_Later", period: SettledPeriod, most: float | Array) -> tuple[Array, Array, float]:
-    """Return the change (joints,), its standard error and the sum of squares that it leaves.
+    """Return the change (joints,), its standard error and the remaining sum of squares.
 
     most: largest change in one iteration.
     """
@@ -167,7 +167,7 @@ def _fitted(later: "_Later", period: SettledPeriod, most: float | Array) -> tupl
 
 @dataclass(frozen=True)
 class _Later:
-    """The later period as predicted by an estimate; names: the parameters that change."""
+    """The later period as predicted by an estimate; names: parameters that change."""
 
     estimate: Estimate
     run: Run
@@ -197,7 +197,7 @@ class _Later:
         return np.concatenate((by_factor, J[:, :, len(self.names) :]), axis=2).reshape(r.size, -1), r
 
     def _scale(self, name: str) -> float:
-        """Size of a parameter's change for a change of 1: friction changes by a factor, a torque by N m."""
+        """Return a parameter's change per unit of `change`: its own value for friction, 1 for a torque [N m]."""
         return 1.0 if name.startswith("offset") else self.estimate.parameters[name]
 
     def _changed(self, change: Array) -> dict[str, float]:

@@ -1,7 +1,7 @@
-"""Fit of a model whose terms are given, with the periods of its ripple and cogging searched for twice.
+"""Fit of a model with given terms, with two searches for the periods of its ripple and cogging.
 
-The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period if it explains the rest of the
-motion. The linear regression cannot represent encoder errors, cables and narrow Stribeck friction. If they matter, the
+The regression on Fourier lines (`hil.estimator.fit.ripple`) finds a wave's period if all other effects are modelled
+well. The linear regression cannot represent encoder errors, cables and narrow Stribeck friction. If they matter, the
 search may end at a wrong period, and no fit started there finds the right one. The second search starts from a fit of
 all other terms.
 """
@@ -59,10 +59,10 @@ def _with_wave(
     starts: Sequence[Mapping[str, float]],
     options: SelectionOptions,
 ) -> Estimate:
-    """Return the best fit of the estimate's model with a wave, from its most likely numbers of cycles.
+    """Return the best fit of the estimate's model with a wave, starting from its most likely numbers of cycles.
 
-    A wave is most visible in the residual of a fit that explains most, even if its terms partly imitate the wave; that
-    fit is only used for the search.
+    A wave is most visible in the residual of the fit that explains the most, even if its terms partly imitate the wave;
+    that fit is used only for the search.
     """
     model, joints = estimate.model.having(wave), range(1, estimate.model.joints + 1)
     rich = replace(estimate.model, friction=FRICTIONS[-1]).having("zeros", *SMOOTH)

@@ -1,4 +1,4 @@
-"""How well given parameters predict a recording that was not used to estimate them."""
+"""Errors of given parameters in predicting recordings that were not used to estimate them."""
 
 from collections.abc import Mapping, Sequence
 
@@ -98,7 +98,7 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
 
 
 def _complete(parameters: Mapping[str, float], joints: int) -> dict[str, float]:
-    """Return the parameters, with a narrow width of the Coulomb step added for each joint that has none."""
+    """Return the parameters, with a narrow Coulomb step width added for each joint that has none."""
     return {f"coulomb_width_{joint + 1}": LEAST_WIDTH for joint in range(joints)} | dict(parameters)
 
 

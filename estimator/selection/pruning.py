@@ -1,4 +1,4 @@
-"""Removal of terms that do not differ significantly from zero. The covariance decides, without another fit."""
+"""Removal of terms that do not differ significantly from zero, judged by the covariance without another fit."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -59,7 +59,7 @@ def removable_parts(model: Model) -> list[tuple[str, Model]]:
 
 
 def _tested(model: Model, plainer: Model) -> list[str]:
-    """Return the tested parameters of the part that `plainer` lacks.
+    """Return the parameters to test of the part that `plainer` lacks.
 
     Parameters that only have an effect together with others, such as a wave's period, are not tested.
     """

@@ -36,7 +36,7 @@ def left_per_joint(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def restarts(period: SettledPeriod, estimate: Estimate, options: SelectionOptions) -> Iterator[Mapping[str, float]]:
-    """Yield changed parameters, by name, from which another minimum may be reached; the worst joint's come first.
+    """Yield changed parameters, by name, from which another minimum may be reached, starting with the worst joint.
 
     Only joints whose residual exceeds `options.presliding_residual` are changed.
     """
@@ -52,7 +52,7 @@ def undisguised(estimate: Estimate) -> dict[str, float]:
     """Return changed parameters, by name, for joints whose Stribeck rise may really be a narrow Coulomb step.
 
     A rise that fades within a wide step resembles a narrow step without a rise, and explains the motion nearly as well.
-    A fit that starts from one of the two does not reach the other.
+    A fit started from one does not reach the other.
     """
     values: dict[str, float] = estimate.parameters
     changed: dict[str, float] = {}

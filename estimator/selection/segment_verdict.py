@@ -46,7 +46,7 @@ class SegmentEvidence:
     doubts: tuple[str, ...] = ()
     """Implausible values, as sentences."""
     faulty: bool = False
-    """Whether a warning rules out using the estimate."""
+    """Whether a warning makes the estimate unusable."""
     doubtful: bool = False
     """Whether a warning casts doubt on the estimate."""
     conflicts: tuple[Conflict, ...] = ()
@@ -60,7 +60,7 @@ class SegmentEvidence:
 
 
 def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool = True) -> dict[str, float]:
-    """Return the relative standard error of each base parameter except offsets and, without gravity, its torques.
+    """Return the relative standard error of each base parameter except offsets and, without gravity, gravity torques.
 
     If gravity is negligible, its error is relative to the fraction LITTLE_TORQUE of the RMS torque.
     """
@@ -75,7 +75,7 @@ def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate, gr
 
 
 def explains_well(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool = True) -> bool:
-    """Whether the motion is nearly explained and determines every base parameter well."""
+    """Return whether the motion is nearly explained and determines every base parameter well."""
     well = max(relative_std(recordings, estimate, gravity).values()) <= WELL_KNOWN
     return well and float(estimate.residual_over_noise.max()) <= NEARLY_EXPLAINED
 
@@ -131,7 +131,7 @@ def _left(estimate: ShootingEstimate, evidence: SegmentEvidence, trust: Trust) -
 
 def _predicted(held_out: Array | None, length: float) -> str:
     if held_out is None:
-        return "The model was not validated on a held-out motion: the recording is too short to hold out a part of it."
+        return "The model was not validated on a held-out motion: the recording is too short to hold out part of it."
     return (
         f"Fitted to every other segment of {length:g} s, the model predicts the remaining ones to within "
         f"{percent(float(held_out.max()))} of the motion's RMS."
@@ -142,6 +142,6 @@ def _weakest(name: str, part: float, spoiled: bool) -> str:
     if part <= WELL_KNOWN or spoiled:
         return f"The least certain parameter is {name}, known to within {percent(part)}."
     if not np.isfinite(part):
-        return f"This motion provides no information on {name}. To identify it: {IMPROVEMENT[kind_of(name)]}."
+        return f"This motion provides no information on {name}. To identify it, use {IMPROVEMENT[kind_of(name)]}."
     improvement = IMPROVEMENT[kind_of(name)]
-    return f"The least certain parameter is {name}, known to within {percent(part)}. To improve it: {improvement}."
+    return f"The least certain parameter is {name}, known to within {percent(part)}. To improve it, use {improvement}."

@@ -81,7 +81,7 @@ def linearised(recordings: Sequence[Recording], estimate: ShootingEstimate, name
 def held_out_errors(
     recordings: Sequence[Recording], estimate: ShootingEstimate, of: slice = ALL
 ) -> tuple[Array, float]:
-    """Return the RMS error of predicted segments relative to the motion's RMS: per joint (joints,), and the median.
+    """Return the RMS error of predicted segments relative to the motion's RMS, per joint (joints,), and its median.
 
     The initial state of a segment is estimated from its first third; the rest is predicted from the torque alone. The
     median is taken over segments, since the error of a segment in which the arm tumbles can be arbitrarily large. A

@@ -1,8 +1,8 @@
 """Friction model selection: models are fitted from simple to rich and judged on a held-out motion.
 
 A richer model always has a smaller residual on the motion to which it was fitted. Its open-loop prediction of another
-motion improves only if its terms are real, or by chance. Therefore a richer model must also reduce the residual more
-than meaningless terms would. Without another motion, the Bayesian information criterion is used (Schwarz, Annals of
+motion improves only if its terms are real, or by chance. Therefore it must also reduce the residual by more than
+meaningless terms would. Without another motion, the Bayesian information criterion is used (Schwarz, Annals of
 Statistics 6 (1978) 461), with the number of samples reduced according to the residual's correlation.
 """
 
@@ -49,7 +49,7 @@ def choose(
     First, Stribeck friction is fitted together with the encoders' zeros and the ratio of two torque constants, which
     are never known exactly. If that does not explain the motion, or if a score test finds a significant term in the
     residual (`hil.estimator.selection.candidates`), all other smooth terms are added at once: load, direction,
-    saturation, cables, encoder nonlinearity. Adding them one by one would be misleading, since each takes over the
+    saturation, cables, encoder nonlinearity. Adding them one by one would be misleading, since each would absorb the
     effects of the missing ones; together, with typical sizes as a prior, they can be separated. Then presliding
     friction and torque ripple are tried, and finally insignificant terms are removed. A model that predicts `held_out`
     worse than a simpler one is not chosen. If friction differs between the two recordings, it also changed within each
@@ -60,14 +60,14 @@ def choose(
         held_out: a settled period of another motion, for validation; without one, the Bayesian information criterion is
             used.
         drive: drive model of all candidates.
-        torque_scale: whether the ratio of the torque constants is kept in any case.
+        torque_scale: whether the ratio of the torque constants is always kept.
         by_voltage: joints, from 1, that are driven by voltage.
         lever: as for `hil.estimator.models.model.Model`.
         starts: additional initial guesses as in `hil.estimator.identify.identify`.
         seconds: time from the middle of `periods` to that of `held_out` [s], if known.
         options: thresholds.
-        executor: a concurrent.futures executor, on which fits are started that may turn out not to be needed. It does
-            not change the choice.
+        executor: a concurrent.futures executor for starting fits early that may turn out not to be needed. It does not
+            affect the choice.
 
     Raises:
         ConvergenceError: if no model can be fitted.
@@ -105,7 +105,7 @@ class Selection:
         self._seconds = seconds
         self._begun: dict[tuple[Model, int, bool], Future[Trial]] = {}
         self.trials: list[Trial] = []
-        """All trials with the present correction of the periods, in chronological order."""
+        """All trials with the current correction of the periods, in chronological order."""
 
     @property
     def period(self) -> SettledPeriod:
@@ -118,7 +118,7 @@ class Selection:
         return self._fitting.drift
 
     def _begin(self, model: Model, near: Trial | None = None, *, coarse: bool = False) -> None:
-        """Start a fit that may be needed, if there is an executor; it only becomes a trial once it is needed."""
+        """Start a fit that may be needed, if there is an executor; it becomes a trial only when needed."""
         key = (model, id(near), coarse)
         if self._executor is not None and key not in self._begun:
             self._begun[key] = self._executor.submit(self._fitting.trial, model, near, {}, coarse)
@@ -166,7 +166,7 @@ class Selection:
         return self._better(self._try_or_none(best.model, best, values), best) or best if values else best
 
     def _without_bristles(self, best: Trial) -> Trial:
-        """Drop presliding if the motion is explained as well without it: it may have mimicked ripple until then."""
+        """Drop presliding if the motion is explained equally well without it: it may have imitated ripple before."""
         if "presliding" not in best.model.options or not set(WAVES) & set(best.model.options):
             return best
         return self._better(best, self._try_or_none(best.model.without("presliding"), best)) or best
@@ -188,8 +188,8 @@ class Selection:
     def _closest(self) -> list[Trial]:
         """Return the trials that explain the most, with and without presliding, best first.
 
-        Ripple is most visible where other terms explain most, whether or not they are significant yet; but bristles may
-        have absorbed part of it.
+        Ripple is most visible where other terms explain the most, even if they are not significant yet; but bristles
+        may have absorbed part of it.
         """
         fitted = sorted((each for each in self.trials if each.estimate is not None), key=self._left)
         kinds = {"presliding" in each.model.options: each for each in reversed(fitted)}
@@ -226,7 +226,7 @@ class Selection:
         return trial
 
     def _use(self, periods: Sequence[SettledPeriod], held_out: SettledPeriod | None, drift: Drift | None) -> None:
-        """Fit these periods from now on; earlier trials and fits already started are for other periods."""
+        """Fit these periods from now on, discarding trials and started fits of other periods."""
         self._periods = list(periods)
         self._fitting = replace(self._fitting, periods=self._periods, held_out=held_out, drift=drift)
         self.trials = []
@@ -240,9 +240,9 @@ class Selection:
     def _with_wave(self, best: Trial, plain: Trial | None = None) -> Trial:
         """Add ripple or cogging, whichever explains more, if the score test finds it.
 
-        The score test needs the model that explains most, `best`. A fit that starts from it may end far from the truth,
-        because until then cables, saturation and load together have imitated the wave. Therefore the wave is first
-        added to `plain`, which has few terms that could imitate it, and the others are then added to the result.
+        The score test needs the model that explains the most, `best`. A fit that starts from it may end far from the
+        truth, because cables, saturation and load have so far imitated the wave together. Therefore the wave is first
+        added to `plain`, which has few terms that could imitate it, and then the other terms are added.
         """
         assert best.estimate is not None
         absent = [wave for wave in WAVES if wave not in best.model.options]
@@ -284,7 +284,7 @@ class Selection:
         return self._left(trial) < self._options.presliding_residual**2
 
     def _converged(self, trial: Trial) -> Trial:
-        """Return a fit with full precision: during model comparison, fits that leave much unexplained stop early."""
+        """Return a fit to full precision, since fits that leave much unexplained stop early during model comparison."""
         if not trial.coarse or self._is_explained(trial):
             return trial
         return self._try_or_none(trial.model, trial) or trial
@@ -328,7 +328,7 @@ class Selection:
         return best
 
     def _pruned_at(self, level: float, best: Trial) -> Trial:
-        """Prune and refit until no more terms are insignificant; with fewer terms, the others become more certain."""
+        """Prune and refit until no term is insignificant; with fewer terms, the others become more certain."""
         while best.estimate is not None:
             plainer = without_nothings(best.estimate, level, self._fixed)
             trial = None if plainer == best.model else self._try_or_none(plainer, best)
@@ -338,7 +338,9 @@ class Selection:
         return best
 
     def _pruned_by_fits(self, best: Trial) -> Trial:
-        """Remove terms one by one, each judged by a fit without it: for a motion too sensitive for standard errors."""
+        """Remove terms one by one, judging each by a fit without it, where the motion is too sensitive for standard
+        errors.
+        """
         for part, plainer in removable_parts(best.model):
             trial = None if part == self._fixed else self._try_or_none(plainer, best)
             if trial is not None and self._gain(best, trial) < self._worth(best, trial):
@@ -393,7 +395,7 @@ class Selection:
             return None
 
     def _try(self, model: Model, near: Trial | None, values: Mapping[str, float], *, coarse: bool = False) -> Trial:
-        """Fit from the result of `near`, using `values` for what it lacks, or from scratch."""
+        """Fit from the result of `near`, using `values` for parameters that it lacks, or from scratch."""
         begun = None if values else self._begun.pop((model, id(near), coarse), None)
         trial = self._fitting.trial(model, near, values, coarse) if begun is None else begun.result()
         self.trials.append(trial)

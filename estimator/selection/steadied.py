@@ -1,4 +1,4 @@
-"""Periods corrected for friction that changes while they are recorded, as it does while grease warms up.
+"""Correction of periods for friction that changes while they are recorded, such as while grease warms up.
 
 A fit assumes constant friction. If friction changes by a fraction c per second, the fit lacks the torque c (t -
 t_middle) F(t), where F is the friction torque. F is known well from the measured motion and a first fit, and c from a
@@ -34,8 +34,7 @@ def friction_torque(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def steadied(period: SettledPeriod, estimate: Estimate, drift: Drift) -> SettledPeriod:
-    """Return `period` with the torque that its motion would have needed if friction had stayed at its mid-period
-    value.
+    """Return `period` with the torque that its motion would have required had friction stayed at its mid-period value.
 
     estimate: fitted to this period, or to one with the same friction. drift: change of friction over `drift.seconds`.
     """

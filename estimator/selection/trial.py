@@ -1,4 +1,4 @@
-"""One fitted model with its performance, the choice among several, and the data that they are fitted to."""
+"""A fitted model with its performance, the choice among several, and the data to which they are fitted."""
 
 import time
 from collections.abc import Mapping, Sequence

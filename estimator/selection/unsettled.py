@@ -6,8 +6,8 @@ with their typical sizes as a prior; then insignificant terms are removed. Every
 earlier result.
 
 If the motion is explained down to the noise, the likelihood decides. Otherwise a richer model may merely compensate for
-another missing term. Then every other segment of each recording is fitted and the remaining ones are predicted, also by
-models with presliding friction. The model that predicts them best is fitted once more to all segments.
+another missing term. Then every other segment of each recording is fitted and the rest are predicted, also by models
+with presliding friction. The best predictor is fitted once more to all segments.
 """
 
 import time
@@ -46,8 +46,8 @@ class SegmentTrial:
     held_out: Array | None
     """RMS error relative to the motion's RMS (joints,); None if the fit did not converge."""
     score: float
-    """Median of the segments' relative errors over all joints, since the error of a segment in which the arm tumbles
-    can be huge.
+    """Median of the segments' relative errors over all joints, as the error of a segment in which the arm tumbles can
+    be huge.
     """
     seconds: float
 
@@ -81,8 +81,8 @@ def choose_by_shooting(
 ) -> SegmentChoice:
     """Fit friction with the terms that the recordings support.
 
-    Arguments as for `estimate_by_shooting`. torque_scale: whether the ratio of the torque constants is always fitted,
-    even if the recordings do not support it.
+    Arguments as for `estimate_by_shooting`. torque_scale: whether to fit the ratio of the torque constants even if the
+    recordings do not support it.
 
     Raises RecordingError if no recording has two segments, ConvergenceError if no model can be fitted.
     """
@@ -161,9 +161,10 @@ class _Search:
             return None
 
     def trial(self, near: ShootingEstimate, model: Model) -> SegmentTrial:
-        """Return how well `model` predicts segments to which it was not fitted, starting the fit from `near`.
+        """Fit `model`, starting from `near`, and return how well it predicts segments that were held out of the fit.
 
-        `near` was also fitted to these segments, but it only determines which local minimum is found, not its location.
+        `near` was also fitted to the held-out segments, but it only determines which local minimum is found, not its
+        location.
         """
         if model not in self._trials:
             began = time.perf_counter()
@@ -195,9 +196,8 @@ class _Search:
         return self.fit(best.model, near) or plain
 
     def judged(self, plain: ShootingEstimate, best: ShootingEstimate) -> SegmentChoice:
-        """Return the choice: `best`, or the simplest model if that predicts held-out segments much better.
-
-        If no model explains the motion, any improvement is enough.
+        """Return the choice: `best`, or the simplest model if it predicts held-out segments much better. If no model
+        explains the motion, any improvement suffices.
         """
         simple = Model(plain.model.joints, "coulomb", plain.model.drive)
         plainest, chosen = self.trial(plain, simple), self.trial(best, best.model)

@@ -1,4 +1,4 @@
-"""Checks of an estimate: residual compared with rounding, whiteness, conditioning, free simulation, lines."""
+"""Checks of an estimate: residual compared with rounding, whiteness, conditioning, open-loop simulation, lines."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ class Levels:
     """RMS by source, in encoder steps (joints,)."""
 
     excited: Array
-    """Motion at the spectral lines that were excited in one or more joints."""
+    """Motion on the lines excited in one or more joints."""
     distortion: Array
     """Motion on the other lines, caused by the arm's nonlinearity."""
     noise: Array
@@ -42,8 +42,7 @@ class Validation:
     """Results of the checks."""
 
     residual_over_floor: Array
-    """RMS residual relative to the known noise, rounding and scatter (joints,); 1 means that everything is explained.
-    """
+    """RMS residual relative to the known noise, rounding and scatter (joints,); 1 means fully explained."""
     correlated_lags: Array
     """Fraction of the residual's autocorrelations outside the 95 % band of white noise (joints,); 0.05 is white.
 
@@ -97,7 +96,8 @@ def validate(period: SettledPeriod, estimate: Estimate, gravity: bool = True) ->
 def _relative_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]:
     """Return the relative standard error of each base parameter except offsets.
 
-    On a horizontal arm gravity may be zero; its error is then relative to the torque that moved the arm.
+    On a horizontal arm, gravity may be zero; its error is then relative to the fraction LITTLE_TORQUE of the RMS
+    torque.
     """
     torque = LITTLE_TORQUE * np.sqrt(np.mean(period.torque**2, axis=1))
     relative = {}

@@ -3,7 +3,7 @@
 "Yes" means that, as far as can be judged, every inertia, gravity and friction parameter is accurate to 2 % or three
 standard errors. This relies on valid standard errors: those of the estimate are widened for effects that the model
 omits (`hil.estimator.selection.candidates.considered`) and for the unexplained part of the motion
-(`hil.estimator.fit.covariance`). No sentence advises something that the tool has already tried.
+(`hil.estimator.fit.covariance`). No sentence recommends anything that the tool has already tried.
 """
 
 from collections.abc import Sequence
@@ -70,7 +70,7 @@ class Evidence:
     drift: Drift | None = None
     """Change of friction while the arm moved."""
     torque: TorqueChange | None = None
-    """Constant torque in the held-out motion, if that explains the motion better than a change of friction."""
+    """Constant torque in the held-out motion, if it explains that motion better than a change of friction does."""
     disturbances: tuple[str, ...] = field(default=())
     """Faults of the recording itself, as sentences; they explain the residual and any change of friction."""
     doubts: tuple[str, ...] = field(default=())
@@ -125,7 +125,7 @@ def _trust(validation: Validation, evidence: Evidence, at_bound: Sequence[str]) 
 
 
 def _is_weak(validation: Validation, name: str) -> bool:
-    """Return whether a parameter is poorly known and the arm's torque depends on it."""
+    """Return whether a parameter is poorly known although the arm's torque depends on it."""
     return validation.relative_std[name] > WEAK and not validation.torque_std[name] <= LITTLE_EFFECT
 
 
@@ -178,10 +178,10 @@ def _in_words(part: str) -> str:
 
 
 def _spoilt(validation: Validation, trust: Trust) -> str:
-    """Return which parameters the model error may have biased, judged by their inflated standard errors."""
+    """Return a sentence on the parameters that the model error may bias, judged by their inflated standard errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst and trust == "no":
-        return "This error may bias all parameters, whatever their standard errors say."
+        return "This error may bias all parameters, regardless of their standard errors."
     if not worst:
         return "This error does not affect the parameters significantly: including it, each is known to 2 % or better."
     named = sorted(worst, key=lambda name: -worst[name])
@@ -198,7 +198,7 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
 
 
 def _distorted(validation: Validation) -> tuple[str, ...]:
-    """Return the response on lines that were left unexcited, and the part of it that the model does not explain."""
+    """Return sentences on the response on unexcited lines, and on the part of it that the model does not explain."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
         return (
@@ -252,8 +252,8 @@ def _pushed(torque: TorqueChange | None) -> tuple[str, ...]:
 
 
 def _reason(change: float, seconds: float) -> str:
-    """Return the possible cause of a change of friction, as the end of a sentence. While a servo warms up, its friction
-    falls; a rise always indicates a fault.
+    """Return the possible cause of a change of friction, as the end of a sentence. Friction falls as a servo warms up;
+    a rise always indicates a fault.
     """
     holds = "the identified values hold for the fitted periods"
     if change < 0.0:
@@ -285,17 +285,17 @@ def _predicted(held_out: Array | None, as_fitted: Array | None) -> tuple[str, ..
 
 
 def _percent(error: Array) -> str:
-    """The largest of some relative errors in percent, never in exponential notation."""
+    """Return the largest relative error in percent, never in exponential notation."""
     return percent(max(float(error.max()), 0.01 * LEAST_PERCENT))
 
 
 def percent(part: float) -> str:
-    """A fraction in percent, never in exponential notation if it is large."""
+    """Return a fraction in percent; large values are not in exponential notation."""
     return f"{100.0 * part:.{'2g' if part < 0.995 else '0f'}} %"
 
 
 def improvement_of(name: str, torque_limit: str = "") -> str:
-    """Advice on how to determine the parameter `name` better; torque_limit: as in `Evidence`."""
+    """Return advice on improving the estimate of the parameter `name`; torque_limit: as in `Evidence`."""
     return IMPROVEMENT[kind_of(name)].format(
         torque=torque_limit or "peak_torque", own_torque=torque_limit or "its peak_torque"
     )
@@ -311,11 +311,13 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
         share = 100 * validation.torque_std[name]
         return (
             f"The least certain parameter is {name}, known to within {percent(part)}. It hardly affects this arm: "
-            f"its standard error is {share:.2g} % of the torque of the fitted motion. To improve it: {improvement}.",
+            f"its standard error is {share:.2g} % of the fitted motion's torque. To improve it, use {improvement}.",
         )
     if not np.isfinite(part):
-        return (f"This motion provides no information on {name}. To identify it: {improvement}.",)
-    return (f"The least certain parameter is {name}, known to within {percent(part)}. To improve it: {improvement}.",)
+        return (f"This motion provides no information on {name}. To identify it, use {improvement}.",)
+    return (
+        f"The least certain parameter is {name}, known to within {percent(part)}. To improve it, use {improvement}.",
+    )
 
 
 def _alike(validation: Validation) -> tuple[str, ...]:

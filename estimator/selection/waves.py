@@ -1,4 +1,4 @@
-"""Periods of torque ripple and cogging: score tests of each number of cycles per turn."""
+"""Periods of torque ripple and cogging, found by score tests of each number of cycles per turn."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -15,9 +15,7 @@ from hil.estimator.selection.candidates import columns_of, simulated_run
 
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=8)
 COMPARABLE = 0.3
-"""Other numbers of cycles are tried too if they decrease the sum of squares by at least this fraction of the largest
-decrease.
-"""
+"""Minimum decrease of the sum of squares, as a fraction of the largest, for other numbers of cycles to be tried too."""
 
 
 def wave_peaks(
@@ -27,15 +25,15 @@ def wave_peaks(
     waves: Sequence[Wave] = WAVES,
     only: Sequence[int] = (),
 ) -> dict[str, tuple[float, ...]]:
-    """Return the numbers of `cycles` per turn with which a wave explains more of the residual than with neighbouring
+    """Return the numbers of `cycles` per turn at which a wave explains more of the residual than at neighbouring
     numbers, best first.
 
     Whatever the fitted parameters can explain is removed from residual and waves first. The result is keyed by
     parameter name. If the estimate's model includes a wave that is searched for, that wave is disabled first. If other
     terms have absorbed part of a wave, the best number may be wrong. Therefore other numbers are returned as well if
-    they explain at least the fraction `COMPARABLE` of the sum of squares that the best one explains.
+    they explain at least `COMPARABLE` times as much of the sum of squares as the best one.
 
-    only: joints, from 1, that are considered; by default all.
+    only: joints to consider, from 1; by default all.
     """
     used = without_spikes(period)
     run = simulated_run(used).integrated(COARSE)

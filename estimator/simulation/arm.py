@@ -101,11 +101,11 @@ def simulate(
 
 
 def finer_pieces(physics: Physics, step: float, most: int = MAX_SUBSTEPS) -> NDArray[np.int64]:
-    """Return the number of substeps for a step of `step` [s] while each joint is near standstill, at most `most`.
+    """Return the number of substeps, at most `most`, for a step of `step` [s] while each joint is near standstill.
 
     Within one substep, a reversal of dry friction may take a joint through a quarter of its Coulomb step's width. The
-    numbers are powers of two, so that small changes of the physics seldom change them, and with them the last digits of
-    the motion. They differ between joints, since the velocity of a joint with a wide step is nearly always within that
+    numbers are powers of two, so that small changes of the physics seldom change them and hence the last digits of the
+    motion. They differ between joints, since the velocity of a joint with a wide step is nearly always within that
     width.
     """
     needed = [min(4.0 * step / max(time, 1e-12), most) for time in physics.crossing_times()]
@@ -119,8 +119,8 @@ def bump_at(ratio: float) -> float:
 
 
 def bend_at(v: float, sharp: float) -> tuple[float, float]:
-    """Return tanh(v sharp) and its derivative with respect to v, from one exponential; the library's tanh takes twice
-    as long.
+    """Return tanh(v sharp) and its derivative with respect to v, using one exponential: half the time of the library's
+    tanh.
     """
     past = 2.0 * abs(v) * sharp
     if not past < FADED:

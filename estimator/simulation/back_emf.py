@@ -1,4 +1,4 @@
-"""Back-EMF of joints driven by voltage: a part of the motor's torque, subject to the same lag as the voltage.
+"""Back-EMF of joints driven by voltage: part of the motor torque, with the same lag as the voltage.
 
 A voltage u drives the current i through the winding, lag i' = (u - k v) / R - i, so the back-EMF passes through the
 same lag as the command. The fraction `back_emf` of viscous friction is due to it, b = k^2 / R. The equivalent motor,
@@ -6,10 +6,10 @@ with a lagging voltage and a brake b without lag, is
 
     1 / (lag J s^2 + J s + b) = 1 / ((lag' s + 1) ((J - b lag') s + b)),    lag' (J - b lag') = lag J
 
-which is exact for a joint of inertia J: it moves like a joint whose inertia is smaller by b lag', under a command with
-the lag lag'. It is simulated in this way: `Physics.of` subtracts back_emf viscous (lag + delay) from the joint's own
-inertia, 5 to 10 % of it on an XL430. The estimated lag is lag', slightly larger than that of the winding. The effect of
-friction on the motor's current is delayed by lag' - lag (see `neglected`).
+which is exact for a joint of inertia J: the joint moves like one with an inertia smaller by b lag', under a command
+with the lag lag'. It is simulated in this way: `Physics.of` subtracts back_emf viscous (lag + delay) from the joint's
+own inertia, 5 to 10 % of it on an XL430. The estimated lag is lag', slightly larger than that of the winding. The
+effect of friction on the motor's current is delayed by lag' - lag (see `neglected`).
 
 Ripple, saturation and load-dependent friction act on the motor's torque, which is the torque of the voltage minus the
 torque of the back-EMF (`hil.estimator.simulation.arm`).
@@ -27,7 +27,7 @@ _LATE: dict[str, tuple[int, ...]] = {"lag": (0, 1), "delay": (0, 1), "lag_differ
 
 
 def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the constants whose derivatives the simulation must provide to obtain those with respect to `names`."""
+    """Return the constants for which the simulation must provide derivatives to obtain those for `names`."""
     through = [
         CONSTANTS[place]
         for joint in _generating(physics)
@@ -71,7 +71,8 @@ def neglected(physics: Physics) -> dict[str, float]:
     """Return the standard deviations of the joints' own inertias due to effects that this model neglects [kg m^2].
 
     The effect of friction on the motor's current is delayed by lag' - lag, which is of second order in b lag' / J:
-    negligible on most arms, but 5 % of the inertia of an XL430 with hardly any load. The result is by name.
+    negligible on most arms, but 5 % of the inertia of an XL430 with hardly any load. Keys are the names of the
+    inertias.
     """
     found = {}
     for joint in _generating(physics):
@@ -83,8 +84,8 @@ def neglected(physics: Physics) -> dict[str, float]:
 
 def limited(parameters: Mapping[str, float]) -> tuple[str, ...]:
     """Return the names of the back-EMFs that would cancel more of their joint's inertia than the simulation allows
-    (`LEAST_INERTIA`). The loss that is simulated is then smaller than the parameters imply, which
-    biases the estimated inertia.
+    (`LEAST_INERTIA`). The simulated reduction is then smaller than the parameters imply, which biases the estimated
+    inertia.
     """
     physics = Physics.of(parameters)
     found = []

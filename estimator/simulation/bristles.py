@@ -9,10 +9,10 @@ Astrom and P. Lischinsky, "A new model for control of systems with friction", IE
 A step of the arm is split (Strang, SIAM Journal on Numerical Analysis 5 (1968) 506). In the first half, the bristles
 deflect at the step's initial velocity, which is solved exactly; then the arm moves with their torque as an additional
 offset and their damping as additional viscous friction; in the second half, they deflect at the final velocity. The
-arm's own step is the same as for every other friction law. The level is evaluated at the velocity in the middle of the
-step; for the first half, that velocity is predicted with the last step's acceleration. Once the bristles slip, friction
-equals the level, which would otherwise be half a step late. Compared with a hundred steps per sample, three at 400 Hz
-are accurate to 0.03 encoder steps RMS for 5 to 1000 N m/rad.
+arm's own step is the same as for every other friction law. The level is evaluated at the mid-step velocity; for the
+first half, it is predicted from the last step's acceleration. Once the bristles slip, friction equals the level, which
+would otherwise be half a step late. Compared with a hundred steps per sample, three at 400 Hz are accurate to 0.03
+encoder steps RMS for 5 to 1000 N m/rad.
 """
 
 import math
@@ -35,7 +35,7 @@ VISCOUS, COULOMB, OFFSET, RISE, FADING, LOAD, SCALE, STIFFNESS, DAMPING, SATURAT
 
 
 def has_bristles(physics: Physics) -> bool:
-    """Return whether dry friction of at least one joint yields before the joint slides."""
+    """Return whether any joint has presliding friction, which yields before the joint slides."""
     return bool(np.any(physics.vector[STIFFNESS : STIFFNESS + 2] > 0.0))
 
 
@@ -57,8 +57,8 @@ def bend(p: Any, b: Any, m: Any, v1: float, v2: float, u1: float, u2: float, t1:
     """Deflect the bristles for `time` [s] at the velocities v1 and v2 under the motor torques t1 and t2.
 
     b: torque of the bristles (2,) [N m], updated in place. u1 and u2 are the velocities in the middle of the arm's
-    step, at which the level is evaluated, since it is the whole friction once the bristles slip. The bristles' effect
-    on the arm is written into the constants `m`.
+    step, at which the level is evaluated, since the level is all of the friction once the bristles slip. The bristles'
+    effect on the arm is written into the constants `m`.
     """
     for joint in range(2):
         stiffness = p[STIFFNESS + joint]
@@ -75,7 +75,7 @@ def bend(p: Any, b: Any, m: Any, v1: float, v2: float, u1: float, u2: float, t1:
 
 
 def without_dry_friction(vector: Array) -> Array:
-    """Return the constants of an arm with all dry friction in its bristles, to be completed by `bend`."""
+    """Return the constants of an arm with all dry friction in its bristles; `bend` sets the bristles' effect."""
     left = vector.copy()
     for joint in range(2):
         if vector[STIFFNESS + joint] > 0.0:

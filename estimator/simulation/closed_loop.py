@@ -65,8 +65,8 @@ class Response:
 class Stabilised:
     """A period in which `feedback` applied part of the torque.
 
-    In the simulation the feedback acts on the simulated arm, as it did on the real one, so an arm that is unstable on
-    its own can be simulated. If model and arm agree, the torque is the one that was actually commanded.
+    In the simulation, the feedback acts on the simulated arm, as it did on the real one, so an arm that is unstable on
+    its own can be simulated. If model and arm agree, the torque equals the one actually commanded.
     """
 
     feedback: Feedback
@@ -102,7 +102,7 @@ class Stabilised:
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
-    """Return the physics with the lag reduced by `command_to_sample` [s], as commands take effect that much earlier."""
+    """Return the physics with the lag reduced by `command_to_sample` [s], by which commands take effect earlier."""
     return replace(physics, lag=max(physics.lag - command_to_sample, 1e-5))
 
 

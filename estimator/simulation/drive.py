@@ -1,7 +1,6 @@
 """Motor torque from the commanded torque: held, delayed, and averaged over each integration step.
 
-It is compiled because the likelihood needs it in every simulation; with numpy it would take a third of the simulation's
-time.
+The code is compiled because the likelihood needs it in every simulation; in numpy, it would take a third of the time.
 """
 
 import math

@@ -17,7 +17,7 @@ def measured(physics: Physics, position: Array) -> Array:
 
 
 def without_errors(physics: Physics, reading: Array) -> Array:
-    """Return the angles of joints whose encoders show `reading`, both (joints, samples) [rad]."""
+    """Return the joint angles at which the encoders read `reading`, both (joints, samples) [rad]."""
     if not physics.encoder.any():
         return reading
     encoder = physics.encoder[: reading.shape[0]]
@@ -37,7 +37,7 @@ def slopes_without_errors(physics: Physics, position: Array) -> Array:
 
 
 def by_motion(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the `names` of parameters on which the motion depends if no spring pulls the arm to a reading."""
+    """Return those `names` of parameters on which the motion depends if no spring pulls the arm to a reading."""
     return tuple(name for name in names if kind_of(name) not in ENCODER)
 
 

@@ -1,4 +1,4 @@
-"""Simulation of many arms under the same commands in one call of compiled code, as needed by a dry run.
+"""Simulation of many arms under the same commands in one call of compiled code, for dry runs.
 
 Equations, integration and feedback are those of `hil.estimator.simulation.closed_loop` with longer steps.
 """
@@ -20,7 +20,7 @@ from hil.estimator.simulation.bristles import has_bristles, without_dry_friction
 from hil.estimator.simulation.closed_loop import Feedback, respond_compiled
 
 COARSE = IntegrationOptions(max_step=2.6e-3, max_substeps=4)
-"""Integration for peaks and overshoots: accurate to a few milliradians, in a tenth of the time."""
+"""Integration for peaks and overshoots: accurate to a few milliradians, ten times as fast."""
 LOWEST, HIGHEST, VELOCITY, TORQUE, POWER = range(5)
 """Rows of the peak values."""
 
@@ -73,11 +73,11 @@ class ManyArms:
     def peaks(
         self, multisines: Sequence[Commands], rate: float, settling: SettlingRule
     ) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Return the extreme values of every arm, and when it settled.
+        """Return the extreme values of each arm, and when it settled.
 
         The values (arms, 5, joints) are lowest and highest angle [rad], speed [rad/s], assumed torque [N m], and
         assumed torque times speed [W]. The second array (arms,) is the number of periods of the first multisine that
-        the arm took to settle. It is 0 if the arm never settled; its experiment then ends.
+        the arm took to settle. It is 0 if the arm never settled, which ends its experiment.
         """
         count = len(self.physics)
         values, settled = np.empty((count, 5, 2)), np.zeros(count, dtype=np.int64)
@@ -116,7 +116,7 @@ class ManyArms:
 
 
 def _two(torque: Array) -> Array:
-    """Extend torques to two joints: a one-joint arm has a second joint without torque that moves nothing."""
+    """Extend torques to two joints: a one-joint arm gets a second joint that has neither torque nor effect."""
     both = np.zeros((2, torque.shape[1]))
     both[: len(torque)] = torque
     return both
@@ -172,7 +172,7 @@ def _raise(values: Any, position: Any, velocity: Any, torque: Any, scale: Any) -
 
 @_inner
 def _difference(former: Any, latest: Any) -> float:
-    """Return the RMS difference of the second halves of two periods, relative to the motion's RMS, worst joint."""
+    """Return the worst joint's RMS difference of the second halves of two periods, relative to the motion's RMS."""
     samples = former.shape[1]
     half = samples // 2
     count = samples - half

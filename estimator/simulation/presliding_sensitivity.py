@@ -172,7 +172,7 @@ def _bend(
 
 
 def _clear(rows: Any, now: int) -> None:
-    """Clear the friction rows that the arm's step will write; the bristles have written to all of them before."""
+    """Clear the friction rows that the arm's step is about to write, since the bristles have written to all of them."""
     for stage in range(2):
         first = (2 * now + stage) * STAGE
         for i in range(4 * WIDE):
@@ -192,7 +192,7 @@ def _press(rows: Any, here: Any, bristles: Any, now: int, count: int) -> None:
 
 
 def _accelerate(bristles: Any, Z: Any, kept: float, share: float, count: int) -> None:
-    """Update the accelerations' derivatives: `kept` times the previous ones plus `share` times the velocities'."""
+    """Set the accelerations' derivatives to `kept` times the previous ones plus `share` times the velocities'."""
     faster_by = bristles[4]
     for joint in range(2):
         r, z = joint * WIDE, (2 + joint) * WIDE

@@ -8,11 +8,11 @@ end of the step as predicted by its first stage, a step is
 
 A parameter only enters through the residuals of W k = f, of M' a = f' and of the third equation. Changing them by r, g,
 e changes the new velocity by A r + B g + C e, where A, B and C are two-by-two matrices common to all parameters.
-Therefore one more parameter costs a few dozen operations per step instead of one more simulation.
+Therefore each further parameter costs a few dozen operations per step instead of another simulation.
 
-A processor handles several parameters at once if the compiler knows that no rows of derivatives overlap: rows are WIDE
-apart in one-dimensional arrays. They are processed one step behind the rest, since values that were just written one by
-one cannot be read several at a time without a stall.
+A processor handles several parameters at once if the compiler knows that rows of derivatives do not overlap: they are
+WIDE apart in one-dimensional arrays. They are processed one step behind the rest, since reading several values at a
+time stalls if they have just been written one by one.
 """
 
 import math
@@ -163,7 +163,7 @@ class Sensitive:
 #   spring         stiffness and target angle of the springs, and the target's derivatives by encoder errors
 #   at             the column of each cause
 def _drive(p: Any, joint: int, stage: int, now: int, t: float, room: Any) -> None:  # noqa: PLR0915 a call costs time
-    """Compute the torque of a drive minus friction and the slope of friction, with all derivatives, into `room`."""
+    """Compute a drive's torque minus friction and the slope of friction, with all derivatives, into `room`."""
     rows, numbers, here, left, slope, dt, _, at = room
     q, v = here[0, joint], here[1, joint]
     viscous, coulomb, offset, width = p[VISCOUS + joint], p[COULOMB + joint], p[OFFSET + joint], p[WIDTH + joint]
@@ -287,7 +287,7 @@ def _arm(p: Any, stage: int, now: int, t1: float, t2: float, room: Any) -> tuple
 
 
 def arm_step(p: Any, x: Any, t1: float, t2: float, h: float, now: int, room: Any) -> tuple[float, float]:
-    """Advance the state x (2, joints) by a step of `h` [s], with its rows and scalars; return the accelerations
+    """Advance the state x (2, joints) by a step of `h` [s], computing its rows and scalars; return the accelerations
     [rad/s^2].
 
     t1, t2: motor torques [N m].
