@@ -72,7 +72,7 @@ class KnownMass:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Result: the joints' torque constants, and the parameters of the arm that follow from them."""
+    """Torque constants of the joints, and the arm parameters that follow from them."""
 
     factor: Array
     """Ratio of true to assumed torque constant of each joint (joints,)."""

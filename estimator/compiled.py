@@ -1,4 +1,4 @@
-"""Compiled loops with a disk cache that any change in the code or constants compiled into them invalidates.
+"""Compiled loops whose disk cache is invalidated by any change in the code or constants compiled into them.
 
 numba stores compiled code next to the source and checks only the date of that one file. Functions inlined from other
 modules, and constants taken from them, could therefore be older than their sources; and if a file changes while a

@@ -25,7 +25,7 @@ __all__ = [
 
 
 class EstimationError(Exception):
-    """Base class: catch it to catch everything that the estimator raises."""
+    """Base class of all errors that the estimator raises."""
 
 
 class ExcitationError(EstimationError):

@@ -57,8 +57,8 @@ class CoordinateOptions:
     """Largest change of a joint's velocity that a reversal of friction may cause in the shortest substep, in widths of
     the smoothed Coulomb step.
 
-    Beyond about ten, the simulation jumps back and forth across the step: its motion hardly changes, but its
-    derivatives grow without limit.
+    Beyond about ten, the simulation jumps back and forth across the step: the motion hardly changes, but its
+    derivatives grow without bound.
     """
     min_initial: float = 1e-3
     """Minimum initial value of a positive parameter, as a fraction of its scale."""

@@ -1,7 +1,7 @@
-"""The approach of Zhu et al. on a servo arm's settled period: linear response at each Fourier line, about the hanging
-pose.
+"""The method of Zhu et al. for a servo arm's settled period: linear response about the hanging pose at each Fourier
+line.
 
-This is its corrected form, second order with damping: (s^2 D + s F + K) q = tau on every line, with D and K of the arm
+This is the corrected form, second order with damping: (s^2 D + s F + K) q = tau on every line, with D and K of the arm
 linearised at (-pi/2, 0). It is valid for small swings without dry friction; for other motions it shows the
 linearisation error. Zhu et al., Machines 10 (2022) 392, equations (13), (48), (52) to (69); docs/paper.md.
 """

@@ -50,7 +50,7 @@ class Signs:
 
 @dataclass(frozen=True)
 class Suspicion:
-    """Columns that seem reversed.
+    """Columns that appear to be reversed.
 
     signs: the combination that explains the recordings.
     residual, residual_given: relative RMS of the torque residual of the worst joint, with these signs and with the

@@ -154,7 +154,7 @@ def suspect_drift(recordings: Sequence[Recording]) -> ClockDrift | None:
 
 
 def _shifted(recording: Recording, delay: float, relative: float) -> Recording:
-    """Return the recording with its torque delayed by `delay` at mid-recording; it grows at the rate `relative`."""
+    """Return the recording with a torque delay of `delay` at mid-recording that grows at the rate `relative`."""
     time = recording.time
     at = time - delay - relative * (time - 0.5 * (time[0] + time[-1]))
     return replace(recording, torque=np.stack([np.interp(at, time, torque) for torque in recording.torque]))

@@ -68,8 +68,8 @@ class Recording:
 
     @cached_property
     def noise(self) -> Array:
-        """Standard deviation of one position sample's error (joints,) [rad]: the measured white noise, but at least
-        that of rounding.
+        """Standard deviation of one position sample's error (joints,) [rad]: the larger of measured white noise and
+        rounding noise.
         """
         rounding = self.position_step / np.sqrt(12.0)
         white = np.array([_white_noise(self.time, row) for row in self.position])

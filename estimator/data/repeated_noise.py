@@ -123,8 +123,8 @@ def _fastest(power: Array) -> int:
 
 
 def _beyond_fast(power: Array, slow: int) -> Array:
-    """Return the power of signals in excess of white noise at the level of their upper quarter (rows,); power: their
-    spectrum (rows, lines), whose first `slow` lines may contain more than noise.
+    """Return the power of signals in excess of white noise, measured in the upper quarter of the lines (rows,); power:
+    their spectrum (rows, lines), whose first `slow` lines may contain more than noise.
     """
     fastest = _fastest(power)
     fast, above = power[:, fastest:].mean(axis=1), power[:, slow : 2 * slow].mean(axis=1)
@@ -142,7 +142,7 @@ def agreed_noise(white: Array, repeated: Array | None, samples: int) -> Array:
     underestimate the noise.
 
     Args:
-        white: bound from the fastest lines of a period of `samples` samples (joints,) [rad].
+        white: bound from the highest lines of a period of `samples` samples (joints,) [rad].
         repeated: bound from the difference of two halves of such periods (joints,) [rad], if known.
         samples: number of samples of the period.
     """

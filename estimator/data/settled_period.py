@@ -70,8 +70,8 @@ class SettledPeriod:
     valid: Mask = field(init=False)
     """Whether each sample was received (joints, samples)."""
     noise: Array = field(init=False)
-    """Standard deviation of one sample's error (joints,) [rad]: coloured noise, and the measured white noise, but at
-    least that of rounding.
+    """Standard deviation of one sample's error (joints,) [rad]: coloured noise, combined with the larger of measured
+    white noise and rounding noise.
 
     At a low sampling rate, the highest lines contain motion as well as noise. The part of them that repeats from period
     to period is then left out.
@@ -115,11 +115,11 @@ class SettledPeriod:
 def without_spikes(period: SettledPeriod) -> SettledPeriod:
     """Return the period with single outliers (such as a bit error on the bus) marked as missing.
 
-    Two distances of a reading are computed: from the median of itself and two neighbours on either side, and from a
-    cubic through its neighbours. It is an outlier if both exceed SPIKE encoder steps and SPIKE times the typical
-    distance from the median. At a low sampling rate, the median alone would take every fast reversal for an outlier,
-    since most readings of a steadily moving joint are the median themselves. If this applies to more than the fraction
-    MOST_SPIKES of the readings, none is marked: the joint moves fast compared with the sample rate.
+    Two distances are computed for each reading: from the median of itself and two neighbours on either side, and from a
+    cubic through its neighbours. The reading is an outlier if both exceed SPIKE encoder steps and SPIKE times the
+    typical distance from the median. At a low sampling rate, the median alone would take every fast reversal for an
+    outlier, since most readings of a steadily moving joint are the median themselves. If this applies to more than the
+    fraction MOST_SPIKES of the readings, none is marked: the joint moves fast compared with the sample rate.
     """
     from scipy.ndimage import median_filter
 

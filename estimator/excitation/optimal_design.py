@@ -69,10 +69,10 @@ class DesignProblem:
 
     physics: Physics
     names: tuple[str, ...]
-    """Names of the parameters whose standard errors count."""
+    """Names of the parameters whose standard errors are considered."""
     limits: Limits
     pose: Array
-    """Pose at rest (joints,) [rad]."""
+    """Rest pose (joints,) [rad]."""
     position_step: Array
     """Encoder resolution (joints,) [rad]."""
     feedback: Feedback
@@ -139,7 +139,7 @@ class DesignProblem:
         return best
 
     def positions(self, wave: Multisine) -> Array:
-        """Return transient and settled period (joints, samples) [rad]."""
+        """Return the positions in transient and settled period (joints, samples) [rad]."""
         return self._two_periods(wave).position
 
     def _two_periods(self, wave: Multisine) -> Response:

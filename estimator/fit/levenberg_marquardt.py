@@ -36,7 +36,7 @@ class Minimum:
     iterations: int
     """Number of points at which the sum was evaluated."""
     stalled: bool = False
-    """Whether the minimum was accepted because no damping gave the decrease that the normal equations predict."""
+    """Whether the minimum was accepted because no damping achieved the decrease that the normal equations predict."""
 
 
 Evaluate = Callable[[Array], Quadratic]

@@ -1,8 +1,8 @@
 """The narrowest smoothed Coulomb step that a simulation resolves.
 
-On a light arm, friction stops a joint within microseconds. A step narrower than the one returned here looks the same in
-any recording, but the simulation jumps back and forth across it: the derivatives, and with them the standard errors,
-are meaningless.
+On a light arm, friction stops a joint within microseconds. A step narrower than the bound returned here looks no
+different in any recording, but the simulation jumps back and forth across it, which makes the derivatives, and hence
+the standard errors, meaningless.
 """
 
 from collections.abc import Mapping, Sequence

@@ -76,7 +76,7 @@ class Segmented:
     """The prior's contribution to `information` (shared, shared)."""
 
     def covariance(self, groups: npt.NDArray[np.int64] | None = None, own: int = 0) -> Array:
-        """Return the sandwich covariance of the shared coordinates (shared, shared), taking segments as independent.
+        """Return the sandwich covariance of the shared coordinates (shared, shared), treating segments as independent.
 
         It is valid if residuals within a segment are correlated, as model errors are: Liang and Zeger, "Longitudinal
         data analysis using generalized linear models", Biometrika 73 (1986) 13. With fewer segments than MIN_SEGMENTS
@@ -166,7 +166,7 @@ def minimise_segmented(
 ) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
-    `residual` and `derivative` are called from several threads; the result does not depend on their number.
+    `residual` and `derivative` are called from several threads; the result does not depend on the number of threads.
 
     Args:
         residual: returns the residuals of a segment.

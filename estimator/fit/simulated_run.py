@@ -53,7 +53,7 @@ class SimulatedRun:
         return cls(*samples, steps, integration.max_substeps)
 
     def integrated(self, integration: IntegrationOptions) -> "SimulatedRun":
-        """Return the same run with other integration steps."""
+        """Return this run with the integration steps of `integration`."""
         steps = steps_per_sample(self.rate, integration.max_step)
         return replace(self, steps=steps, max_substeps=integration.max_substeps)
 

@@ -48,7 +48,7 @@ class StabilisedRun:
         return self.run.measured
 
     def integrated(self, integration: IntegrationOptions) -> "StabilisedRun":
-        """Return the same run with other integration steps."""
+        """Return this run with the integration steps of `integration`."""
         return replace(self, run=self.run.integrated(integration))
 
     def position(

@@ -55,7 +55,7 @@ class Fit:
     outliers: int
     """Number of samples that were downweighted."""
     correlation_time: float
-    """Number of samples over which the residual is correlated; 1 is white."""
+    """Number of samples over which the residual is correlated; 1 for white noise."""
     iterations: int
     """Number of simulations with derivatives."""
     at_bound: tuple[str, ...] = ()

@@ -1,9 +1,9 @@
-"""Declaration of every parameter that a model may have: adding a term takes one entry here and its equations.
+"""Declaration of every parameter that a model may have: a new term requires one entry here and its equations.
 
 Fits, results, reports, exports and the configuration take names, units, descriptions, ranges, initial guesses and
 scales from here; docs/architecture.md lists the files that a new term touches. Parameters are named `term_joint`, with
 joints counted from 1, and terms of the whole arm just `term`. This module only imports the standard library, so that
-reading a result loads nothing heavy.
+reading a result imports no large packages.
 """
 
 import re

@@ -1,7 +1,7 @@
 """Noise, nonlinear distortion and model error, separated by the lines on which they appear.
 
-The method is that of Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. An arm excited on odd
-lines only responds on these and, because it is nonlinear, also on others. Effects that change sign with the motion
+The method is that of Pintelon and Schoukens, System Identification, 2nd ed. (2012), chapter 4. An arm that is excited
+only on odd lines responds on these and, being nonlinear, on others as well. Effects that change sign with the motion
 (friction, gravity about a hanging pose) produce odd lines; others (an offset, direction-dependent friction, any other
 pose) produce even lines. Some odd lines, the detection lines, are left unexcited to observe the effects of the first
 kind. If even lines are excited too, odd distortion appears on all lines, so the unexcited lines cannot be separated
@@ -51,7 +51,7 @@ class Distortion:
 
 
 def excited_lines(period: SettledPeriod) -> Mask:
-    """Return for each harmonic, starting with 0, whether any joint was excited at it (lines,)."""
+    """Return whether any joint was excited at each harmonic, starting with 0 (lines,)."""
     drive = period.torque if period.stabiliser is None else period.stabiliser.excitation
     power = np.abs(lines_of(drive)) ** 2
     power[:, 0] = 0.0

@@ -59,7 +59,7 @@ def removable_parts(model: Model) -> list[tuple[str, Model]]:
 
 
 def _tested(model: Model, plainer: Model) -> list[str]:
-    """Return the parameters to test of the part that `plainer` lacks.
+    """Return the parameters to be tested for the part that `plainer` lacks.
 
     Parameters that only have an effect together with others, such as a wave's period, are not tested.
     """

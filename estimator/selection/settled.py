@@ -109,7 +109,7 @@ class Selection:
 
     @property
     def period(self) -> SettledPeriod:
-        """The first period as it is fitted."""
+        """The first period as fitted, including any correction."""
         return self._periods[0]
 
     @property

@@ -24,12 +24,12 @@ QUICK = LikelihoodOptions(
     integration=IntegrationOptions(max_substeps=16),
     coarse_integration=IntegrationOptions(max_step=2.6e-3, max_substeps=8),
 )
-"""Options of a quick fit: with few iterations and substeps, little time is lost if bristles become extremely stiff."""
+"""Options for quick fits: with few iterations and substeps, little time is lost if bristles become extremely stiff."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One model and its performance."""
+    """A model and its performance."""
 
     model: Model
     estimate: Estimate | None

@@ -33,14 +33,14 @@ SMOOTH: tuple[Option, ...] = ("asymmetry", "saturation", "cable")
 """Terms whose effect vanishes smoothly at zero, so that including them adds little cost to a fit."""
 FINE = ShootingOptions()
 QUICK = ShootingOptions(ftol=1e-3, max_step=FINE.coarse_step, reweightings=1)
-"""Options of fits that are only compared with each other."""
+"""Options for fits that are only compared with each other."""
 EXPLAINED = 1.1  # residual over noise: the noise is estimated from the same samples
 NEARLY = 1.5  # residual over noise up to which the likelihood can be trusted to choose
 
 
 @dataclass(frozen=True)
 class SegmentTrial:
-    """One model and its prediction error on the held-out segments."""
+    """A model and its prediction error on the held-out segments."""
 
     model: Model
     held_out: Array | None

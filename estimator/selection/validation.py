@@ -44,7 +44,7 @@ class Validation:
     residual_over_floor: Array
     """RMS residual relative to the known noise, rounding and scatter (joints,); 1 means fully explained."""
     correlated_lags: Array
-    """Fraction of the residual's autocorrelations outside the 95 % band of white noise (joints,); 0.05 is white.
+    """Fraction of the residual's autocorrelations outside the 95 % band of white noise (joints,); 0.05 if white.
 
     Lags of 1 to LAGS samples are used.
     """

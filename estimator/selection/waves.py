@@ -59,7 +59,7 @@ def wave_peaks(
 
 
 def ranked_cycles(peaks: Mapping[str, Sequence[float]], most: int) -> list[dict[str, float]]:
-    """Return at most `most` combinations of cycles per turn, each by parameter name, best first.
+    """Return at most `most` combinations of cycles per turn, keyed by parameter name, best first.
 
     The n-th combination takes the n-th best candidate of each wave in `peaks`, the result of `wave_peaks`, or its last
     one if it has fewer.

@@ -7,7 +7,7 @@ with a lagging voltage and a brake b without lag, is
     1 / (lag J s^2 + J s + b) = 1 / ((lag' s + 1) ((J - b lag') s + b)),    lag' (J - b lag') = lag J
 
 which is exact for a joint of inertia J: the joint moves like one with an inertia smaller by b lag', under a command
-with the lag lag'. It is simulated in this way: `Physics.of` subtracts back_emf viscous (lag + delay) from the joint's
+with the lag lag'. The simulation uses this form: `Physics.of` subtracts back_emf viscous (lag + delay) from the joint's
 own inertia, 5 to 10 % of it on an XL430. The estimated lag is lag', slightly larger than that of the winding. The
 effect of friction on the motor's current is delayed by lag' - lag (see `neglected`).
 
@@ -23,7 +23,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import CONSTANTS, GENERATED, LEAST_INERTIA, OWN_INERTIA, VISCOUS, Physics
 
 _LATE: dict[str, tuple[int, ...]] = {"lag": (0, 1), "delay": (0, 1), "lag_difference_2": (1,)}
-"""Joints whose torque is delayed by each of these parameters."""
+"""For each parameter, the joints whose torque it delays."""
 
 
 def causes_of(physics: Physics, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """Motor torque from the commanded torque: held, delayed, and averaged over each integration step.
 
-The code is compiled because the likelihood needs it in every simulation; in numpy, it would take a third of the time.
+The code is compiled because the likelihood needs it in every simulation; in numpy, it would take up a third of the
+simulation time.
 """
 
 import math

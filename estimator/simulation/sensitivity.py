@@ -11,7 +11,7 @@ e changes the new velocity by A r + B g + C e, where A, B and C are two-by-two m
 Therefore each further parameter costs a few dozen operations per step instead of another simulation.
 
 A processor handles several parameters at once if the compiler knows that rows of derivatives do not overlap: they are
-WIDE apart in one-dimensional arrays. They are processed one step behind the rest, since reading several values at a
+WIDE apart in one-dimensional arrays. Rows are processed one step behind the rest, since reading several values at a
 time stalls if they have just been written one by one.
 """
 
