@@ -64,7 +64,7 @@ class KnownMass:
             return {"gravity_1": M * d * g, "inertia_1": about}
         if self.length <= 0.0:
             raise ModelError(
-                "the length of link 1 must be known: measure it from joint to joint and give it with --length"
+                "the length of link 1 must be known: measure it from joint to joint and pass it with --length"
             )
         added = (M * d * g, about, M * self.length * d, M * self.length * g, M * self.length**2)
         return dict(zip(ADDED[2], added, strict=True))

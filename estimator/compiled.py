@@ -32,7 +32,7 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
 def only_version(dispatcher: Any) -> Any:
     """Return the machine code of a compiled function that has been called with arguments of one set of types.
 
-    Calling it skips the lookup of the argument types, which takes 0.1 us per array: as long as a small loop itself. Use
+    Calling it skips the lookup of the argument types, which takes 0.1 us per array, as long as a small loop itself. Use
     it only where the arguments' types never change. Without a compiler (NUMBA_DISABLE_JIT), and if there are several
     versions, the function is returned unchanged.
     """

@@ -52,7 +52,7 @@ def fit_linearised(period: SettledPeriod, length: float | None, gravity: float) 
         single = ("inertia_1", "viscous_1", "gravity_1")
         return LinearisedEstimate(_named(single, x), _named(single, np.sqrt(np.diag(covariance))), remark)
     if length is None:
-        raise ModelError("the method of Zhu et al. needs the length of link 1: give known.length_1")
+        raise ModelError("the method of Zhu et al. needs the length of link 1: set known.length_1")
     none = np.zeros_like(s)
     # Unknowns: D11, D12, D22, viscous_1, viscous_2, gravity_1, gravity_2.
     first = np.stack((s * s * Q[0], s * s * Q[1], none, s * Q[0], none, Q[0], Q[0] + Q[1]), axis=1)

@@ -49,7 +49,7 @@ class Hypothesis:
     joints: tuple[int, ...]
     course: Course
     directions: tuple[Direction, ...]
-    """One direction for each unknown; empty for scales of angles, which have one unknown for each joint."""
+    """One direction per unknown; empty for angle scales, which have one unknown per joint."""
     strength: Array
     """Strength of the defect in each segment (segments,), as given by its course."""
     used: Mask

@@ -28,7 +28,7 @@ STRIBECK_TERMS = tuple(name for name, term in TERMS.items() if term.part == "str
 
 @dataclass(frozen=True)
 class Start:
-    """Result from one initial guess with coarse integration steps."""
+    """Result of fits from one initial guess, with coarse integration steps."""
 
     tracking: Array
     """Coordinates of the tracking fit, in which springs hold the simulated arm close to the measured motion."""

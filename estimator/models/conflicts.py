@@ -1,4 +1,4 @@
-"""Values that contradict prior knowledge: those many standard deviations from configured or typical values.
+"""Values that contradict prior knowledge: many standard deviations from configured or typical values.
 
 If the model lacks an effect, such as gear backlash, other parameters of the fit imitate it. The true values of some are
 known beforehand; a large deviation then reveals the imitation, unlike standard errors.

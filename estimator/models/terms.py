@@ -115,7 +115,8 @@ class Term:
     falls is Coulomb friction, and a Coulomb step that is never completed is viscous friction.
     """
     max_step: float | None = None
-    """Maximum change of the term's coordinate (for positive terms, a logarithm) per iteration; None: the fit's limit.
+    """Maximum change of the term's coordinate (for positive terms, a logarithm) per iteration; None for the fit's
+    limit.
     """
     standstill: bool = False
     """Whether the term shapes friction near standstill: its fit has local minima and needs several initial guesses."""
@@ -138,7 +139,7 @@ _DECLARED = (
     Term(
         "inertia",
         "kg m^2",
-        "inertia of the joint's link about the joint; for joint 1, with its rotor and all mass at its end",
+        "inertia of the joint's link about the joint; for joint 1, including its rotor and the mass at its end",
         part="base",
         scale="inertia",
     ),
@@ -245,7 +246,7 @@ _DECLARED = (
     Term(
         "saturation",
         "1/(N m)^2",
-        "lost fraction of the torque, per torque squared",
+        "fraction of the torque lost, per torque squared",
         part="saturation",
         range="any",
         scale="saturation",
@@ -336,7 +337,7 @@ def term_of(name: str) -> Term:
     try:
         return TERMS[kind_of(name)]
     except KeyError:
-        raise ModelError(f"{name}: not a parameter of any model") from None
+        raise ModelError(f"{name} is not a parameter of any model") from None
 
 
 def joint_of(name: str) -> int | None:

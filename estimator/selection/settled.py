@@ -196,7 +196,7 @@ class Selection:
         return sorted(kinds.values(), key=self._left)
 
     def _steadied(self, trial: Trial | None) -> Trial | None:
-        """Correct the periods for a change of friction, if one is found and the motion is then explained as well.
+        """Correct the periods for a change of friction, if one is found and the motion is then explained equally well.
 
         The change is estimated from the uncorrected recordings, so that a later call, with a better model, replaces or
         withdraws an earlier correction. Returns the fit of the corrected periods, or else `trial`.
