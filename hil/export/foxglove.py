@@ -96,7 +96,7 @@ def scene_schema() -> dict[str, Any]:
 
 
 def _cylinder(rod: Rod) -> dict[str, Any]:
-    """A cylinder whose axis is its own z axis."""
+    """The rod as a cylinder along the z axis of its own frame."""
     along = rod.ends[1] - rod.ends[0]
     length = float(np.linalg.norm(along))
     turn, _ = Rotation.align_vectors(along[None] / length, np.array([[0.0, 0.0, 1.0]]))
