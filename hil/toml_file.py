@@ -160,7 +160,7 @@ _SYNTAX = (
     (r"^\w[\w.-]*\s*:", "Write = between key and value, not a colon."),
     (r"[“”‘’„]", "Use straight quotes."),
 )
-"""Patterns of a rejected line without its comment and quoted texts, and the likely cause of each."""
+"""Patterns of a rejected line without its comment and quoted strings, and the likely cause of each."""
 
 
 def _unquoted(line: str) -> str:

@@ -1,6 +1,6 @@
 """Foxglove's messages for a moving arm, as JSON: `foxglove.FrameTransforms` and `foxglove.SceneUpdate`.
 
-Field names are those of Foxglove's public schemas; a schema written here names only the fields that are used.
+Field names are those of Foxglove's public schemas; the schemas written here list only the fields used.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ _EMPTY = ("arrows", "lines", "triangles", "texts", "models")
 
 
 def stamp_of(nanoseconds: int) -> dict[str, int]:
-    """The time since 1970 as Foxglove writes it."""
+    """Convert a time since 1970 [ns] to a Foxglove time stamp."""
     return {"sec": nanoseconds // 1_000_000_000, "nsec": nanoseconds % 1_000_000_000}
 
 
