@@ -49,9 +49,9 @@ def refuse_degrees(source: str, names: Sequence[str], time: Values, position: Va
             continue
         raise CsvError(
             f"{source}: column {name!r} goes from {low:.4g} to {high:.4g} rad: {what}. Is it in degrees? Then correct "
-            'the unit in the column\'s header; if the header has none, set position_unit = "deg" in [columns] of --config '
-            'ARM.toml (in Python: config="ARM.toml"). If it is in rad, set position_unit = "rad" there. Check the '
-            "unit of time, too."
+            'the unit in the column\'s header; if the header has none, set position_unit = "deg" in [columns] of '
+            '--config ARM.toml (in Python: config="ARM.toml"). If it is in rad, set position_unit = "rad" there. Check '
+            "the unit of time, too."
         )
 
 
