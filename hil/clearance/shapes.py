@@ -169,7 +169,7 @@ def _pieces(capsule: Capsule) -> list[Capsule]:
 
 
 def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Capsule], list[str]]:
-    """Capsules around everything fixed to one moving link, and the reasons why shapes could not be read."""
+    """Capsules around everything fixed to one moving link, and why any shapes could not be read."""
     found, unread = [], []
     for _, rotation, translation, element in here:
         if element is None:
