@@ -305,7 +305,7 @@ def _rigid(
 ) -> tuple[Body, list[str], list[str], dict[str, Body]]:
     """Merge a link with everything attached to it.
 
-    Also returned: the names of merged links and of held joints, and the own bodies of the links that these move.
+    Also returns the names of merged links and of held joints, and the individual bodies of links that held joints move.
     """
     body, fixed, held = bodies[link], [], []
     movable: dict[str, Body] = {}
@@ -324,7 +324,7 @@ def _rigid(
 
 
 def _own(link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: set[str]) -> Iterator[tuple[str, Body]]:
-    """Yield a link and all links attached to it by any joint, each with its own body in the first one's frame."""
+    """Yield a link and all links attached to it by any joint, each with its own body in the frame of the first."""
     yield link, bodies[link]
     for joint in tree.values():
         if joint.parent == link and joint.name not in chosen:

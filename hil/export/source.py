@@ -40,7 +40,7 @@ class Source:
 class Recorded:
     """A recording, whether or not it has been estimated.
 
-    joints: names of the joints. result: what was estimated from the recording, None if nothing was.
+    joints: names of the joints. result: the estimate from the recording; None if there is none.
     """
 
     run: Path
