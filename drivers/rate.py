@@ -1,4 +1,4 @@
-"""A fixed rate from absolute deadlines: one late cycle does not delay later ones."""
+"""A fixed rate based on absolute deadlines: a late cycle does not delay later ones."""
 
 from functools import partial
 from typing import NamedTuple
@@ -13,7 +13,7 @@ class Tick(NamedTuple):
 
     deadline: when the wait should have ended [s, on the clock].
     now: when it ended [s].
-    missed: whether it ended a whole interval or more too late; if so, the caller should skip this sample.
+    missed: whether it ended at least a whole interval late; if so, the caller should skip this sample.
     """
 
     deadline: float
