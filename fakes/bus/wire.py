@@ -101,7 +101,7 @@ class Wire:
         return end
 
     def echo(self, data: bytes, start: float) -> None:
-        """Echo back to the host the data that it sends from time `start` on."""
+        """Echo the data that the host sends from time `start` on."""
         self._arriving.append(Arriving(data, start + self.byte_s + self._latency_s, self.byte_s))
         self._arriving = deque(sorted(self._arriving, key=lambda segment: segment.first))
 
@@ -142,7 +142,7 @@ class Wire:
 
     @property
     def on_the_way(self) -> int:
-        """Number of bytes that have reached the host or will do so."""
+        """Number of bytes that have reached the host or will reach it."""
         return sum(len(segment.data) for segment in self._arriving)
 
     @property

@@ -1,4 +1,4 @@
-"""Description of a spatial fake arm: a URDF's links, how the true ones differ from them, and the drives."""
+"""Description of a spatial fake arm: the links of a URDF, how the true links differ, and the drives."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -90,7 +90,7 @@ class ChainArm(Described):
 
 
 def _loaded(body: Body, mass: float, at: np.ndarray) -> Body:
-    """A body with a point mass fixed to it."""
+    """Return the body with a point mass fixed to it."""
     if mass == 0.0:
         return body
     total = body.mass + mass
