@@ -73,7 +73,7 @@ class ServoBus(TorqueSwitch):
         with ServoBus.open(BusConfig("/dev/ttyUSB0", 1_000_000, joints)) as bus, bus.torque(watchdog=0.1):
             state = bus.exchange([0.1, 0.0])
 
-    After any error the same object can still cut torque; `torque_off_report` then says whether that succeeded.
+    After any error, the same object can still cut torque; `torque_off_report` then says whether that succeeded.
     """
 
     def __init__(self, port: Port, config: BusConfig) -> None:
@@ -97,7 +97,7 @@ class ServoBus(TorqueSwitch):
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
-        """Open the port, check that the expected servos answer and that none has torque on, and set every servo's mode.
+        """Open the port, check that the expected servos answer and have torque off, and set every servo's mode.
 
         Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting or TorqueHeld, after closing the port.
         """
@@ -164,7 +164,7 @@ class ServoBus(TorqueSwitch):
             except NoReply as error:
                 raise NoReply(
                     f"{joint.title} answers pings but not reads: its Status Return Level is probably 0. Power-cycle "
-                    "it, which sets that level to 2."
+                    "it to reset that level to 2."
                 ) from error
             if firmware < joint.servo.watchdog_firmware:
                 self._no_watchdog(joint, firmware)
@@ -345,15 +345,12 @@ class ServoBus(TorqueSwitch):
 
     @property
     def heard_instead(self) -> str:
-        """Message about what was received in the last 0.1 s instead of complete and timely replies, with advice; "" if
-        nothing was received.
-        """
+        """Advice on what was received in the last 0.1 s instead of complete and timely replies; "" if nothing was."""
         return self.prepared.heard.advice(self.port.clock.now(), self.port.url)
 
     @property
     def commanded_by_another(self) -> str:
-        """Sentence about a servo that held a value not written by this program when goals were last read back; "" if
-        none.
+        """Sentence on a servo that held a value not written by this program when last read back; "" if there is none.
 
         One such value does not prove another master: a servo that misses writes holds an older goal.
         """
@@ -372,7 +369,7 @@ class ServoBus(TorqueSwitch):
         self.prepared.heard.strangers = -math.inf
 
     def read_status_next(self) -> None:
-        """Read the servos' status in the next exchange, if they report one at all."""
+        """Read the servos' status in the next exchange, if the status is read at all."""
         self.prepared.read_status_next()
 
     def check_alerts(self, state: State) -> None:

@@ -12,7 +12,7 @@ SPIN_S = 300e-6
 
 
 class Clock(Protocol):
-    """Monotonic time in seconds, and a way to wait until a given time."""
+    """A monotonic clock, in seconds, that can wait until a given time."""
 
     def now(self) -> float:
         """Return the seconds since an arbitrary start; never decreases."""

@@ -84,7 +84,7 @@ class BusShared(DriverError):
 
 
 class BusOverheard(BusShared):
-    """Packets of another master have been heard, but nothing shows that it has written anything. Example: a program
+    """Packets from another master were heard, but nothing shows that it has written anything. Example: a program
     that polls the servos' temperatures.
     """
 

@@ -160,13 +160,13 @@ class Exchange:
         self.awaited_until = -math.inf
         """Reply deadline of the latest repeated read-back, which may delay the next cycle [s on the port's clock]."""
         self.read_back_at = math.inf
-        """When `overruled` should be called again, before the next cycle [s on the port's clock]."""
+        """When to call `overruled` again, before the next cycle [s on the port's clock]."""
 
     @property
     def command_to_sample(self) -> float:
         """Wire time from the goals' arrival at the servos to the arrival of the read request [s].
 
-        With two writes the adapter may add a pause, which is not included.
+        With two writes, the adapter may add a pause, which is not included.
         """
         return self._port.wire_time(len(self._plans[0].read.request))
 

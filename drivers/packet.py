@@ -98,7 +98,7 @@ class Packet(NamedTuple):
 
 
 crc: Callable[[bytes], int] = crc16.umts
-"""The CRC-16 that the servos use: polynomial 0x8005, initial value 0, not reflected."""
+"""The CRC-16 used by the servos: polynomial 0x8005, initial value 0, not reflected."""
 
 
 def stuff(payload: bytes) -> bytes:

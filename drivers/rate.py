@@ -27,8 +27,8 @@ _tick = partial(tuple.__new__, Tick)  # half the time of Tick(...)
 class FixedRate:
     """Deadlines at `rate` per second; the first is one interval after the first call of `wait`.
 
-    After a stall the missed deadlines are returned at once, one by one and marked as missed. A caller that plays back
-    samples thus stays in step with the clock without sending a burst. `missed` counts them.
+    After a stall, each missed deadline is returned without waiting, marked as missed and counted in `missed`. A caller
+    that plays back samples thus stays in step with the clock without sending a burst.
     """
 
     def __init__(self, clock: Clock, rate: float) -> None:

@@ -8,7 +8,7 @@ from hil.drivers.packet import HEADER, MAX_LENGTH, NO_ID, Instruction, crc, unst
 from hil.drivers.port import Port
 
 PATIENCE_S = 0.018
-"""Time that set-up work waits for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
+"""How long set-up work waits for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
 
 
 _SHORTEST = 11

@@ -135,7 +135,7 @@ class ServoModel:
 
     @property
     def default_mode(self) -> Mode:
-        """Current mode if the servo has it, otherwise PWM."""
+        """Current mode if the servo has it, otherwise PWM mode."""
         return Mode.PWM if self.current_unit is None else Mode.CURRENT
 
     @property
@@ -186,8 +186,8 @@ class ServoModel:
     def torque_per_volt(self) -> Published:
         """Torque at the output shaft per volt at standstill [N m/V]: stall torque divided by supply voltage.
 
-        In PWM mode the motor's torque is this times the applied voltage, minus the effect of the back-EMF; an
-        identified viscous friction then includes the back-EMF.
+        In PWM mode, the motor torque is this value times the applied voltage, minus the effect of the back-EMF, which
+        identified viscous friction then includes.
         """
         return _spread([stall.torque / stall.voltage for stall in self.stalls])
 

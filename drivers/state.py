@@ -129,7 +129,7 @@ def _status_names(mode: Mode) -> tuple[str, ...]:
 
 
 SETTINGS = ("Drive Mode", "Operating Mode", "Homing Offset")
-"""Settings that determine what goals and angles mean, and that another program may change while torque is on, or by
+"""Settings that define the meaning of goals and angles. Another program may change them while torque is on, or by
 rebooting the servo.
 """
 
@@ -257,8 +257,8 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
 
     of: the joint index of each servo, in ascending order. count: number of joints.
     Goals and currents are summed; angle, velocity and clock are the first servo's; the lowest voltage and the highest
-    temperature are taken; an error or a missing reply of one servo applies to its joint. `apart` shows how the servos
-    of one joint disagree.
+    temperature are taken; an error or missing reply of one servo applies to its joint. `apart` shows by how much the
+    servos of one joint disagree.
     """
     servos = [[place for place, joint in enumerate(of) if joint == wanted] for wanted in range(count)]
     first = [places[0] for places in servos]

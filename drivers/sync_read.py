@@ -72,7 +72,7 @@ class Span:
         )
 
     def longer(self, by: int) -> "Span":
-        """Return the span with `by` more bytes in front of the same registers."""
+        """Return the span with `by` extra bytes before its registers."""
         return Span(self.registers, self.address - by, self.size + by, "x" * by + self.format)
 
     @classmethod

@@ -136,7 +136,7 @@ class FakeSerial(SerialBase):
         return taken
 
     def write(self, data: bytes | bytearray) -> int:  # type: ignore[override]  # pyserial's stub allows any buffer
-        """Put bytes on the wire; returns immediately, like a driver with a buffer."""
+        """Put bytes on the wire and return immediately, like a buffered driver."""
         self._open_bus().write(bytes(data))
         return len(data)
 
@@ -146,7 +146,7 @@ class FakeSerial(SerialBase):
 
     @property
     def in_waiting(self) -> int:
-        """Number of bytes that have arrived and have not been read."""
+        """Number of bytes that have arrived but have not been read."""
         return self._open_bus().in_waiting
 
     def reset_input_buffer(self) -> None:

@@ -36,15 +36,13 @@ class Heard:
         self._expected: frozenset[tuple[int, int]] = frozenset()
         self.expect(reads)
         self.damaged_at = self.late_at = -math.inf
-        """Times at which incomplete or damaged replies last arrived, and at which an unexpected reply last arrived [s
-        on the port's clock].
+        """Times of the latest incomplete or damaged replies, and of the latest late or repeated reply [s on the port's
+        clock].
         """
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """Number of replies since the last late one that had one answer per servo, but IDs that do not match the
-        request.
-        """
+        """Number of replies since the last late one with one answer per servo but IDs not matching the request."""
         self.strangers: float = 0
         """Number of received packets that this program neither sent nor requested: another master is on the bus."""
 
@@ -93,8 +91,8 @@ class Heard:
             self._was_late(now)
 
     def advice(self, now: float, url: str) -> str:
-        """Return a message about what was received in the last 0.1 s instead of complete and timely replies, with
-        advice; "" if nothing was received.
+        """Return advice on what was received in the last 0.1 s instead of complete and timely replies; "" if nothing
+        was.
         """
         since = now - _RECENT_S
         if self.late_at > since:

@@ -30,7 +30,7 @@ REMEMBERED = 128
 """Number of recent goals that a servo may still hold if writes are lost and the status has not yet detected that."""
 
 _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
-"""Numbers of read-backs of a foreign value that prove another writer, and the time in which they must occur [s].
+"""Numbers of read-backs of a foreign value that prove another writer, and the time within which they must occur [s].
 
 Three of the same value are required for a goal that this program may have written in an earlier cycle, and for 0, which
 a servo itself may have set. By then, the status would have revealed lost writes, a tripped watchdog or a reboot; and
@@ -52,7 +52,7 @@ goal in a hundred is lost, missing three of six is rarer than missing two consec
 
 _FADES = 0.98
 _IN_DOUBT_S = 0.3
-"""Time after a foreign value was read during which more such values are expected [s]."""
+"""How long after a foreign value was read more such values are expected [s]."""
 
 
 _Sightings = deque[tuple[float, int]]
@@ -120,7 +120,7 @@ class ReadBack:
 
     @property
     def read(self) -> GroupRead:
-        """The group read to send next: of the goals, or of the operating modes."""
+        """The next group read to send: goals or operating modes."""
         return self.reads[self.is_of_modes]
 
     def took(self, seconds: float) -> None:
@@ -165,7 +165,7 @@ class ReadBack:
         return None
 
     def _choose_next(self, now: float) -> None:
-        """Choose what to read next; a change of mode resets the goal, so a foreign goal may be its first sign."""
+        """Choose what to read next; since a mode change resets the goal, a foreign goal may be its first sign."""
         if self.is_of_modes:
             self._modes_due, self._goals_since = now + _MODES_S * (0.5 + self._draw.random()), 0
         else:

@@ -16,7 +16,7 @@ LISTEN_S = 0.05
 """How long the bus must be quiet before this program starts to use it [s]."""
 
 SLOWEST_S = 0.1
-"""Delay of the slowest adapter that is supported [s]."""
+"""Delay of the slowest supported adapter [s]."""
 
 _TRIPS = 5
 _TIMES, _APART_S = 6, 0.05

@@ -47,7 +47,7 @@ class TorqueOff:
     unwatched: joints, of either group, whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
     rebooted: confirmed joints whose servos had lost the watchdog that was armed before torque came on.
-    driven: joints in neither group: their servos' torque is on, because another program switches it on whenever it is
+    driven: joints in neither group, whose servos' torque is on because another program switches it on whenever it is
     cut.
     """
 
@@ -240,7 +240,7 @@ def cut_again(servo: Servo, *, armed: bool) -> bool:
 
 
 def is_torque_on(servo: Servo) -> bool | None:
-    """Whether a servo's torque is on; None if that is unknown (`has_torque`) or if it does not answer."""
+    """Whether a servo's torque is on; None if this is unknown (`has_torque`) or the servo does not answer."""
     with suppress(DriverError):
         return has_torque(servo)
     return None
@@ -258,9 +258,9 @@ def has_torque(servo: Servo) -> bool | None:
 
 
 def was_rebooted(servo: Servo) -> bool:
-    """Whether a servo's watchdog was armed but no longer is; False if the servo does not answer.
+    """Whether a servo's armed watchdog is no longer armed; False if the servo does not answer.
 
-    A late reply to an earlier request would be taken for the answer, so another register is read before and after.
+    A late reply to an earlier request would be mistaken for the answer, so another register is read before and after.
     """
     with suppress(DriverError):
         return servo.read("ID") == servo.id and servo.read("Bus Watchdog") == 0 and servo.read("ID") == servo.id

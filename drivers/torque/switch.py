@@ -53,9 +53,10 @@ class TorqueSwitch:
         return set()
 
     def refuse_switched_on(self) -> None:
-        """Check that torque is still off, after this program has found it off or switched it off.
+        """Check that torque is still off after this program has found it off or switched it off.
 
-        If it is on, another program has switched it on: torque is cut on all servos. Raises BusShared, or TorqueNotOff.
+        If it is on, another program has switched it on; torque is then cut on all servos. Raises BusShared or
+        TorqueNotOff.
         """
         if not (found := switched_on(self._servos)):
             return
@@ -169,7 +170,7 @@ class TorqueSwitch:
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
 
     def has_torque(self) -> bool:
-        """Read whether torque is on at every servo, outside the control cycle; False if one does not answer."""
+        """Read, outside the control cycle, whether torque is on at all servos; False if one does not answer."""
         return all(is_torque_on(servo) for servo in self._servos.values())
 
     def cut_foreign_torque(self, on: Collection[Joint]) -> None:

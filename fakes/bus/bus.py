@@ -61,7 +61,7 @@ class FakeBus:
         self.plant = plant
         self.clock = clock
         self.packets = 0
-        """Number of valid packets that the host has sent."""
+        """Number of valid packets sent by the host."""
         self.pulls = 0
         """Number of times the adapter's cable was unplugged. A port that was open when this happened stays lost."""
         self.cable_is_out = False
@@ -90,8 +90,8 @@ class FakeBus:
     def baud(self) -> int:
         """The host's baud rate. Servos set to another rate cannot decode anything and stay silent.
 
-        If it is changed while a reply is being received, the rest arrives as the garbage that a receiver at the wrong
-        rate reads.
+        If it is changed while a reply is being received, the rest arrives as garbage, as read by a receiver at the
+        wrong rate.
         """
         return self._wire.baud
 
@@ -183,7 +183,7 @@ class FakeBus:
 
     @property
     def in_waiting(self) -> int:
-        """Number of bytes that have reached the host and have not been read."""
+        """Number of bytes that have reached the host but have not been read."""
         return self._wire.count_by(self.clock.now())
 
     @property
@@ -211,7 +211,7 @@ class FakeBus:
     # Time
 
     def notice_faults(self) -> None:
-        """Start and end the faults that are due by the clock."""
+        """Start and end faults that are due by now."""
         now = self.clock.now()
         if now - self._origin >= self.faults.next_change:
             self.advance(now)

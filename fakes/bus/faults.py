@@ -114,9 +114,7 @@ class Fault(Described):
     """One injected fault (immutable). `servo` is the servo's bus ID when the fault begins; None means all servos."""
 
     kind: Annotated[FaultKind, Field(strict=False, description="kind of fault; see FAULTS")]
-    at: Annotated[
-        float, Field(ge=0, allow_inf_nan=False, description="when it begins [s since the bus was created]")
-    ] = 0.0
+    at: Annotated[float, Field(ge=0, allow_inf_nan=False, description="start time [s since the bus was created]")] = 0.0
     duration: Annotated[float, Field(gt=0, description="duration [s]; unlimited by default")] = math.inf
     servo: Annotated[int | None, Field(ge=0, le=252, description="bus ID of the servo; all servos by default")] = None
     probability: Annotated[
@@ -129,7 +127,7 @@ class Fault(Described):
 
     @property
     def end(self) -> float:
-        """Time at which it ends [s since the bus was created]."""
+        """Time at which the fault ends [s since the bus was created]."""
         return self.at + self.duration
 
     @property
@@ -139,7 +137,7 @@ class Fault(Described):
 
     @property
     def repeats_every(self) -> float:
-        """Period with which it recurs while it lasts [s]; infinite for a fault that happens once."""
+        """Period with which the fault recurs [s]; infinite for a fault that happens once."""
         return max(self.size, _LEAST_REPEAT_S) if self.kind is FaultKind.OTHER_MASTER else math.inf
 
     def concerns(self, servo_id: int) -> bool:
@@ -189,7 +187,7 @@ class Faults:
 
     @property
     def lasting(self) -> tuple[Fault, ...]:
-        """The faults that have begun but not ended."""
+        """The faults that have begun but not yet ended."""
         return tuple(self._lasting)
 
     def change(self, now: float) -> None:

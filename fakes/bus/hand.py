@@ -38,7 +38,7 @@ class Move(Described):
         Field(ge=-4 * math.pi, le=4 * math.pi, allow_inf_nan=False, description="joint angle at the end [rad]"),
     ] = None
     ticks: Annotated[int | None, Field(description="Present Position at the end, instead of `to`")] = None
-    at: Annotated[float, Field(ge=0, le=86400, allow_inf_nan=False, description="delay before it starts [s]")] = 0.0
+    at: Annotated[float, Field(ge=0, le=86400, allow_inf_nan=False, description="delay before the start [s]")] = 0.0
     duration: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False, description="duration of the movement [s]")] = (
         1.0
     )

@@ -25,7 +25,7 @@ from hil.fakes.servo.backup import RESET_ALL
 from hil.fakes.servo.servo import EmulatedServo
 
 Part = tuple[int, int, int]
-"""The part of a group read that concerns one servo: its ID, and the address and number of the bytes to read."""
+"""One servo's part of a group read: its ID, and the address and number of bytes to read."""
 
 
 class Line(Protocol):
@@ -67,7 +67,7 @@ class Line(Protocol):
 
 
 class Instructions:
-    """The servos on a line as receivers of packets. `route` must be called whenever an ID has changed."""
+    """How the servos on a line act on packets. `route` must be called whenever an ID has changed."""
 
     def __init__(self, servos: Sequence[EmulatedServo], line: Line) -> None:
         self._servos = tuple(servos)

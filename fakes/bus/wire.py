@@ -13,7 +13,7 @@ ROUNDING_S = 1e-9
 
 
 class Arriving(NamedTuple):
-    """Bytes on their way to the host.
+    """Bytes in transit to the host.
 
     first: arrival time of the first byte [s].
     byte_s: time between two bytes [s].
@@ -44,7 +44,7 @@ _arriving = partial(tuple.__new__, Arriving)  # half the time of Arriving(...)
 
 
 class Wire:
-    """Replies in transit, ordered by their arrival at the host, `latency_s` after they were on the wire."""
+    """Replies in transit, ordered by arrival time at the host, which is `latency_s` after transmission."""
 
     def __init__(self, baud: int, latency_s: float) -> None:
         self._set_baud(baud)

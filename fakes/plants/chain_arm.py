@@ -65,7 +65,7 @@ class ChainArm(Described):
 
     @property
     def description(self) -> ArmDescription:
-        """The arm as its URDF describes it; raises ArmFileError."""
+        """The arm as described by its URDF; raises ArmFileError."""
         return read_arm(Path(self.urdf), self.joints)
 
     @property

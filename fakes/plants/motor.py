@@ -21,7 +21,7 @@ JAM = 1e6  # N m of dry friction: more than any drive here can overcome
 
 
 class Motor:
-    """The physics of one drive. Its state consists of its current and the deflection of its friction's bristles."""
+    """The physics of one drive. Its state consists of its current and the deflection of its friction bristles."""
 
     __slots__ = (
         "_bent",

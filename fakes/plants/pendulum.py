@@ -1,4 +1,4 @@
-"""One link and one joint: the plant of `hil.fakes.plants.two_link` without its second link."""
+"""An arm with one link and one joint: the plant of `hil.fakes.plants.two_link` without its second link."""
 
 from collections.abc import Sequence
 from math import ceil, copysign, cos

@@ -24,7 +24,7 @@ Blocks = tuple[tuple[int, int, int], ...]
 
 @dataclass(frozen=True, slots=True)
 class RegisterFacts:
-    """Properties of a register that its control table does not contain. `limits` None: the full range of its bytes."""
+    """Properties of a register missing from control tables. `limits` is None for the full range of its bytes."""
 
     initial: int = 0
     limits: tuple[int, int] | None = None
@@ -32,9 +32,7 @@ class RegisterFacts:
 
 
 class Motor(NamedTuple):
-    """A motor's figures as published for the nominal voltage [V]: stall current [A], no-load speed of the output
-    shaft [rev/min].
-    """
+    """Published motor data at the nominal voltage [V]: stall current [A], no-load speed of the output shaft [rev/min]."""
 
     voltage_v: float
     stall_a: float

@@ -36,7 +36,7 @@ Share = Callable[[float, float], float]
 
 
 class Present:
-    """The encoder, the current sensor and the clock of one servo."""
+    """Encoder, current sensor and clock of one servo."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Present:
         self.position_sign = direction
         """+1 or -1: sign of the servo's position relative to the joint's; Reverse Mode inverts it on every model."""
         self.jump_ticks = 0
-        """Error of the encoder injected by a fault [ticks]."""
+        """Encoder error injected by a fault [ticks]."""
         self._memory = memory
         self._model = model
         self._clock_rate = clock_rate

@@ -79,7 +79,7 @@ class EmulatedServo(Powered):
         super().__init__(model, Memory(model), health, supply_v)
         self.firmware = firmware
         self.has_fast_reads = firmware >= model.fast_read_firmware
-        """Whether it supports Fast Sync Read, Fast Bulk Read and Control Table Backup."""
+        """Whether the servo supports Fast Sync Read, Fast Bulk Read and Control Table Backup."""
         self.connected = True
         """False if its bus cable is disconnected: it neither receives nor replies; its motor keeps its last command."""
         self.heard_at = 0.0
@@ -161,7 +161,7 @@ class EmulatedServo(Powered):
         self.power_up(now, self._angle, boot_s)
 
     def hears(self, now: float, baud: int) -> bool:
-        """Return whether a packet at this baud rate that ends at `now` [s] is understood."""
+        """Return whether the servo receives a packet at this baud rate that ends at `now` [s]."""
         return self.baud == baud and self.connected and now >= self.ready_at
 
     def trip_watchdog(self) -> None:
@@ -235,10 +235,10 @@ class EmulatedServo(Powered):
     def execute(
         self, instruction: int, body: bytes, now: float, moving: bool, *, shadow: bool = False
     ) -> tuple[int, bytes]:
-        """Execute an instruction addressed to this servo; return the error number and the data of the status.
+        """Execute an instruction addressed to this servo; return the error number and data of the status packet.
 
         The error number excludes the Alert bit. shadow: the instruction was addressed to the Secondary ID. Read is not
-        among these instructions: the bus handles it with `read`, after updating the measurements.
+        included: the bus handles it with `read`, after updating the measurements.
         """
         if instruction in (Instruction.WRITE, Instruction.REG_WRITE) and len(body) < 3:
             return StatusError.DATA_LENGTH, b""
