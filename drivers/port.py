@@ -471,7 +471,7 @@ def _advice(error: BaseException, url: str) -> str:
     if "exclusively lock" in text or "busy" in text:
         return "Another program has it open; close it first. ModemManager holds new ports open for half a minute."
     if "No such file" in text and "://" in url:
-        return "The file in this URL does not exist; a relative path starts at the file or folder that names it."
+        return "The file in this URL does not exist; a relative path is resolved from the file or folder that names it."
     if "No such file" in text:
         return "Is the adapter plugged in? `hil scan` lists the ports that exist."
     if "ioctl" in text:

@@ -23,7 +23,7 @@ _Place = Annotated[float, Field(ge=-3, le=3)]
 class ChainArm(Described):
     """A serial arm of up to seven joints in space. The servos' bodies are part of the URDF's links."""
 
-    urdf: str = Field(description="URDF file with the links; a relative path starts at the TOML file's folder")
+    urdf: str = Field(description="URDF file with the links; absolute, or relative to the TOML file's folder")
     joints: tuple[str, ...] = Field(
         strict=False,
         min_length=1,

@@ -32,7 +32,7 @@ class RegisterFacts:
 
 
 class Motor(NamedTuple):
-    """Published motor data at the nominal voltage [V]: stall current [A], no-load speed of the output shaft [rev/min]."""
+    """Published motor data: nominal voltage [V], stall current [A], no-load speed of the output shaft [rev/min]."""
 
     voltage_v: float
     stall_a: float
