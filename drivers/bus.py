@@ -182,7 +182,7 @@ class ServoBus(TorqueSwitch):
         """Ensure that every servo's torque is off before anything is written.
 
         If it is not, raises TorqueHeld, or lets the arm sink if `BusConfig.take_over` is set.
-        ours: joints whose torque an earlier program of this user left on; it is cut immediately.
+        ours: joints whose torque was left on by an earlier program of this user; that torque is cut immediately.
         """
         for joint in ours:
             if self._servos[joint].read("Torque Enable"):
@@ -331,9 +331,7 @@ class ServoBus(TorqueSwitch):
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """Index of a joint that has missed many of the latest goals, and a text stating the value read back; None if no
-        joint has.
-        """
+        """Index of a joint that has missed many of the latest goals, and text with the value read back; else None."""
         if (lost := self.prepared.lost) is None:
             return None
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"
@@ -345,7 +343,7 @@ class ServoBus(TorqueSwitch):
 
     @property
     def heard_instead(self) -> str:
-        """Advice on what was received in the last 0.1 s instead of complete and timely replies; "" if nothing was."""
+        """Advice on bytes received in the last 0.1 s instead of complete and timely replies; "" if there were none."""
         return self.prepared.heard.advice(self.port.clock.now(), self.port.url)
 
     @property
@@ -380,7 +378,7 @@ class ServoBus(TorqueSwitch):
             raise ServoFault(" ".join(faults))
 
     def _faults(self, joint: Joint) -> str:
-        """Return text on the faults of a joint's servos after one of them has set its alert bit."""
+        """Describe the faults of a joint's servos after one of them has set its alert bit."""
         texts = [self._fault(drive, alone=len(joint.drives) == 1) for drive in joint.drives]
         return " ".join(filter(None, texts))
 

@@ -155,7 +155,7 @@ class Port:
         return count * 10 / self.baud
 
     def reply_time(self, timeout: float, sent: int) -> ReplyTime:
-        """Return the reply times, for `ask`, of a request of `sent` bytes whose reply is lost after `timeout` [s]."""
+        """Return the ReplyTime that `ask` needs for a request of `sent` bytes with this timeout [s]."""
         return ReplyTime(timeout, int(timeout * 1e3), _EARLY_BITS * sent / self.baud)
 
     def write(self, data: bytes) -> None:

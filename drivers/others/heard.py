@@ -91,9 +91,7 @@ class Heard:
             self._was_late(now)
 
     def advice(self, now: float, url: str) -> str:
-        """Return advice on what was received in the last 0.1 s instead of complete and timely replies; "" if nothing
-        was.
-        """
+        """Return advice on bytes received in the last 0.1 s instead of complete and timely replies; "" if none."""
         since = now - _RECENT_S
         if self.late_at > since:
             return (
@@ -124,9 +122,7 @@ class Heard:
             self.strangers += sum(self._is_strange(packet) for packet in packets)
 
     def _is_strange(self, packet: Packet) -> bool:
-        """Whether this is another master's instruction or a reply to one. A reply without data may be ours, e.g. an
-        error.
-        """
+        """Whether this is another master's instruction or a reply to one. Errors without data may be ours."""
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected

@@ -52,7 +52,7 @@ goal in a hundred is lost, missing three of six is rarer than missing two consec
 
 _FADES = 0.98
 _IN_DOUBT_S = 0.3
-"""How long after a foreign value was read more such values are expected [s]."""
+"""Time during which more foreign values are expected after one was read [s]."""
 
 
 _Sightings = deque[tuple[float, int]]

@@ -45,7 +45,7 @@ def refuse_held(servos: Mapping[Joint, Servo]) -> None:
 
 
 def switched_on(servos: Mapping[Joint, Servo]) -> str:
-    """Return text on the servos with torque on and their currents; "" if none. Same errors as `Servo.read`."""
+    """Describe the servos with torque on and their currents; "" if none. Raises the same errors as `Servo.read`."""
     on = [servo for servo in servos.values() if servo.read("Torque Enable") and has_torque(servo)]
     return " and ".join(f"{servo.title}{_current(joint, servo)}" for joint, servo in servos.items() if servo in on)
 

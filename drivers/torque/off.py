@@ -32,7 +32,7 @@ _INTERRUPTS_BORNE = 5
 """Number of attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
-"""Longest time after its timeout at which a watchdog may act [s], since it counts in steps of 20 ms."""
+"""Maximum delay of a watchdog beyond its timeout [s], since it counts in steps of 20 ms."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
 """Number of further torque-off packets and the time between them [s]: a packet that collides with a reply is lost."""
@@ -258,7 +258,7 @@ def has_torque(servo: Servo) -> bool | None:
 
 
 def was_rebooted(servo: Servo) -> bool:
-    """Whether a servo's armed watchdog is no longer armed; False if the servo does not answer.
+    """Whether a servo's watchdog has been disarmed, as by a reboot; False if the servo does not answer.
 
     A late reply to an earlier request would be mistaken for the answer, so another register is read before and after.
     """

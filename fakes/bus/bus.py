@@ -102,7 +102,7 @@ class FakeBus:
 
     @property
     def servos(self) -> dict[int, EmulatedServo]:
-        """The servos by current ID (the last if several have the same), in their state at the clock's current time."""
+        """The servos by current ID (the last if several share one), in their state at the clock's current time."""
         self.advance(self.clock.now())
         return {servo.id: servo for servo in self._servos}
 
