@@ -60,7 +60,7 @@ class BusConfig:
     def __post_init__(self) -> None:
         ids = [drive.id for joint in self.joints for drive in joint.drives]
         if len(set(ids)) < len(ids):
-            raise ValueError(f"Servo IDs must be unique, but they are {', '.join(map(str, ids))}.")
+            raise ValueError(f"The servos' IDs are {', '.join(map(str, ids))}, but each must be unique.")
 
     def is_same_arm(self, other: "BusConfig") -> bool:
         """Return whether both configurations describe the same servos on the same port."""
