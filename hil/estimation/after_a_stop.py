@@ -1,4 +1,4 @@
-"""What a stopped run still contains, and the command to continue with."""
+"""What is kept of a stopped run, and the command to continue with."""
 
 from pathlib import Path
 
@@ -53,6 +53,6 @@ def can_be_estimated(path: Path) -> bool:
 
 
 def _steps(path: Path) -> list[Path]:
-    """Folders of the runs before the last one, oldest first."""
+    """Folders of the runs that preceded the final one, oldest first."""
     found = [each.parent for each in path.glob("*/samples.npy")]
     return sorted(found, key=lambda folder: (folder / "samples.npy").stat().st_mtime)

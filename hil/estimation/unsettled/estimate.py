@@ -41,7 +41,7 @@ START_CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the inverse dynamics that start the li
 START_WIDTH = 0.05  # rad/s
 JUMPED = (
     "A position jumped (see the warnings), so angles before and after the jump are inconsistent: use only the part "
-    "before or after it, or put each part in a file of its own."
+    "before or after it, or put each part in a separate file."
 )
 NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 
@@ -49,7 +49,7 @@ NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 @dataclass(frozen=True)
 class Estimated:
     """An estimate from recordings. result: complete except for the fields that the caller fills in. predicted:
-    positions per recording (joints, samples) [rad]; NaN if there is none.
+    positions per recording (joints, samples) [rad]; NaN if there are none.
     """
 
     result: ShootingResult
