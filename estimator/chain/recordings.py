@@ -73,7 +73,7 @@ class RecordedChain:
     value: Array
     covariance: Array
     simulated: bool
-    """Whether stage 2 was used; False if only the regression was, because the torque was measured."""
+    """Whether stage 2 was used; False if only the regression was used because the torque was measured."""
     residual_over_noise: Array
     """RMS of the one-step-ahead residual relative to the noise of the angles (joints,); NaN for a regression."""
     residual: Array
@@ -202,7 +202,7 @@ def _torque_residual(recordings: Sequence[Recording], model: ChainModel, value: 
 
 
 def _beginning(piece: MotionPiece) -> PeriodicMotion:
-    """Return the motion, with velocities from smoothed angles; only those at its beginning and their RMS matter."""
+    """Return the motion, with velocities from smoothed angles; only its initial state and RMS velocity are used."""
     position = piece.filled()
     kernel = np.ones(VELOCITY_SAMPLES) / VELOCITY_SAMPLES
     padded = np.pad(position, ((0, 0), (VELOCITY_SAMPLES // 2,) * 2), mode="edge")

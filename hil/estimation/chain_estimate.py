@@ -121,7 +121,7 @@ def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
 
     A link moved by several joints couples their torques, so inexact torque constants contradict each other. Their
     ratios are therefore parameters if the configuration gives an uncertainty. Each joint has its own lag: servo models
-    differ, and neglecting half a millisecond makes the inertias of light joints wrong by several percent.
+    differ, and neglecting half a millisecond biases the inertias of light joints by several percent.
     """
     wanted = config.model
     scales = known.base.chain.joints > 1 and (wanted.torque_scale or known.prior.scale_precision is not None)

@@ -10,7 +10,7 @@ creeping motion would seem to identify a light joint, whose torque is mostly fri
 
 This designer is for the pilot experiment, where only limits are known: it also chooses the centre and width of the
 motion. For a box that the user has chosen, `fourier_path.design_path` is simpler; its criterion, the prediction of
-other motions in that box, needs the box to be given.
+other motions in that box, requires a given box.
 """
 
 from collections.abc import Callable

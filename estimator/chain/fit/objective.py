@@ -40,7 +40,7 @@ class _Latest:
     settings: tuple[float, ...] = ()
     """Other settings on which the simulation depends."""
     parts: dict[int, list[tuple[slice, Array, Array]]] = field(default_factory=dict)
-    """Samples, angles and derivatives of each period that was simulated to its end."""
+    """Samples, angles and derivatives of each period that was simulated to the end."""
     size: int = 0
 
 

@@ -16,7 +16,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 
-MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
+MEANINGS = {"lag_ratio": "ratio of the lag of the joint's current loop to joint 1's"}
 """Meanings of the kinds of parameters specific to chains."""
 PART = 0.1
 """`limited` names a joint's back-EMF only if the joint contributes more than this fraction to the motion that loses the

@@ -1,4 +1,4 @@
-"""A weak prior from a description of the arm, for what the data do not determine: base parameters, torque constants."""
+"""Weak prior, from a description of the arm, on base parameters and torque constants that the data do not determine."""
 
 from dataclasses import dataclass
 

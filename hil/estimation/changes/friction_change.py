@@ -1,4 +1,4 @@
-"""Whether one joint's friction changed between two runs, tested with the full covariance of its parameters.
+"""Test whether one joint's friction changed between two runs, using the full covariance of its parameters.
 
 Coulomb friction, its rise at low speed and the speed at which it falls are known far better in combination than
 individually: a change of one of them by 10 % may be less than its own standard error and still be obvious. Let d be the
@@ -33,15 +33,15 @@ KINDS = ("viscous", "coulomb", "coulomb_width", "stribeck_rise", "stribeck_veloc
 rise.
 """
 REPEATABILITY = 0.005
-"""Standard deviation of a friction parameter from run to run of an unchanged arm, relative to its value."""
+"""Run-to-run standard deviation of a friction parameter of an unchanged arm, relative to its value."""
 
 
 @dataclass(frozen=True)
 class FrictionChange:
     """The friction of one joint in two runs.
 
-    term: the term that explains the difference best if it alone changed. before, after: its values if nothing else in
-    the joint's friction changed. std: standard error of that change [unit of the term]. z: change in standard errors.
+    term: the single term whose change explains the difference best. before, after: its values if nothing else in the
+    joint's friction changed. std: standard error of that change [unit of the term]. z: change in standard errors.
     p: probability of a difference at least this large, in any term, if the joint is unchanged. stds: standard error of
     the change of each term alone [unit of the term].
     """

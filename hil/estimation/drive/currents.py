@@ -73,7 +73,7 @@ def settled_current_findings(config: Config, samples: NDArray[np.void]) -> Curre
 
 
 def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Array, Array]]:
-    """Name, goals and currents of each joint that is driven by current and measures its motor's."""
+    """Name, goals and currents of each joint that is driven by current and measures its motor current."""
     return [
         (joint.name, samples["goal_current"][:, index], samples["current"][:, index])
         for index, joint in enumerate(config.joints)

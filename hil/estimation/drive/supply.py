@@ -5,7 +5,7 @@ and i v if it is driven with current i. The resistance of the supply turns this 
 register is read only a few times a second, in steps of 0.1 V. A regression of its readings on these products over the
 whole recording nevertheless gives the drop at every sample.
 
-A voltage-driven joint receives its duty cycle times the supply voltage of that moment: its torque sags with it. A
+A voltage-driven joint receives its duty cycle times the supply voltage at that moment: its torque sags with it. A
 current-driven joint is not affected as long as its servo can still drive the current.
 """
 

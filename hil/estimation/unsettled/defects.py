@@ -97,7 +97,7 @@ def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> t
             said = f"The friction of {whose} seems to differ by {percent} at the beginning and to settle {when}"
             return said, "Let the arm move for some minutes before you record, so that it is warm."
         case "linear":
-            said = f"The friction of {whose} seems to change {when}, by {percent} of its value at the beginning"
+            said = f"The friction of {whose} seems to change {when}, by {percent} of its initial value"
             return said, "Let the arm move for some minutes before you record, so that it is warm."
         case "recording":
             return f"The friction of {whose} seems to differ by {percent} {when}", "Estimate each recording separately."

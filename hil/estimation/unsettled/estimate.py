@@ -64,7 +64,7 @@ class Given:
     torque_scale_std: relative standard deviation of the ratio of the torque constants, by parameter. zeros: whether a
     configuration defines the encoder zeros. names: names of the recordings. jumps: a sentence for each joint of a
     recording whose position jumped. torque_source: where the torques come from. origin: the angles [rad] at which the
-    columns of positions are 0, by default 0.
+    position columns are 0, by default 0.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
@@ -146,7 +146,7 @@ def estimate_any(
 def _judged(
     fitted: Fitted, given: Given, why: tuple[str, ...], held_out: NDArray[np.float64] | None, found: Doubts
 ) -> Verdict:
-    """The verdict. why: sentences on what is wrong with the recordings."""
+    """The verdict. why: sentences on defects of the recordings."""
     recordings, estimate = fitted.recordings, fitted.estimate
     conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
     ratios = ratios_of(estimate.names, estimate.value, estimate.std)
@@ -193,7 +193,7 @@ def joint_names(count: int) -> tuple[str, ...]:
 
 
 def _start(recordings: Sequence[Recording]) -> NDArray[np.float64]:
-    """Base parameters by inverse dynamics, filtered as lightly as the recordings' rate and length allow."""
+    """Base parameters from inverse dynamics, filtered as lightly as the recordings' rate and length allow."""
     for cutoff in START_CUTOFFS[:-1]:
         try:
             return fit_inverse_dynamics(recordings, cutoff, START_WIDTH).value

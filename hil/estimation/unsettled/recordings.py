@@ -246,7 +246,7 @@ def _keep(
 
 
 def _as_toml(config: RecordingConfig, columns: Columns) -> str:
-    """A configuration with which the same files give the same result."""
+    """A configuration that reproduces the result from the same files."""
     lines = [
         "# How `hil estimate` interpreted the columns.",
         "[arm]",
