@@ -80,7 +80,7 @@ class ChainEstimate(FittedParameters):
     at_bound: tuple[str, ...] = ()
     """Parameters at a bound although the data favour values beyond it; empty unless this affects base parameters."""
     conflicts: tuple[Conflict, ...] = ()
-    """Values far from what was known beforehand, the largest contradiction first."""
+    """Values that contradict prior knowledge, worst first."""
 
     @property
     def over_noise(self) -> Array:

@@ -92,7 +92,7 @@ class RecordedChain:
     """Largest ratio of the base parameters' standard errors to those under white noise; 1 for a regression."""
     at_bound: tuple[str, ...] = ()
     conflicts: tuple[Conflict, ...] = ()
-    """Values far from what was known beforehand, the largest contradiction first."""
+    """Values that contradict prior knowledge, worst first."""
 
     @property
     def std(self) -> Array:

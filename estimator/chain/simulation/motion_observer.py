@@ -1,4 +1,4 @@
-"""Checks at every sample whether the motion of a spatial arm is consistent with what is known about it.
+"""Check at every sample whether the motion of a spatial arm is consistent with its known parameters.
 
 Angles, velocities and commanded torques pass through the same first-order low-pass filter, which also yields
 accelerations. The residual torque, `torque - Y(q, v, a) theta`, is compared with its uncertainty, due to the

@@ -32,7 +32,7 @@ DRIVE_TERMS = ("viscous", "coulomb", "offset", "coulomb_width", "torque_scale", 
 
 @dataclass(frozen=True)
 class ChainArms:
-    """An ensemble of arms, each of which may be the real one.
+    """An ensemble of arms, each a candidate for the real one.
 
     rigid: base parameters (arms, base parameters) [SI].
     drive: DRIVE_TERMS (arms, 6, joints) [SI]; `torque_scale` is the ratio of true to commanded torque.

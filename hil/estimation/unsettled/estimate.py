@@ -59,7 +59,7 @@ class Estimated:
 
 @dataclass(frozen=True)
 class Given:
-    """What is known about the drives and encoders beforehand.
+    """Prior knowledge of the drives and encoders.
 
     torque_scale_std: relative standard deviation of the ratio of the torque constants, by parameter. zeros: whether a
     configuration defines the encoder zeros. names: names of the recordings. jumps: a sentence for each joint of a
@@ -178,7 +178,7 @@ def _judged(
 
 
 def conflicts_in(estimate: ShootingEstimate, given: Given) -> tuple[Conflict, ...]:
-    """Estimated values that are far from what is known beforehand."""
+    """Estimated values that contradict prior knowledge."""
     names, value, std = [*estimate.names], [*estimate.value], [*estimate.std]
     if given.zeros:
         for zero, error in zip(estimate.zeros, estimate.zeros_std, strict=True):

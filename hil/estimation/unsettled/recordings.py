@@ -35,7 +35,7 @@ MOST_RECORDINGS = 200
 
 @dataclass(frozen=True)
 class _Read:
-    """All recordings of one arm. notes: what was guessed, corrected or averaged, in sentences. doubts: contradictions
+    """All recordings of one arm. notes: sentences on what was guessed, corrected or averaged. doubts: contradictions
     among the columns.
     """
 
