@@ -71,8 +71,8 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     currents = settled_current_findings(config, samples)
     truth, extra = true_chain_parameters(config, known), _quantities(estimate, linear, len(estimate.names))
     result = SettledResult(
-        method="settled period, least squares on Fourier lines, then maximum likelihood of each position by "
-        f"one-step-ahead prediction with an observer of {estimate.softness:g} Hz; {model.description}",
+        method="settled period, least squares on Fourier lines, then maximum likelihood of one-step-ahead "
+        f"position predictions with an observer of {estimate.softness:g} Hz; {model.description}",
         config=facts.config,
         joints=len(config.joints),
         parameters=_quantities(estimate, 0, linear),
@@ -121,7 +121,7 @@ def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
 
     A link moved by several joints couples their torques, so inexact torque constants contradict each other. Their
     ratios are therefore parameters if the configuration gives an uncertainty. Each joint has its own lag: servo models
-    differ, and neglecting half a millisecond makes the inertias of light joints wrong by several percent.
+    differ, and neglecting half a millisecond biases the inertias of light joints by several percent.
     """
     wanted = config.model
     scales = known.base.chain.joints > 1 and (wanted.torque_scale or known.prior.scale_precision is not None)
@@ -295,12 +295,12 @@ def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_p
 
 
 def is_explained(estimate: ChainEstimate) -> bool:
-    """Whether the residual is only noise, so that nothing suggests an effect missing from the model."""
+    """Whether the residual is only noise, with no sign of an effect missing from the model."""
     return float(estimate.over_noise.max()) <= EXPLAINED and estimate.systematic <= SYSTEMATIC
 
 
 def _unexplained(config: Config, estimate: ChainEstimate) -> str:
-    """How large the residual is compared with the noise, and what that says about the model."""
+    """Describe the residual relative to the noise, and what it implies for the model."""
     over, joint = float(estimate.over_noise.max()), int(np.argmax(estimate.over_noise))
     noise = float(estimate.noise_steps[joint])
     measured = (
@@ -317,7 +317,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     tried = ""
     if estimate.model.friction != "stribeck_load":
         if config.model.friction == "auto":
-            tried = " Friction that depends on the load was tried and does not explain it."
+            tried = " Load-dependent friction was tried and does not explain it."
         else:
             causes = f'load-dependent friction ([model] friction = "auto" tries that), {causes}'
     if over > EXPLAINED:

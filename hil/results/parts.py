@@ -275,9 +275,10 @@ class ChainFacts:
     """Facts from the URDF of a spatial arm, which define its base parameters.
 
     urdf: file name, relative to the configuration. rotation, translation [m]: pose of each joint's frame in the
-    previous link's frame. axis: joint axis in its own frame. gravity: gravity in the base frame [m/s^2]. groups: linear
-    combination that each base parameter represents. from_prior: parameters that the recording barely constrains, taken
-    from the URDF. held: joints of the URDF that are treated as fixed. doubts: warnings about implausible inertias.
+    previous link's frame. axis: joint axis in the joint's frame. gravity: gravity in the base frame [m/s^2]. groups:
+    linear combination that each base parameter represents. from_prior: parameters that the recording barely constrains,
+    taken from the URDF. held: joints of the URDF that are treated as fixed. doubts: warnings about implausible
+    inertias.
     """
 
     urdf: str
@@ -335,7 +336,7 @@ class StabiliserShare:
 
 @dataclass(frozen=True)
 class PlayedStep:
-    """One run with a pilot, on the way to full amplitude: its predicted and measured peaks.
+    """One step of a pilot on the way to full amplitude, with its predicted and measured peaks.
 
     The rows of predicted and measured peaks are the quantities of hil.dry_run.prediction.QUANTITIES, the columns are
     the joints. peak_torque: peak torque per joint [N m]. ended: why the run ended early; None if it did not.

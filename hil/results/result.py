@@ -109,7 +109,7 @@ class Result:
 
     @property
     def _residual(self) -> str:
-        """The residual in encoder steps; without them, in mrad."""
+        """The residual in encoder steps, or in mrad if their size is unknown."""
         if steps := ", ".join(f"{value:.3f}" for value in self.fit.residual_rms_ticks):
             return f"residual {steps} encoder steps RMS"
         angles = getattr(self.fit, "residual_rms_rad", ())

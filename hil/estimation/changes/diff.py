@@ -56,7 +56,7 @@ class Difference:
     """The changes from one run to another.
 
     only_before, only_after: terms that only one of the two models has. detectable: smallest change of each friction
-    term alone that two runs like these would show with a probability of 95 % [% of its value before].
+    term alone that two runs like these would show with a probability of 95 % [% of its earlier value].
     """
 
     before: str

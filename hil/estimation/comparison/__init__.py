@@ -1,1 +1,1 @@
-"""Other methods on the recording of a run, compared with its result."""
+"""Other methods applied to the recording of a run, compared with its result."""

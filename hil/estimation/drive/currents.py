@@ -41,7 +41,7 @@ current.
 
 @dataclass(frozen=True)
 class CurrentFindings:
-    """What is wrong with the currents of a recording.
+    """Problems with the currents of a recording.
 
     warnings: one sentence per joint whose current was not the commanded one. disturbances: a sentence for the verdict
     if a current was neither the commanded one nor merely clipped.
@@ -73,7 +73,7 @@ def settled_current_findings(config: Config, samples: NDArray[np.void]) -> Curre
 
 
 def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Array, Array]]:
-    """Name, goals and currents of each joint that is driven by current and measures its motor's."""
+    """Name, goals and currents of each joint that is driven by current and measures its motor current."""
     return [
         (joint.name, samples["goal_current"][:, index], samples["current"][:, index])
         for index, joint in enumerate(config.joints)
@@ -82,7 +82,7 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
 
 
 def _other(name: str, goal: Array, measured: Array) -> str:
-    """Say that the current was not the commanded one; "" if it was, or was only clipped."""
+    """Describe a current that was not the commanded one; "" if it was, or was merely clipped."""
     if len(goal) < _RECENT or not goal.any():
         return ""
     recent = np.lib.stride_tricks.sliding_window_view(goal, _RECENT)
@@ -136,7 +136,7 @@ def _short_part(goal: Array, measured: Array) -> float:
 
 
 def _follows_small_goals(goal: Array, measured: Array) -> float:
-    """Ratio of the measured to the commanded current while the goal is far below what the motor has carried."""
+    """Ratio of the measured to the commanded current while the goal is far below the motor's largest current."""
     least = _least(goal)
     most = np.nanquantile(np.abs(measured), 0.99)
     small = (least > _LEAST * most) & (least < _SMALL * most) & np.isfinite(measured[1:])

@@ -1,6 +1,4 @@
-"""Whether several recordings show the same arm: a change of load must not be mistaken for a missing term of the
-model.
-"""
+"""Check whether several recordings show the same arm, lest a change of load be mistaken for a missing model term."""
 
 from collections.abc import Sequence
 

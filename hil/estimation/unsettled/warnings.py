@@ -36,7 +36,7 @@ def doubts_of(
 ) -> Doubts:
     """Find what looks wrong in the recordings, or in how the estimate explains them.
 
-    cause_known: whether the verdict says why much of the motion is unexplained. gravity: whether it acts in the
+    cause_known: whether the verdict says why much of the motion is unexplained. gravity: whether gravity acts in the
     arm's plane.
     """
     faults, doubts, warnings = _signs(recordings), [], _rows(recordings)
