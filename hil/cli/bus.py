@@ -117,7 +117,7 @@ def pose(
 def setup(
     port: PortOrFile,
     servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's current ID.")],
-    baud: Annotated[int, typer.Option("--baud", help="Its current baud rate.")] = 1_000_000,
+    baud: Annotated[int, typer.Option("--baud", help="The servo's current baud rate.")] = 1_000_000,
     new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252, help="ID to set.")] = None,
     new_baud: Annotated[int | None, typer.Option("--new-baud", help="Baud rate to set.")] = None,
     return_delay_us: Annotated[

@@ -32,7 +32,7 @@ Live = Annotated[
     typer.Option(
         "--live",
         metavar="WHERE",
-        help="Where to show the run: terminal, rerun (its viewer), rerun:FILE.rrd or rerun:URL; see docs/commands.md.",
+        help="Where to show the run: terminal, rerun (viewer), rerun:FILE.rrd or rerun:URL; see docs/commands.md.",
     ),
 ]
 Recordings = Annotated[

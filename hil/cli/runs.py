@@ -12,7 +12,7 @@ from hil import strict_json
 from hil.cli.options import Json, RunPath
 
 _WHOLE = 100.0
-"""Smallest detectable change [%] above which the output gives no figure: the runs reveal nothing about that term."""
+"""Detectable change [%] above which the output gives no figure, because the runs reveal nothing about that term."""
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -39,7 +39,7 @@ def runs(
 
 
 def _print_runs(found: "list[RunSummary]") -> None:
-    """A table; if the terminal is too narrow for it, each run's path on a separate line, so that it can be copied."""
+    """Print a table; if the terminal is too narrow, put each run's path on a separate line so that it can be copied."""
     from rich.markup import escape
     from rich.table import Table
 

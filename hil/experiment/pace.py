@@ -1,4 +1,4 @@
-"""When the exchanges of a stream are due: the samples, the exchanges between them, and the read-backs before each."""
+"""Timing of a stream's exchanges: samples, exchanges between samples, and the read-backs before each."""
 
 from collections.abc import Iterator, Sequence
 from math import inf
@@ -64,7 +64,7 @@ class Pace:
     def between(self, goal: Sequence[float]) -> Iterator[State]:
         """Exchange the same goals until the next sample is due; yield each state.
 
-        An exchange that might delay the next sample is left out: the adapter may be slow, or a servo silent.
+        An exchange that might delay the next sample is skipped: the adapter may be slow, or a servo silent.
         """
         if self._deadline is None:
             return

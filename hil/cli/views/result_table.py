@@ -98,7 +98,7 @@ def _parameters(result: SettledResult, truth: Truth) -> Table:
 
 
 def _shown(entry: Quantity) -> list[str]:
-    """Value and standard error; no digits of a value about which the motion provides no information."""
+    """Return value and standard error; no digits if the motion provides no information about the value."""
     return [f"{entry.value:.5g}", f"{entry.std:.1e}"] if entry.std < math.inf else ["undetermined", "-"]
 
 
@@ -190,7 +190,7 @@ def _next(result: SettledResult, run: Path) -> list[str]:
 
 
 def what_next(result: Result, run: Path) -> str:
-    """The line that names the next command: export, or another estimate if the numbers should not be used."""
+    """Return the line that names the next command: export, or another estimate if the numbers should not be used."""
     if _is_useless(result):
         return next_step("estimate", run)
     return next_step("export", run, "--format", _usual_format(result))
@@ -201,6 +201,6 @@ def _is_useless(result: Result) -> bool:
 
 
 def _usual_format(result: Result) -> str:
-    """A format that can hold this arm: MJCF needs the length of link 1, which can only be determined with gravity."""
+    """Return a format that suits this arm: MJCF needs the length of link 1, which only gravity reveals."""
     flat = result.chain is None and result.arm is not None and not result.arm.gravity
     return "toml" if flat else "mjcf"
