@@ -77,8 +77,9 @@ class Repetition:
         self._compare = only_version(_add)
 
     def begin(self, samples: int, *, anew: bool = False) -> None:
-        """Start a new period of `samples` samples. anew: whether its torque differs from the previous period's. The
-        buffer is not cleared: that would take too long between two samples.
+        """Start a new period of `samples` samples. anew: whether its torque differs from the previous period's.
+
+        The buffer is not cleared: that would take too long between two samples.
         """
         self._anew = anew
         self._half = samples // 2

@@ -189,8 +189,9 @@ def _moved_without_torque(config: Config, bus: ServoBus, recorder: Recorder) -> 
 
 
 def _try_again(bus: ServoBus, note: Note) -> None:
-    """Keep cutting the torque of servos that did not answer, for as long as a servo takes to boot. Their watchdogs have
-    acted by now, if they were still armed, so packets can no longer delay them.
+    """Keep cutting the torque of servos that did not answer, for as long as a servo takes to boot.
+
+    Their watchdogs have acted by now, if they were still armed, so packets can no longer delay them.
     """
     clock = bus.port.clock
     end = clock.now() + REBOOT_S
@@ -242,8 +243,9 @@ def _check_unchanged(bus: ServoBus) -> Settings:
 
 
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, modes_seen_ago: float) -> None:
-    """Name settings that another program changed. They are read only once torque is off, because reading takes time. A
-    change that can explain a stop is named before it; all others, including any that may have come later, after it.
+    """Name settings that another program changed. They are read only once torque is off, because reading takes time.
+
+    A change that can explain a stop is named before it; all others, including any that may have come later, after it.
     """
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return

@@ -35,7 +35,8 @@ def _describe(bus: ServoBus, found: Found) -> str:
         if drive.id == secondary:
             raise WrongSetting(
                 f"{name}: its Secondary ID is {secondary}, so it obeys torque and goal commands for {drive} in its "
-                "own mode, without a watchdog, although it is not in the configuration. Remove the Secondary ID: "
-                f"hil setup {bus.port.url} --id {found.id} --secondary-id 255. If it moves the same joint, list both IDs there."
+                "own mode, without a watchdog, although it is not configured. Remove the Secondary ID: "
+                f"hil setup {bus.port.url} --id {found.id} --secondary-id 255. If it moves the same joint, list both "
+                "IDs in the configuration."
             )
     return f"{name}, torque {'on' if torque else 'off'}"
