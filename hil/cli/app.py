@@ -102,7 +102,7 @@ def _built() -> Callable[[], object]:
 
 
 def _one_blas_thread() -> None:
-    """Give BLAS one thread unless the user chose a number; it reads these variables when numpy is first imported.
+    """Limit BLAS to one thread unless the user chose a number; BLAS reads it when numpy is first imported.
 
     hil's matrices are small. On two busy cores, two spinning threads took 91 ms for a singular value decomposition that
     takes one thread 1 ms.

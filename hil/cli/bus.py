@@ -149,7 +149,7 @@ def setup(
         servo = open_servo(opened, servo_id)
         restored = recover(servo, opened.url)
         if written := ", ".join(restored.written):
-            print(f"Restored settings that an earlier run had left changed: {written}.", file=sys.stderr)
+            print(f"Restored settings left behind by an earlier run: {written}.", file=sys.stderr)
         if restored.others:
             print(f"{servo.title}: {restored.others}", file=sys.stderr)
         confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm

@@ -134,7 +134,7 @@ def _print_difference(difference: "Difference") -> None:
 
 
 def _would_show(detectable: "Mapping[str, float]") -> list[str]:
-    """Describe the smallest change of each friction term alone that two such runs would reveal [%, by name], if any."""
+    """Describe the smallest change in each friction term, taken alone, that two such runs would reveal [%, by name]."""
     least = [f"{name} {percent:.2g} %" for name, percent in detectable.items() if percent <= _WHOLE]
     never = [name for name, percent in detectable.items() if percent > _WHOLE]
     lines = []

@@ -34,7 +34,7 @@ def causes_of_standstill(joint: Joint) -> str:
 
 
 class Apart:
-    """Compares the other servos of each joint with its first one."""
+    """Compares each joint's other servos with its first servo."""
 
     def __init__(self) -> None:
         self._first: dict[tuple[int, int], float] = {}

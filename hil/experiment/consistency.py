@@ -88,8 +88,8 @@ values reach back by `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
-"""Below the first velocity, readings may stay the same while a joint sticks and slips. Second value: resolution of the
-readings [rad/s].
+"""Velocity below which readings may stay the same while a joint sticks and slips, and resolution of the readings
+[rad/s].
 """
 
 LONGEST_GAP_S = 0.06
@@ -238,7 +238,7 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
 
 
 def lost(memory: Any) -> None:
-    """Restart with the next reply, because too many replies are missing."""
+    """Restart the check at the next reply, because too many replies are missing."""
     memory.position = np.nan
 
 
@@ -277,7 +277,7 @@ def check_standstill(name: str, states: Iterable[State], joint: int, still: floa
 
 
 def _looks_long(memory: Any, velocity: float) -> bool:
-    """Add the intervals since the last call to the long memories; return whether one shows a disagreement."""
+    """Add the intervals since the last call to the long memories; return whether either shows a disagreement."""
     long, slow, seconds = memory.long, memory.slow, memory.seconds
     moved, difference, unknown = memory.moved, memory.difference, memory.unknown
     _add(long, LONG_S, moved, difference, velocity, seconds, memory.most_curved, unknown)

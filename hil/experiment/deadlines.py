@@ -79,7 +79,9 @@ class Deadlines:
 
     def _why_often(self) -> str:
         if 2 * self._waited > self._counted:
-            heard = self._heard_instead() or "Check the cables, the supply and what else may be sending on the bus."
+            heard = (
+                self._heard_instead() or "Check the cables, the supply and whether anything else is sending on the bus."
+            )
             return f", most of them while waiting for replies that were lost or damaged. {heard}"
         return (
             f": the replies arrive too late for {1 / self._interval:g} Hz. `hil check` measures what this bus can do: "

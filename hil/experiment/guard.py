@@ -1,6 +1,6 @@
 """Checks every sample and stops the arm when a limit is exceeded or a reply is inconsistent.
 
-The checks take a few us per sample. Those of every joint form one compiled loop (`joint_checks`), which also applies
+The checks take a few us per sample. The per-joint checks form one compiled loop (`joint_checks`), which also applies
 `following` (does the motor carry the commanded current), `consistency` (do position and velocity agree) and `work`
 (does the motor turn as commanded). Other modules check the status registers (`status_check`) and the time without
 commands or replies (`deadlines` and `silence`); `command_limits` clamps what is sent.
@@ -46,7 +46,8 @@ limit.
 """
 
 _LACKS_S, _EXPLAINED = 0.1, 0.5
-"""The supply explains a lack of torque if, within the last `_LACKS_S` [s], it caused at least this share of it."""
+"""The supply explains a lack of torque if, within the last `_LACKS_S` [s], it caused at least this share of the lack.
+"""
 
 _ERRORS_IN_A_ROW = 3
 """If this many consecutive replies of a servo contain both values and an error number, the arm is stopped: the servo
@@ -316,7 +317,7 @@ class Guard:
         # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
         shared = f"{NONE_HEARD}; requests or replies are lost: check the adapter, the cables and the supply"
         if self._silence.is_busy:
-            return f"{shared}, and whether other programs keep this computer busy: this program had just been late."
+            return f"{shared}, and whether other programs keep this computer busy: this program was running late."
         return f"{shared}."
 
     def _jumped(self, index: int, _: State) -> NoReturn:

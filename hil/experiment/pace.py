@@ -44,7 +44,7 @@ class Pace:
         """When the latest goals were sent [s]; None before the first ones."""
 
     def wait(self) -> Tick:
-        """Wait until the next sample is due. If a read-back is due, it takes place just before."""
+        """Wait until the next sample is due. If a read-back is due, it takes place just before the sample."""
         former = self._deadline
         if former is not None and self._exchange.read_back_at <= former + self.interval:
             read_back(self._bus, self._guard, former + self.interval)

@@ -43,10 +43,10 @@ _MOST_UNSEEN = 20
 """Number of progress reports that may be queued for the observer; about one second."""
 
 _REPEAT_S = 0.05
-"""Time after which torque off is sent again to a servo that does not answer [s]."""
+"""Time after which the torque-off command is sent again to a servo that does not answer [s]."""
 
 _PATIENCE_S = 0.2
-"""Time for which the end of a run waits for the observer [s]."""
+"""Time that a finished run waits for the observer [s]."""
 
 
 def run_experiment(

@@ -142,9 +142,9 @@ class StatusCheck:
         )
 
     def _never_sent(self, joint: int, held: float) -> bool:
-        """Whether none of the goals sent since a status last agreed, to any joint, explains the one that is held.
+        """Whether the goal that is held differs from every goal sent to any joint since a status last matched.
 
-        The halves of a goal for two servos may be of different age, so nothing is known about their sum.
+        The halves of a two-servo joint's goal may differ in age, so nothing is known about their sum.
         """
         if not self._goals or not self._has_one_servo[joint]:
             return False

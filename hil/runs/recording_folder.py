@@ -42,7 +42,7 @@ class RecordingFile:
 class RecordingRecord:
     """The contents of run.json.
 
-    config: path of the configuration, empty without one. started: ISO 8601. notes: sentences.
+    config: path of the configuration; empty if there is none. started: ISO 8601. notes: sentences.
     """
 
     config: str

@@ -127,7 +127,7 @@ def _reversed(joint: JointConfig) -> list[int] | int:
 
 
 def _unlike(joint: JointConfig, drives: Array) -> str:
-    """Say that a joint's two servos do not turn as their directions describe; "" if they do."""
+    """Return a message if a joint's two servos do not turn as their directions describe, otherwise ""."""
     if len(joint.ids) == 1 or abs(drives[1] - drives[0]) <= SEVERAL * abs(drives[0]):
         return ""
     first, second = joint.ids

@@ -65,7 +65,7 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
         beyond = "the tip" if number == len(chosen) - 1 else names[number + 1]
         usual = f"{1e3 * usual_length(str(found.model)):.0f}"
         length = 1e-3 * _number(f"Length from {name} to {beyond} in mm", usual, _LENGTHS_MM, ask, say)
-        question = f"How far may {name} swing from there to either side, in degrees"
+        question = f"How far may {name} swing from its rest angle to either side, in degrees"
         swing = math.radians(_number(question, "90", (5.0, _MOST_SWING), ask, say))
         answers = JointAnswers(name, found.id, str(found.model), zero, rest, directions[number], swing, length)
         joints.append(replace(answers, voltage=found.voltage))

@@ -172,7 +172,7 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
 
 
 def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> Iterator[Finding]:
-    """Check one servo; ends early if it does not answer or is another model.
+    """Check one servo; stop early if it does not answer or is of another model.
 
     Nothing is written, except to restore settings that an earlier program left behind.
     """
@@ -218,7 +218,7 @@ def _still_off(bus: ServoBus) -> Iterator[Finding]:
     if on:
         fix = (
             f"{on}: torque was off when this check began. Another program has switched it on and is driving the arm: "
-            "stop that program first; or cut the supply."
+            "stop that program first, or cut the supply."
         )
         yield Finding(Level.STOP, "bus", "torque", "switched on during this check", fix)
 

@@ -38,7 +38,7 @@ def print_result(result: SettledResult, config: Config, run: Path, console: Cons
 
 
 def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
-    """Print a result of multiple shooting. run: its folder."""
+    """Print a multiple-shooting result. run: folder of the result."""
     print(f"{result.joints}-joint arm, {result.config}")
     for name, entry in result.quantities.items():
         value, std = _shown(entry)
@@ -103,7 +103,7 @@ def _shown(entry: Quantity) -> list[str]:
 
 
 def _numbers(name: str, entry: Quantity, truth: Truth) -> list[str]:
-    """Return the cells of a parameter: value, standard error and, if there is any truth, the error."""
+    """Return the cells of a parameter: value, standard error and, if the true value is known, the error."""
     value, std = entry.value, entry.std
     cells = _shown(entry)
     if name not in truth.values:

@@ -180,7 +180,7 @@ class Lowering:
             )
 
     def goals(self, index: int, state: State) -> list[float]:
-        """Goals [A or V] of one sample, from the previous sample's state. Raises SafetyStop."""
+        """Compute the goals [A or V] of one sample from the previous sample's state. Raises SafetyStop."""
         velocity = np.array(self._recent.believed(state))
         ahead = self._position[index] - np.array(state.position), self._velocity[index] - velocity
         missing = np.array(state.missing)

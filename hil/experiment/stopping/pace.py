@@ -48,7 +48,7 @@ class Pace:
         return max(min(max(self._least, LONGEST_S), LAST_S - unheard), LONGER_S)
 
     def took(self, seconds: float, *, missed: bool) -> None:
-        """Process an exchange that took `seconds` [s]. missed: whether replies were missing in the end."""
+        """Process an exchange that took `seconds` [s]. missed: whether replies were still missing at the end."""
         if missed:
             return
         usual, self._longest = self._usual, max(self._longest, seconds)

@@ -18,7 +18,7 @@ BENDS_RAD_S2 = 200.0
 """Largest joint acceleration assumed while an arm is lowered [rad/s^2]; it determines how uncertain predictions are."""
 
 MOST_STEPS = 6
-"""Largest number of steps of one joint that are corrected; a single false reading causes two."""
+"""Largest number of corrected steps per joint; a single false reading causes two."""
 
 
 class _Seen(NamedTuple):

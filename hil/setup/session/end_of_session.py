@@ -66,8 +66,8 @@ def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
 
 @contextmanager
 def telling_of_torque(bus: ServoBus) -> Iterator[None]:
-    """Add a note about torque to any exception that ends the block, unless it has one: a stop may come between two
-    runs.
+    """Add a note about torque to any exception that ends the block, unless it already has one: a stop may also come
+    between two runs.
     """
     try:
         yield

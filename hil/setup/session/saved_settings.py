@@ -35,7 +35,7 @@ class SavedSettings:
     killed.
     """
     reduced: dict[Joint, dict[str, int]] = field(default_factory=dict)
-    """Goals that could only be restored as far as a lowered limit allows, with the restored values."""
+    """Goals restored only as far as a lowered limit allows, with the restored values."""
     _refused: set[Joint] = field(default_factory=set)
     """Servos whose Current Limit another program has left too low for this run; the file keeps its former value."""
 
