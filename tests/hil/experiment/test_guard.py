@@ -157,7 +157,7 @@ def test_silence_on_a_computer_that_was_late_before_names_it_too(arm: Arm) -> No
     guard.look(at(0, STILL))
     guard.woke_up(0.0, 0.0011)
     silent = MISSING._replace(missing=(True, True))
-    with pytest.raises(SafetyStop, match="other programs keep this computer busy: this program had just been late"):
+    with pytest.raises(SafetyStop, match="other programs keep this computer busy: this program was running late"):
         for number in range(1, 30):
             guard.look(at(number, silent))
     assert number == round(400 * arm().safety.late_time), "as for missed deadlines"
