@@ -219,7 +219,7 @@ def identify_chain_in_steps(
 def _full(search: ChainSearch) -> str:
     """Play the full run; repeat it with a smaller amplitude if it exceeds a limit or never settles.
 
-    If the last one fails only in its second path, which serves to validate the result, the first is enough.
+    If the last run fails only in its second path, which only serves for validation, the first path suffices.
     """
     tries = 3
     for number in range(1, tries + 1):

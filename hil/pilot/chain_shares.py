@@ -1,6 +1,6 @@
 """The largest share of the designed paths' amplitude that is safe for every spatial arm of the current belief.
 
-`hil identify` and `hil dry-run` both decide in this way, on the same arms, so that they agree.
+`hil identify` and `hil dry-run` both use this search, on the same arms, so that they agree.
 """
 
 from collections.abc import Callable
@@ -50,10 +50,10 @@ STOPPED_SHARE = 0.5
 """Computing time for the simulation of a stop, relative to that for one arm on a path and its transitions."""
 
 RAISED_RATE = 1.6
-"""The first higher rate that is tried in order to advise the user, relative to the configured rate."""
+"""First higher rate tried in the search for one to recommend, relative to the configured rate."""
 
 ROOM = 1.2
-"""Advised extension of a limit, relative to the amount by which the simulated arms exceed the limit."""
+"""Recommended extension of a limit, relative to the amount by which the simulated arms exceed the limit."""
 
 SATURATED = 0.98
 LEAST_SPREAD_SHARE = 0.1
@@ -170,7 +170,7 @@ class SafeShares:
         return ""
 
     def _other_seed(self) -> float | None:
-        """Design paths from another seed; return the ratio of their amplitude to the former, None if there are none."""
+        """Design paths from another seed; return the ratio of new to old amplitude, None if there are none."""
         experiment = self.given.experiment
         other = experiment.model_copy(update={"seed": experiment.seed + _NEXT_SEED})
         given, former = self.given.model_copy(update={"experiment": other}), self.paths
@@ -212,7 +212,7 @@ class SafeShares:
         return found, why
 
     def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
-        """The first safe share of the paths, why a larger one is not, and how much clearance that one lacks [m].
+        """Return the first safe share of the paths, why a larger one is not safe, and its lack of clearance [m].
 
         If neither the first share nor, on few arms, the last one is safe, those between them are not tried.
         """
@@ -234,7 +234,7 @@ class SafeShares:
         return found, why, shortage
 
     def _found(self, config: Config, share: float, which: str) -> tuple[Found | None, str, float]:
-        """This share if it is safe, else why it is not, and how much clearance it lacks [m]."""
+        """Return this share if it is safe, else why it is not, and how much clearance it lacks [m]."""
         shortage = 0.0
         for count in (SEARCH_ARMS, ARMS):
             found, why, lacking = self._unsafe(config, share, count, which)
@@ -246,7 +246,7 @@ class SafeShares:
         return (None if why else found), why, shortage
 
     def _unsafe(self, config: Config, share: float, count: int, which: str) -> tuple[Found | None, str, float]:
-        """Simulate a share on some arms: the prediction, why it is not safe, how much clearance is lacking [m]."""
+        """Simulate a share on some arms; return the prediction, why it is not safe, and its lack of clearance [m]."""
         if self.trying is not None:
             most = (1 + OTHER_SEEDS) * (1 + REDESIGNS)
             self.trying(f"path {self._path} of at most {most}, {which}")
@@ -261,7 +261,7 @@ class SafeShares:
         return Found(share, plan, foreseen), why, -float(foreseen.rooms.min())
 
     def _worth(self, paths: Paths, found: Found) -> float:
-        """Worst relative standard error of the base parameters after the found share of a path."""
+        """Worst relative standard error of the base parameters with the found share of a path."""
         return paths.designer.worth(paths.designer.scaled(paths.identify, found.share))[0]
 
     def _unsafe_stop(self, config: Config, plan: Plan) -> str:
@@ -290,7 +290,7 @@ def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
-    """Return the changes by which a user may make a path safe that was rejected as `unsafe`."""
+    """Suggest changes that may make a path safe that was rejected as `unsafe`."""
     if not foreseen.is_clear:
         helps = "A rest_pose farther from obstacles, or less restrictive [clearance] settings (floor, boxes, margin)"
         return f"{helps}, if the arm allows it, can help. {_better_known(config)}"
@@ -298,7 +298,7 @@ def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
 
 
 def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
-    """Return what to change, and by how much, if a joint exceeds a limit on some of the simulated arms.
+    """Suggest what to change, and by how much, if a joint exceeds a limit on some of the simulated arms.
 
     stiffness: each joint's stabiliser stiffness at this rate, relative to that at a high rate (joints,).
     """

@@ -1,5 +1,4 @@
-"""How fast each joint can be turning, judged from the change of its position: no brake may rely on a reported velocity
-alone.
+"""Range of velocities that each joint's change of position allows: no brake may rely on a reported velocity alone.
 
 A servo can report a false velocity in an intact reply. A brake that trusted it would drive the joint. Therefore the
 velocity to brake against is the reported one, confined to the range that the change of position allows over two spans
@@ -91,8 +90,8 @@ class RecentMotion:
         return found
 
     def contradicts(self, joint: int, velocity: float) -> bool:
-        """Whether a velocity cannot be the joint's: either no known change of its position allows it, or no change is
-        known and no servo turns that fast.
+        """Whether a velocity is impossible for the joint: no known change of its position allows it, or none is known
+        and no servo turns that fast.
         """
         travels = self.travels(joint)
         if not travels:
