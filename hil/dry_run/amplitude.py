@@ -28,7 +28,7 @@ class AmplitudeOptions:
     simulated arms show.
     """
     max_rounds: int = 12
-    """Maximum number of iterations of the search, and of reductions after it."""
+    """Maximum number of search iterations, and of subsequent torque reductions."""
     max_polishing_rounds: int = 4
     """Maximum number of final torque increases, one joint at a time."""
     close: float = 0.94

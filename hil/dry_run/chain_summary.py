@@ -180,6 +180,6 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         )
     if run.refused == "" and (doubt := run.doubt(run.config)):
         lines.append(
-            f"hil identify decides using fewer of these arms. With all {run.arms}, the experiment is not safe: {doubt}."
+            f"hil identify bases its decision on fewer arms. With all {run.arms}, the experiment is not safe: {doubt}."
         )
     return [*lines, f"NOT SAFE: {why}." if why else "SAFE. Not tested on hardware."]

@@ -10,7 +10,7 @@ from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 
 _SHARE = 0.85
-"""Fraction of the no-load speed that is used; the rest of the voltage drives the current."""
+"""Usable fraction of the no-load speed; the remaining voltage drives the current."""
 
 
 def within_supply(config: Config) -> Config:

@@ -38,7 +38,7 @@ _ERROR = 0.08
 """Assumed model error of a simulated displacement, relative to that displacement."""
 _LEAST_ERROR_STEPS = 1.5
 MOVED_STEPS = 26
-"""Smallest range of motion of a joint that counts as having moved [encoder steps]."""
+"""Smallest range of motion for which a joint counts as having moved [encoder steps]."""
 _STILL = 0.02  # rad, allowed range of a simulated joint whose real counterpart stood still
 _MOST_RAISES, _RAISE = 12, (0.05, 0.25)
 """If a simulated joint moves although the real one stood still, the logarithm of its friction is increased, at most

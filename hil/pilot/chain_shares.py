@@ -27,12 +27,12 @@ from hil.setup.session.servo_session import Say
 Array = NDArray[np.float64]
 
 SEARCH_ARMS, ARMS = 24, 72
-"""Numbers of arms that are simulated in the search for a safe share of the amplitude, and for its confirmation."""
+"""Numbers of arms simulated in the search for a safe share of the amplitude, and to confirm it."""
 
 PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
 SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4, 0.28, 0.18)
 SMALL = 0.5
-"""If the safe share is below this fraction of the wanted one, other paths with more reserve are designed."""
+"""If the safe share is below this fraction of the desired one, other paths with more reserve are designed."""
 
 REDESIGNS = 2
 
@@ -47,7 +47,7 @@ processor time with six joints.
 """
 
 STOPPED_SHARE = 0.5
-"""Computing time for the simulation of a stop, relative to that for one arm on a path and its transitions."""
+"""Computing time of a simulated stop, relative to that of one arm on a path and its transitions."""
 
 RAISED_RATE = 1.6
 """First higher rate tried in the search for one to recommend, relative to the configured rate."""
@@ -57,7 +57,7 @@ ROOM = 1.2
 
 SATURATED = 0.98
 LEAST_SPREAD_SHARE = 0.1
-"""A smaller [arm.prior] spread is advised only if it is at least this fraction of the configured one."""
+"""A smaller [arm.prior] spread is recommended only if it is at least this fraction of the configured one."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ class SafeShares:
         return times
 
     def _safe_of_these(self, config: Config, shares: tuple[float, ...], most: float) -> tuple[Found | None, str]:
-        """Find a safe share of the paths of one seed, or say why there is none."""
+        """Find a safe share for the paths of one seed, or explain why there is none."""
         most = min(most, self.cap) if self.cap < 1.0 else most
         found, why, shortage = self._largest(config, _up_to(most, shares))
         reserve = self.paths.reserve
@@ -335,7 +335,9 @@ def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
 
 
 def _too_soft(peaks: Prediction) -> float:
-    """Factor by which a stiffer stabiliser would keep all joints within their limits, infinite if none would."""
+    """Factor by which the stabiliser must be stiffened to keep all joints within their limits; infinite if none
+    suffices.
+    """
     middle, reached = (peaks.median[:GUARDED], peaks.quantile[:GUARDED])
     room, way = (np.abs(each - middle) for each in (peaks.limits[:GUARDED], reached))
     is_typical = (peaks.limits[:GUARDED] - middle) * (reached - middle) < 0.0

@@ -38,7 +38,7 @@ _LINES_FOR_DETECTION = 4
 
 @dataclass
 class Search:
-    """Search state: runs so far and the current belief; both are updated from run to run."""
+    """Search state: runs so far and the current belief; both are updated after each run."""
 
     config: Config
     run: RunFolder

@@ -39,7 +39,7 @@ unexplained torque has another cause.
 """
 
 MOST_UNEVEN = 3
-"""Number of consecutive tests in which the unexplained torque falls unevenly, after which it is attributed to the motor
+"""After this many consecutive tests in which the unexplained torque falls unevenly, it is attributed to the motor
 nevertheless.
 """
 

@@ -30,7 +30,7 @@ _STEPS = 2.0
 """Uncertainty of a change of position, in encoder steps."""
 
 _MORE = 1.25
-"""Tolerance for a velocity that increases within the span, as a factor on the mean velocity."""
+"""Tolerance for a velocity that increases within the span, as a multiple of the mean velocity."""
 
 CONTRADICTS = 2.0
 """A velocity contradicts the position if it is beyond this multiple of the range that the position allows: at constant
@@ -134,7 +134,7 @@ class RecentMotion:
 
 
 def _since(known: list[State], last: State, span: float) -> State:
-    """The latest state that is at least `span` [s] older than the last one, or the oldest."""
+    """The latest state that is at least `span` [s] older than the last one, or the oldest if there is none."""
     now = last.time_before_write
     return next((state for state in reversed(known) if now - state.time_before_write >= span), known[0])
 

@@ -161,9 +161,7 @@ class Study(_Table):
         if self.study.runs is None and self.study.task != "estimate":
             drawn = [key for key, values in self.vary.items() if isinstance(values, Draw)]
             if drawn:
-                raise ValueError(
-                    f'study.runs is missing: vary."{drawn[0]}" is drawn at random, so the number of runs is needed'
-                )
+                raise ValueError(f'study.runs is missing: vary."{drawn[0]}" is drawn at random, so runs must be given')
         return self
 
 

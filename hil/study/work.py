@@ -37,7 +37,7 @@ _ONE_AT_A_TIME = threading.Lock()
 class Spec:
     """Specification of one run.
 
-    toml: the arm's file with this run's values in it, or "". versions: package versions that the worker must have.
+    toml: the arm's file with this run's values inserted, or "". versions: package versions that the worker must have.
     seconds: processor time after which the run counts as failed. recording: the run folder to estimate, or None.
     keep_in: where the run folder is kept; None if it is deleted.
     """
