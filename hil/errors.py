@@ -57,7 +57,7 @@ class Cause(Enum):
     JUMP = "encoder jump"
     NOT_FOLLOWING = "current does not follow"
     OUT_OF_VOLTAGE = "supply too low for this speed"
-    GOALS_CHANGED = "goals changed on the way"
+    GOALS_CHANGED = "goals altered in transit"
     TORQUE_OFF = "torque lost"
     WATCHDOG = "servo's watchdog"
     GOALS_LOST = "goals not accepted"

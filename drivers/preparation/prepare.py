@@ -96,7 +96,7 @@ def overruled(joint: Joint, found: Overruled) -> BusShared:
     if found.register in SETTINGS and found.register != "Operating Mode":
         by, before = "was changed", f"and read {found.written} before the start"
     if found.register not in SETTINGS:
-        check = " If there is none, goals are being changed on the way: check the adapter and the cable."
+        check = " If there is none, goals are being altered in transit: check the adapter and the cable."
     return BusShared(
         f"{joint.title[0].upper()}{joint.title[1:]} {by} by another program: its {found.register} reads "
         f"{found.value}, {before}. Stop that program, or unplug its controller.{check}"

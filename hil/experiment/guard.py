@@ -231,7 +231,7 @@ class Guard:
             index,
             Cause.GOALS_LOST,
             f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. Goals are being "
-            "lost on the way, or the servo refuses them: check its cable and limits.",
+            "lost in transit, or the servo refuses them: check its cable and limits.",
         )
 
     def _stop_for(self, fault: int, state: State) -> NoReturn:
@@ -382,7 +382,7 @@ class Guard:
                 index,
                 Cause.GOALS_CHANGED,
                 f"{said} at {velocity:.2f} rad/s: {self._supply[index]:.1f} V would drive the commanded current at "
-                "that speed, according to the published figures. Its goals are being changed on the way or by another "
+                "that speed, according to the published figures. Its goals are being altered in transit or by another "
                 "program, its supply sags, "
                 "or its current sensor is wrong: check these. If all are in order, its motor is weaker than published: "
                 f"lower velocity_limit to {BELOW_VOLTAGE * abs(velocity):.2g} rad/s.",
@@ -428,7 +428,7 @@ class Guard:
         if held is not None and abs(carried - held) < abs(carried - commanded):
             return (
                 f"Its goal register reads {held:.3f} {unit}, which matches what it carries: another program is "
-                "commanding it, or goals are being changed or lost on the way."
+                "commanding it, or goals are being altered or lost in transit."
             )
         along = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
         allowed = self._joints[index]["following"]["allowed"]
@@ -437,7 +437,7 @@ class Guard:
         weak = "it cannot deliver this much at its speed and supply voltage (safety.follow_share)."
         if along > HARDLY_ANY * abs(commanded):
             return (
-                f"Its goals are being changed on the way or by another program, its current sensor is wrong, or {weak}"
+                f"Its goals are being altered in transit or by another program, its current sensor is wrong, or {weak}"
             )
         return f"Its torque is off, it was rebooted, its watchdog acted, or {weak}"
 

@@ -137,7 +137,7 @@ class StatusCheck:
                 "Or goals are being corrupted on the bus: check the adapter and the cable."
             )
         return Cause.GOALS_LOST, (
-            f"does not accept goals: {held}, and it missed an earlier one too. Goals are being lost on the way, or the "
+            f"does not accept goals: {held}, and it missed an earlier one too. Goals are being lost in transit, or the "
             "servo refuses them: check its cable and limits."
         )
 

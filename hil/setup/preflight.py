@@ -265,7 +265,7 @@ def _status_level(_config: Config, _joint_config: JointConfig, _joint: Joint, se
 
 def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     error = servo.hardware_error()
-    stays = "It stays without torque until rebooted: find" if shuts_down(servo, error) else "Find"
+    stays = "Its torque stays off until it is rebooted: find" if shuts_down(servo, error) else "Find"
     fix = f"{stays} the cause, then power-cycle it."
     return _graded(error == HardwareError(0), "hardware error", describe_error(error), fix)
 

@@ -1,7 +1,7 @@
 """Currents that differ from the commanded ones: they were clipped, or this program's goals did not cause them.
 
 A clipped current is smaller than a large goal, follows a small one, and never opposes it. Any other deviation has
-another cause: goals were changed on the way or by another program, or the reported current is wrong. The torque that
+another cause: goals were altered in transit or by another program, or the reported current is wrong. The torque that
 drove the arm is then not the one that the estimate is based on.
 """
 
@@ -91,7 +91,7 @@ def _other(name: str, goal: Array, measured: Array) -> str:
     away = np.maximum(low - late, late - high)
     beyond = float(np.mean(away > _BEYOND * np.abs(goal).max()))
     why = (
-        "goals were changed on the way or by another program, or its current sensor is wrong. Make sure that nothing "
+        "goals were altered in transit or by another program, or its current sensor is wrong. Make sure that nothing "
         "else commands the servos, and record again."
     )
     if beyond > _BEYOND_OFTEN:

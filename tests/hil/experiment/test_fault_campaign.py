@@ -106,7 +106,7 @@ TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
         (Kind.PUSHED, "state", UNLIKE_ANY, JUMP),
         (Kind.WEAK, "state", NO_TORQUE, CONTRADICTION),
         (Kind.LOWERED_LIMIT, "state", "its Current Limit is 236, but current_limit = 1.2 A needs 447", CONTRADICTION),
-        (Kind.DEAF, "state", "does not accept goals: some are lost. Goals are being lost on the way.", CONTRADICTION),
+        (Kind.DEAF, "state", "does not accept goals: some are lost. Goals are being lost in transit.", CONTRADICTION),
         (Kind.GOAL_FIGHT, "state", "Another program is commanding it.", "stands still. Something is blocking it."),
         (Kind.BIAS, "position", JUMP, NO_TORQUE),
         (Kind.BIAS, "current", NO_TORQUE, JUMP),

@@ -522,7 +522,7 @@ def test_the_supply_is_blamed_only_if_it_cannot_drive_more_at_this_speed(
     assert stop.cause is (Cause.OUT_OF_VOLTAGE if is_supply else Cause.GOALS_CHANGED)
     assert ("its supply cannot drive more" in said) == is_supply
     assert "its current sensor is wrong" in said
-    assert ("goals are being changed on the way" in said) == (not is_supply)
+    assert ("goals are being altered in transit" in said) == (not is_supply)
     assert "carries 0.120 A instead of the commanded 0.300 A" in said
 
 
