@@ -410,7 +410,7 @@ class Exchange:
         return span
 
     def _search(self, read: GroupRead, received: bytes, deadline: float) -> list[Answer]:
-        """Extract answers, some stuffed, damaged or missing; read on until all have arrived or the time is up."""
+        """Extract the answers, some perhaps stuffed, damaged or missing; read until all have arrived or time is up."""
         while True:
             answers, over = read.search(received)
             remaining = deadline - self._now()

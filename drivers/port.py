@@ -376,7 +376,7 @@ class DescriptorPort(Port):
             raise self._lost(error) from error
 
     def _ask_on(self, received: bytes, count: int, deadline: float, looks: int) -> bytes:
-        """Read the rest of a reply that is incomplete after the wait in whole milliseconds."""
+        """Read the rest of a reply that is still incomplete after waiting for whole milliseconds."""
         received = self._read_on(received, count, deadline)
         self._looks = max(0, looks - 1) if len(received) == count else max(looks, _LOOKS_AFTER_LOSS)
         return received

@@ -27,7 +27,7 @@ class Turns:
         """Number of cycles between two samples not yet counted."""
 
     def count(self, left: int) -> None:
-        """Count the cycles run so far; `left` of the planned ones have not been run (-1: one more than planned has)."""
+        """Count the cycles run so far. left: number of planned cycles not yet run (-1: one more was run)."""
         passed = self.usual - left
         self._until_status -= passed
         self._until_slow -= passed - self.between
@@ -56,6 +56,6 @@ class Turns:
             self._until_status = min(self._until_status, 1)
 
     def plan(self) -> int:
-        """Return the minimum number of cycles that will read the usual span; cycles between samples may add to it."""
+        """Return the minimum number of cycles needed to read the usual span; cycles between samples may increase it."""
         self.usual = max(0, min(self._until_slow, self._until_status) - 1)
         return self.usual

@@ -111,7 +111,7 @@ class FakeServo(Described):
 class FakeArm(Described):
     """The whole [fake] table: an adapter, the servos on its bus, and the arm that they move."""
 
-    seed: Annotated[int, Field(ge=0, description="random seed of noise and faults")] = 0
+    seed: Annotated[int, Field(ge=0, description="random seed for noise and faults")] = 0
     adapter_latency_us: Annotated[
         float, Field(ge=0, le=1e6, description="delay of every byte between wire and host [us]")
     ] = 0.0

@@ -124,7 +124,7 @@ class CsvError(HilError):
 
 
 class MissingExtra(HilError):
-    """An optional package is not installed. Example: `hil compare --mujoco` without the extra `peers`."""
+    """An optional package is not installed. Example: `hil compare --mujoco` without the `peers` extra."""
 
     exit_code = 2
 

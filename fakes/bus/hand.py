@@ -120,7 +120,7 @@ class Hand:
         self._tell()
 
     def tick(self, now: float) -> None:
-        """Start moves that are due, and move the joints held; called once per period of the servos' loops.
+        """Start moves that are due, and move the joints in hand; called once per period of the servos' loops.
 
         now: time since the bus was created [s].
         """

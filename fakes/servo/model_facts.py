@@ -197,7 +197,7 @@ def _xl330(motor: Motor, velocity: int, gains: Mapping[str, RegisterFacts]) -> M
 
 
 def _xc330(motor: Motor, velocity: int, gains: Mapping[str, RegisterFacts]) -> ModelFacts:
-    """Return the facts of an XC330 model (M: 5 V, T: 12 V)."""
+    """Return the specifications of an XC330 model (M: 5 V, T: 12 V)."""
     if motor.voltage_v < _LEAST_OF_T:
         return _x330(motor, velocity, 2352, {**_volts(31, 35, 70), **gains})
     return _x330(motor, velocity, 910, {**_volts(55, 55, 140), "PWM Slope": _Facts(255, (1, 255)), **gains})

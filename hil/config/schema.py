@@ -282,9 +282,7 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is treated as spatial: [arm] urdf is given, and it describes no planar arm or [joint_path] is
-        given too.
-        """
+        """Whether the arm is spatial: [arm] urdf is given, and its arm is not planar or [joint_path] is given."""
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property

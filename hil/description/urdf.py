@@ -371,7 +371,7 @@ def _axis(element: ET.Element, where: str, path: Path) -> Array:
     length = float(np.linalg.norm(axis))
     if abs(length - 1.0) > 1e-3:
         raise ArmFileError(
-            f"{path}: {where}: its axis {axis.tolist()} has length {length:.4g}: it must be 1; normalise it"
+            f"{path}: {where}: its axis {axis.tolist()} has length {length:.4g}, not 1: normalise it"
         )
     unit: Array = axis / length
     return unit

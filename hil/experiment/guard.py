@@ -192,7 +192,7 @@ class Guard:
         return self._status.is_in_doubt
 
     def _look_one_by_one(self, state: State, unsure: float) -> None:
-        """Check an exchange in which replies are missing or report an error, or that follows such an exchange."""
+        """Check an exchange with missing replies or with errors in replies, or one that follows such an exchange."""
         now, missing, error = state.time_before_write, state.missing, state.error
         self._silence.ask(now)
         # While the arm is lowered, an exchange may be awaited for a good part of the time that is allowed.

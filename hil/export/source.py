@@ -38,7 +38,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recording, whether or not it has been estimated.
+    """A recording, with or without an estimate.
 
     joints: names of the joints. result: the estimate from the recording; None if there is none.
     """

@@ -212,9 +212,9 @@ class SafeShares:
         return found, why
 
     def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
-        """Return the first safe share of the paths, why a larger one is not safe, and its lack of clearance [m].
+        """Return the first safe share of the paths, why a larger share is unsafe, and the clearance that one lacks [m].
 
-        If neither the first share nor, on few arms, the last one is safe, those between them are not tried.
+        If neither the first share nor the last one, tried on few arms, is safe, the shares between are not tried.
         """
         self._path += 1
         found, why, shortage = self._found(config, shares[0], f"amplitude 1 of at most {len(shares)}")

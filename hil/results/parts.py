@@ -67,7 +67,7 @@ class Covariance:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """Quality of a fit; residual_rms_ticks: measured minus simulated position in encoder steps RMS, per joint."""
+    """Quality of a fit. residual_rms_ticks: RMS of measured minus simulated position, per joint [encoder steps]."""
 
     residual_rms_ticks: PerJoint
 
