@@ -24,7 +24,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class TorqueConstant:
-    """Identified and assumed torque per unit of goal of one joint, in `unit`: N m/A, or N m/V in pwm mode."""
+    """Identified and assumed torque of a joint per unit of goal, in `unit`: N m/A, or N m/V in pwm mode."""
 
     value: float
     std: Spread

@@ -1,4 +1,4 @@
-"""From the run folder of a spatial arm to its result: both estimation stages and validation on a held-out path."""
+"""Estimate the result of a spatial arm from its run folder in two stages, and validate it on a held-out path."""
 
 import time
 from contextlib import suppress
@@ -192,7 +192,7 @@ def _verdict(
     still: list[str],
     disturbances: tuple[str, ...] = (),
 ) -> Verdict:
-    """Decide whether the result can be trusted, name the least well identified base parameter, and give the reasons."""
+    """Decide, with reasons, whether the result can be trusted, and name the least well identified base parameter."""
     count = known.base.count
     certain = estimate.std[:count] / known.prior.std
     weakest = known.base.names[int(np.argmax(certain))]
@@ -263,7 +263,7 @@ def contradicting_torques(config: Config, estimate: ChainEstimate) -> tuple[str,
 
 
 def about_zeros(config: Config, estimate: ChainEstimate) -> str:
-    """State that encoder zeros were not fitted, and which ones the recording contradicts; empty if they were fitted."""
+    """Say that encoder zeros were not fitted, and which ones the recording contradicts; "" if they were fitted."""
     if estimate.model.zeros or estimate.model.joints == 1:
         return ""
     held = "The encoder zeros were taken from the configuration and not identified"
@@ -282,9 +282,7 @@ def about_zeros(config: Config, estimate: ChainEstimate) -> str:
 
 
 def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_prior: tuple[str, ...]) -> str:
-    """Name the base parameters, other than those in `from_prior`, with standard errors larger than the prior's; empty
-    if none.
-    """
+    """Name the base parameters not in `from_prior` whose standard errors exceed the prior's; "" if there are none."""
     found = [name for name in prior.surpassing(names, std) if name not in from_prior]
     if not found:
         return ""

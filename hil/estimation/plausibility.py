@@ -74,7 +74,7 @@ def _weight(config: Config, estimate: Estimate, largest_torque: float) -> list[s
 
 
 def _hangs_upwards(config: Config, joint: int) -> bool:
-    """Whether a link that rests in its described pose, unsupported, must have its centre of mass behind its joint."""
+    """Whether a link points up in its rest pose, unsupported, so that its centre of mass must lie below its joint."""
     angle = float(np.sum(config.arm.rest_pose[: joint + 1]))
     return config.stabiliser is None and np.sin(angle) > _UPRIGHT
 

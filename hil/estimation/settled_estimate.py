@@ -1,4 +1,4 @@
-"""From a run folder to its result: settled period, both estimation stages, and validation on a held-out multisine."""
+"""Estimate a result from a run's settled period in two stages, and validate it on a held-out multisine."""
 
 import logging
 import time

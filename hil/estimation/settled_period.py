@@ -90,7 +90,7 @@ def _passes(position: NDArray[np.float64], first: int, on_time: NDArray[np.float
 
 
 def _mean_of_periods(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean of each sample over the periods that have it: (periods, joints, samples) to (joints, samples); else NaN."""
+    """Mean of (periods, joints, samples) over the periods, without missing values; NaN if all are missing."""
     count = np.isfinite(position).sum(axis=0)
     mean: NDArray[np.float64] = np.where(count > 0, np.nansum(position, axis=0) / np.maximum(count, 1), np.nan)
     return mean

@@ -119,7 +119,7 @@ def contradictions(
 def ratios_said(
     joints: Sequence[str], extra: Mapping[str, Quantity], source: Source, without: Sequence[str]
 ) -> tuple[str, ...]:
-    """A sentence on the ratios of the torques; () if the sentences `without` already give them."""
+    """A sentence on the ratios of the torques; () if the sentences in `without` give them."""
     ratios = [(joint, ratio) for joint, _, ratio in _ratios(joints, extra)]
     if not ratios or without:
         return ()
@@ -152,4 +152,4 @@ def by_voltage_said(joints: Sequence[JointConfig]) -> str:
     """A sentence on what viscous friction includes for voltage-driven joints; empty for others."""
     if all(joint.drive_mode is not Mode.PWM for joint in joints):
         return ""
-    return "Driven by voltage: the viscous friction includes the motor's back-EMF."
+    return "The viscous friction of voltage-driven joints includes the motor's back-EMF."

@@ -67,8 +67,8 @@ STDS = 2.0
 """Number of standard deviations by which the estimates of lag and scale error may be wrong."""
 
 BIAS_LAG_S, BIAS_SCALE, BIAS_LAG_SHARE = 0.002, 0.005, 0.1
-"""Errors of these estimates, in addition to their standard deviations, that creep must exceed [s, 1]. The last is
-relative to the lag times the range of velocities, since a filter is not a pure delay.
+"""Further errors assumed for these estimates, besides their standard deviations, when creep is judged [s, 1]. The last
+is relative to the lag times the range of velocities, since a filter is not a pure delay.
 """
 
 _LAG_SHARE = 0.25
@@ -84,7 +84,7 @@ STEPS, STEPS_S = 4, 0.5
 
 BLOCK_S = 0.0099
 """Shortest interval between two stored values of the distance covered under an unchanged velocity [s]. The latest three
-values reach back by `LAG_S`.
+values span `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
@@ -93,7 +93,7 @@ SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
 """
 
 LONGEST_GAP_S = 0.06
-"""If two exchanges are farther apart than this [s], the velocity in between is unknown. An interval at 20 Hz is
+"""If two exchanges are farther apart than this [s], the velocity in between is unknown. The interval at 20 Hz is
 shorter.
 """
 
@@ -163,7 +163,7 @@ MEMORY = np.dtype(
 position, velocity, turn: latest values, and latest change of velocity [rad, rad/s]; the position is NaN before the
 first one and after a long gap. seconds, moved, difference, unknown, most_curved: sums (for the last one, the maximum)
 since the long memory was last updated. seen: `difference` without motion that the velocity register cannot show.
-headed: time moving in the positive minus time in the negative direction since then [s]. rough: sum of squares of the
+headed: time of motion in the positive minus that in the negative direction since then [s]. rough: sum of squares of the
 errors that velocity jumps may cause in each interval since then [rad^2]. heading, roughness: the same two in the slow
 memory. moving: time in motion there [s]. learnt: information from which lag and scale error were estimated [rad^2/s].
 lag, scale: their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the sums from
@@ -181,7 +181,7 @@ def begin(memory: Any) -> None:
 def look(memory: Any, position: float, velocity: float, seconds: float, unsure: float) -> bool:
     """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
 
-    unsure: excess duration of its exchange [s], by which the measurement time is uncertain.
+    unsure: excess duration of its exchange [s], the uncertainty of the measurement time.
     """
     former, before = memory.position, memory.velocity
     memory.position, memory.velocity = position, velocity
@@ -410,7 +410,7 @@ def _add(
 def _is_wrong(fading: Any, apart: float, unsure: float, velocity: float, lag: float, scale: float) -> bool:
     """Whether position and velocity disagree.
 
-    apart: their difference in this memory, without a known bias [rad]. unsure: tolerance of this memory [rad]. lag,
+    apart: their difference in this memory, minus any known bias [rad]. unsure: tolerance of this memory [rad]. lag,
     scale: largest accepted lag [s] and scale error.
     """
     allowed, of_lag = _explained(fading, unsure, velocity, lag, scale)

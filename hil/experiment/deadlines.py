@@ -65,7 +65,7 @@ class Deadlines:
         )
 
     def met(self) -> None:
-        """Record a sample taken on time. A single stall is tolerated; a large share of missed deadlines is not."""
+        """Record a sample taken on time. A single stall is tolerated; missing too many deadlines is not."""
         self._in_a_row = 0
         if self._often <= 0.0:
             self.any_missed = False

@@ -46,8 +46,7 @@ limit.
 """
 
 _LACKS_S, _EXPLAINED = 0.1, 0.5
-"""The supply explains a lack of torque if, within the last `_LACKS_S` [s], it caused at least this share of the lack.
-"""
+"""The supply explains missing torque if, within the last `_LACKS_S` [s], it caused at least this fraction of it."""
 
 _ERRORS_IN_A_ROW = 3
 """If this many consecutive replies of a servo contain both values and an error number, the arm is stopped: the servo
@@ -122,7 +121,7 @@ class Guard:
         self._silence = Silence(config, interval, patience, lowers_since)
         self._patience = patience or float("inf")
         self._late_after = self._patience + LATE_WAKE_UP_S
-        """Duration of an exchange that shows that this computer is busy [s]."""
+        """Duration above which an exchange shows that this computer is busy [s]."""
         self._heard_instead = heard_instead
         self._deadlines = Deadlines(config, heard_instead, any_share=is_lowering)
         self._longest_gap = safety.watchdog
@@ -407,7 +406,7 @@ class Guard:
         )
 
     def look_at_supply(self, index: int, lacking: float, recent: Sequence[State]) -> None:
-        """Raise SafetyStop if the measured current shows that the supply causes a joint's lack of torque [N m]."""
+        """Raise SafetyStop if the measured current shows that the supply explains a joint's missing torque [N m]."""
         model = self._models[index]
         if model is None or not self._joints[index]["is_followed"] or self._status.other_goal(index) is not None:
             return

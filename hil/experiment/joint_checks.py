@@ -55,9 +55,9 @@ JOINT = np.dtype(
 low, high: position limits [rad]. fastest: velocity limit [rad/s]. farthest: fastest change of a reported position
 [rad/s]. may_start_outside, is_followed, is_worked: whether the joint may start outside its limits, and whether
 `following` and `work` are checked. position, seen_at: latest position [rad], NaN before the first one, and its time
-[s]. found_outside: position outside the limits at which it was first seen [rad], NaN if it was inside. moved, seconds,
-most: change of the position [rad], the time that it represents [s], and the largest possible one [rad]. found: duration
-of a deviation from the goal [s], or work taken out of the arm [J].
+[s]. found_outside: first position seen, if outside the limits [rad], otherwise NaN. moved, seconds, most: change of
+position [rad], the time that it represents [s], and the largest possible change [rad]. found: duration of a deviation
+from the goal [s], or work taken out of the arm [J].
 """
 
 

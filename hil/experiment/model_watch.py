@@ -61,7 +61,7 @@ _LAG_S = 0.012
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 JOLT_S, JOLT_BACK_S = 0.01, 0.15
-"""Time within which a slipping joint's velocity changes, and within which it returns [s]."""
+"""Times within which a slipping joint's velocity changes and returns [s]."""
 
 JOLT_RAD_S, JOLT_TIMES = 1.2, 5.0
 """Smallest change of velocity in `JOLT_S` that counts as a jolt [rad/s], and its smallest ratio to the RMS of ordinary

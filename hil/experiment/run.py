@@ -40,7 +40,7 @@ _LAST_SAMPLES = 100
 """Number of samples attached to an exception."""
 
 _MOST_UNSEEN = 20
-"""Number of progress reports that may be queued for the observer; about one second."""
+"""Number of progress reports that may be queued for the observer (about one second)."""
 
 _REPEAT_S = 0.05
 """Time after which the torque-off command is sent again to a servo that does not answer [s]."""
@@ -111,7 +111,7 @@ def run_experiment(
 
 @contextmanager
 def _with_torque(torque: str) -> Iterator[None]:
-    """Append the torque state to an error while the recording is closed, or to a stop request while torque is cut."""
+    """Append the torque state to an error in closing the recording, or to a stop request made while torque is cut."""
     try:
         yield
     except (RunFolderError, StopRequested) as error:
@@ -302,7 +302,8 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if wire > 1 / rate:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms of wire time alone at "
-            f"{bus.port.baud} baud: {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud rate with `hil setup`."
+            f"{bus.port.baud} baud, which allows {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud rate "
+            "with `hil setup`."
         )
     slowest = bus.port.latency + wire
     if slowest <= 1 / rate:

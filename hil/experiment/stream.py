@@ -51,7 +51,7 @@ _BY_OTHER_GOALS = {
     *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
-"""Causes of a stop that goals sent by another program may explain."""
+"""Causes of a stop that may be due to goals sent by another program."""
 
 _BRAKING_WATCHDOG_S = 0.04
 """Timeout of the Bus Watchdog while the arm is braked [s]. It is shorter than during the experiment, which must allow

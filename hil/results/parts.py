@@ -263,7 +263,7 @@ class RunTiming(Timing, StreamTiming):
 
 @dataclass(frozen=True)
 class ArmFacts:
-    """Facts needed to use the model: gravity in the plane of the arm [m/s^2], rest pose [rad], joints."""
+    """Data needed to use the model: gravity in the plane of the arm [m/s^2], rest pose [rad], joints."""
 
     gravity: float
     rest_pose: PerJoint
@@ -272,7 +272,7 @@ class ArmFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class ChainFacts:
-    """Facts from the URDF of a spatial arm, which define its base parameters.
+    """Data from a spatial arm's URDF that define its base parameters.
 
     urdf: file name, relative to the configuration. rotation, translation [m]: pose of each joint's frame in the
     previous link's frame. axis: joint axis in the joint's frame. gravity: gravity in the base frame [m/s^2]. groups:
@@ -324,7 +324,7 @@ class StabiliserShare:
         return tuple(rms / max(whole, 1e-12) for rms, whole in zip(self.rms, self.commanded_rms, strict=True))
 
     def said(self, names: Sequence[str]) -> str:
-        """One sentence about the stabiliser's share, with these joint names."""
+        """A sentence on the stabiliser's share of the torque, with these joint names."""
         each = ", ".join(
             f"{name} {rms:.3f} of {whole:.3f} N m RMS ({100 * part:.0f} %, peak {peak:.3f})"
             for name, rms, whole, part, peak in zip(

@@ -41,7 +41,7 @@ class FrictionChange:
     """The friction of one joint in two runs.
 
     term: the single term whose change explains the difference best. before, after: its values if nothing else in the
-    joint's friction changed. std: standard error of that change [unit of the term]. z: change in standard errors.
+    joint's friction changed. std: standard error of that change [unit of the term]. z: change divided by `std`.
     p: probability of a difference at least this large, in any term, if the joint is unchanged. stds: standard error of
     the change of each term alone [unit of the term].
     """
@@ -103,7 +103,7 @@ def _of_joint(
 
 
 def _comparable(models: Sequence[ArmModel], name: str) -> bool:
-    """Whether both models have the term, or one has it and its absence from the other is equivalent to 0."""
+    """Whether both models have the term, or one has it and its absence from the other means 0."""
     having = [name in model.values for model in models]
     return all(having) or (any(having) and TERMS[name.rpartition("_")[0]].absent == 0.0 and "velocity" not in name)
 

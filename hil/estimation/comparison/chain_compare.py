@@ -78,8 +78,7 @@ class Judge:
 
 
 def worst_chain_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
-    """Return the parameter with the largest relative error and that error, among large base parameters and friction
-    terms.
+    """Return the base parameter or friction term with the largest relative error, and that error.
 
     Offsets are left out, and so are sums that are small compared with others of their kind (see LARGE).
     """
@@ -119,7 +118,7 @@ def _methods(config: Config, period: SettledPeriod, judge: Judge) -> Iterator[Pe
 
 
 def _best(fit: Callable[[float], tuple[Array, Array]], judge: Judge, period: SettledPeriod) -> Peer:
-    """The result at the cut-off whose simulation is closest to the fitted period, as for planar arms."""
+    """The result at the cut-off that gives the closest simulation of the fitted period, as for planar arms."""
     model = judge.model
     found: list[tuple[float, Peer]] = []
     for cutoff in CUTOFFS:

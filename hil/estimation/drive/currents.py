@@ -26,7 +26,7 @@ OFTEN = 0.05
 """Clipping is reported if it affects more than this fraction of the samples with large goals."""
 
 _RECENT = 4
-"""Number of latest goals, any of which a lagging current may still follow."""
+"""Number of latest goals that a lagging current may still be following."""
 
 _BEYOND, _BEYOND_OFTEN = 0.25, 0.02
 """A current was not the commanded one if it deviates this much from all recent goals and from 0, relative to the
@@ -109,7 +109,7 @@ def _other(name: str, goal: Array, measured: Array) -> str:
 
 
 def _clipped(name: str, goal: Array, measured: Array, lower: str) -> str:
-    """Describe a motor that receives less current than commanded, from a sagging supply or its own current limit."""
+    """Describe a motor that receives less current than commanded because its supply sags or its servo limits it."""
     part = _short_part(goal, measured)
     if part <= OFTEN:
         return ""

@@ -56,7 +56,7 @@ class Sag:
 
 
 def supply_sag(config: Config, samples: NDArray[np.void]) -> Sag | None:
-    """Find a drop of the supply voltage under load in a whole recording; None if none is worth reporting."""
+    """The drop of the supply voltage under load in a whole recording; None if it is not worth reporting."""
     goal, velocity, volts = samples["goal_current"], samples["velocity"], samples["supply_voltage"]
     joints = goal.shape[1]
     read = np.isfinite(volts) & np.isfinite(velocity).all(axis=1)[:, None]

@@ -97,7 +97,7 @@ def _jumps(recording: Recording, joint: int) -> list[tuple[float, float]]:
 
 
 def _steps(time: Array, position: Array, uneven: NDArray[np.bool_]) -> Array:
-    """The step in the middle of every window of 2 SIDE samples [rad]. Unequal intervals are handled where `uneven`."""
+    """The step in the middle of every window of 2 SIDE samples [rad]. `uneven`: where intervals are unequal."""
     windows = np.lib.stride_tricks.sliding_window_view
     sizes = np.correlate(position, _weights(np.arange(2.0 * SIDE)[None, :])[0], mode="valid")
     places = np.flatnonzero(uneven)

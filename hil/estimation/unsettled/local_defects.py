@@ -1,6 +1,6 @@
 """Location and kind of the parts of a recording that the fitted model does not explain although it explains the rest.
 
-A reading that freezes, a torque that is missing, single wrong samples or a joint that hits a stop spoil an estimate.
+A reading that freezes, a missing torque, single wrong samples or a joint that hits a stop can spoil an estimate.
 The residual alone would suggest wrong units or a missing term.
 """
 

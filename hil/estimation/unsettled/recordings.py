@@ -189,16 +189,16 @@ def _back_emf(columns: Columns, result: ShootingResult) -> list[str]:
     if columns.drive not in {"voltage", "pwm"} or gains is None:
         return []
     if columns.torque_constant is None:
-        return ["Driven by voltage: viscous friction includes the braking by back-EMF."]
+        return ["The joints are driven by voltage, so viscous friction includes braking by back-EMF."]
     parts = [
         f"joint {joint + 1} {gain * constant:.3g} of {result.parameters[f'viscous_{joint + 1}'].value:.3g} N m s/rad"
         for joint, (gain, constant) in enumerate(zip(gains, columns.torque_constant, strict=True))
     ]
-    return [f"Driven by voltage: viscous friction includes the braking by back-EMF, {', '.join(parts)}."]
+    return [f"The joints are driven by voltage, so viscous friction includes braking by back-EMF: {', '.join(parts)}."]
 
 
 def _arm(read: _Read, gravity: float) -> ArmFacts:
-    """Facts about the joints from the recordings; the limits are the observed extremes."""
+    """Describe the joints from the recordings; the limits are the observed extremes."""
     columns = read.columns
     gains = columns.gains or [1.0] * len(columns.position or ())
     joints = []

@@ -35,7 +35,7 @@ LEAVES_RAD = 0.35
 """Largest accepted tracking error [rad]: a joint with a larger one does not follow its path to the rest pose."""
 
 MOST_PATHS = 4
-"""Number of paths home, including the first, after which an arm that is pushed off them is given up."""
+"""Number of paths home, including the first, that an arm may be pushed off before it is given up."""
 
 LYING_RAD = 0.06
 """If every joint is within this angle of the rest pose [rad], the arm counts as lying in it."""
@@ -46,7 +46,7 @@ that exceeds this and still speeds up although its torque opposes the motion cou
 """
 
 TOO_FAST = 0.6
-"""Velocity of such a joint, relative to its limit, above which it is no longer tested: torque is cut."""
+"""Velocity of such a joint, relative to its limit, above which torque is cut without a test."""
 
 _GROWS_S = 0.015
 _ROOM_RAD = 0.2  # beyond the position limits and the path home

@@ -116,7 +116,7 @@ class WayDown:
         self._told(error, f"The arm {done}.")
 
     def _is_silent_too_long(self, latest: State, whole: State) -> bool:
-        """Whether the missing replies have been missing for longer than lowering may bridge.
+        """Whether replies have been missing for longer than lowering can do without them.
 
         At most one packet is sent to find out, since each one feeds the watchdog of a servo that has another ID now.
         """
