@@ -370,9 +370,7 @@ def _axis(element: ET.Element, where: str, path: Path) -> Array:
     axis = np.array([1.0, 0.0, 0.0]) if given is None else _three(given, "xyz", where, path)
     length = float(np.linalg.norm(axis))
     if abs(length - 1.0) > 1e-3:
-        raise ArmFileError(
-            f"{path}: {where}: its axis {axis.tolist()} has length {length:.4g}, not 1: normalise it"
-        )
+        raise ArmFileError(f"{path}: {where}: its axis {axis.tolist()} has length {length:.4g}, not 1: normalise it")
     unit: Array = axis / length
     return unit
 

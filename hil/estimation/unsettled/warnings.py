@@ -79,7 +79,7 @@ def _rows(recordings: Sequence[Recording]) -> list[str]:
     if lost <= LOST or np.mean(np.abs(step - whole) < EQUAL) < MOSTLY:
         return []
     return [
-        f"{100 * lost:.2g} % of the rows are missing from the regular time steps: the torques of these rows are unknown, "
+        f"{100 * lost:.2g} % of the rows are missing: the torques of these rows are unknown, "
         "which increases the residual. Log every row."
     ]
 
