@@ -39,12 +39,11 @@ class BusConfig:
     url: device or pyserial URL.
     one_write: send Sync Write and group read in one write; False if `hil check` finds that an arm needs two.
     fast_sync_read: use Fast Sync Read if the firmware of every servo supports it.
-    slow_every: number of samples between two slow reads, which alternately read the servo clock (Realtime Tick) and
-    voltage and temperature.
+    slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
+    voltage plus temperature.
     watchdog_required: reject firmware without Bus Watchdog.
-    take_over: what to do if torque is already on: if true, let the arm sink slowly and cut torque; if false, refuse to
-    start.
-    interval: time between two samples [s]; 0 without a fixed rate, in which case the servos' status is not read.
+    take_over: if torque is already on, let the arm sink slowly and cut torque instead of refusing to start.
+    interval: time between two samples [s]; 0 if the rate is not fixed, in which case the servos' status is not read.
     """
 
     url: str
@@ -348,7 +347,7 @@ class ServoBus(TorqueSwitch):
 
     @property
     def commanded_by_another(self) -> str:
-        """Sentence on a servo that held a value not written by this program when last read back; "" if there is none.
+        """Sentence on a value recently read back that this program did not write; "" if there is none.
 
         One such value does not prove another master: a servo that misses writes holds an older goal.
         """
@@ -371,7 +370,7 @@ class ServoBus(TorqueSwitch):
         self.prepared.read_status_next()
 
     def check_alerts(self, state: State) -> None:
-        """Read the hardware error of every servo with its alert bit set; raises ServoFault, which names all of them."""
+        """Read the hardware error of every servo whose alert bit is set; raises one ServoFault for all of them."""
         raised = [joint for joint, error in zip(self.joints, state.error, strict=True) if error & ALERT]
         faults = [text for joint in raised if (text := self._faults(joint))]
         if faults:

@@ -46,8 +46,8 @@ many cycles late is recognised by its length.
 
 _AGAIN_SHARE = 0.5
 _SHORT_CYCLE_S = 0.005
-"""In cycles of up to `_SHORT_CYCLE_S` [s], a lost read-back is repeated at once, which may delay the next cycle by the
-fraction `_AGAIN_SHARE` of its length. In longer ones, read-backs are rarely lost, and a delay leaves joints unobserved.
+"""In cycles of up to `_SHORT_CYCLE_S` [s], a lost read-back is repeated at once; this may delay the next cycle by the
+fraction `_AGAIN_SHARE` of a cycle. In longer cycles, read-backs are rarely lost, and a delay leaves joints unobserved.
 """
 
 _LONGEST_REPLY = 1024
@@ -382,9 +382,9 @@ class Exchange:
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
         """Handle replies that arrive sooner than the wire time allows: they may belong to an earlier request.
 
-        A duplicated reply is still in the input when the next request is sent; from then on every reply would be one
-        cycle old. If the true reply follows, it is used. If none follows, the port is not a real serial line (a pty),
-        and after a few such cases the check is switched off.
+        A duplicated reply is still in the input when the next request is sent; if it were used, every later reply
+        would be one cycle old. If the true reply follows, that one is used. If none follows, the port is not a real
+        serial line but, say, a pty, and after a few such cases the check is switched off.
         """
         received = self._port.read(read.reply_size, max(0.0, deadline - self._now()))
         if not received:
@@ -410,7 +410,7 @@ class Exchange:
         return span
 
     def _search(self, read: GroupRead, received: bytes, deadline: float) -> list[Answer]:
-        """Extract the answers, some perhaps stuffed, damaged or missing; read until all have arrived or time is up."""
+        """Extract the answers, which may be stuffed, damaged or missing; read until all have arrived or time is up."""
         while True:
             answers, over = read.search(received)
             remaining = deadline - self._now()
@@ -433,7 +433,7 @@ class Exchange:
         self._port.overheard = b""
 
     def _ask_otherwise(self, sent: bytes, plan: "_Plan", start: float) -> bytes:
-        """Return the reply, without an echo, when two writes are needed or the adapter echoes what is sent."""
+        """Return the reply without an echo; used if two writes are needed or the adapter echoes what is sent."""
         port, read = self._port, plan.read
         count = read.reply_size + (len(sent) if self._echoes else 0)
         if self.one_write:
@@ -472,9 +472,9 @@ class _Plan:
     """One of the group reads of an exchange.
 
     span: the span that a Reply reports. reply_time: how long to wait for the replies. pack_behind: packs the goals' CRC
-    and the request. wire_s: wire time of goals, request and replies [s]. soonest: time after the start of a cycle
-    before which a complete reply may belong to an earlier request [s]. is_after_loss: whether a late reply may be on
-    the wire when this read is sent, and destroy the goals.
+    and the request. wire_s: wire time of goals, request and replies [s]. soonest: a complete reply
+    that arrives sooner than this after the start of a cycle may belong to an earlier request [s]. is_after_loss:
+    whether a late reply may be on the wire when this read is sent, and may destroy the goals.
     """
 
     read: GroupRead

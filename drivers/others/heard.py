@@ -20,7 +20,7 @@ _FRONT_SIZE = 8  # header, ID, LEN, INST
 _BEFORE_LENGTH = 7  # header, ID, LEN
 _BESIDE_DATA = 4  # INST, ERR, CRC
 _LONGEST_CUT_OFF = 64
-"""Largest LEN of an instruction that is recognised with its end missing; a damaged LEN is usually larger."""
+"""Largest LEN of a truncated instruction that is recognised as such; a damaged LEN is usually larger."""
 
 _PART_OF_A_REPLY = 8  # bytes; at least the header of a fast reply, whose first servos have then answered
 
@@ -42,16 +42,16 @@ class Heard:
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """Number of replies since the last late one with one answer per servo but IDs not matching the request."""
+        """Number of replies since the last late one that had one answer per servo but IDs not matching the request."""
         self.strangers: float = 0
-        """Number of received packets that this program neither sent nor requested: another master is on the bus."""
+        """Number of received packets that this program neither sent nor requested, but another master did."""
 
     def expect(self, reads: Iterable[GroupRead]) -> None:
         """From now on, treat replies to these reads as replies to this program."""
         self._expected = self._expected.union(*(read.expected for read in reads))
 
     def pending(self, received: bytes, now: float, *, echoes: bool) -> None:
-        """Examine bytes that were pending before a request: from another master, or a late or repeated reply.
+        """Examine bytes that were pending before a request: another master's packets, or a late or repeated reply.
 
         now: time on the port's clock [s]. echoes: whether the adapter echoes what this program sends.
         """
@@ -122,7 +122,7 @@ class Heard:
             self.strangers += sum(self._is_strange(packet) for packet in packets)
 
     def _is_strange(self, packet: Packet) -> bool:
-        """Whether this is another master's instruction or a reply to one. Errors without data may be ours."""
+        """Whether this is another master's instruction or a reply to one. An error without data may be for us."""
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
@@ -146,7 +146,7 @@ def _packets_within(received: bytes) -> list[Packet]:
 
 
 def _fronts_of_replies(received: bytes) -> Iterator[tuple[int, int]]:
-    """Yield ID and number of data bytes, without stuffing, of each status packet, complete or not."""
+    """Yield the ID and number of data bytes, without stuffing, of each status packet, complete or not."""
     at = received.find(HEADER)
     while at >= 0:
         front = received[at : at + _FRONT_SIZE]
@@ -158,9 +158,9 @@ def _fronts_of_replies(received: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:
-    """Yield ID and LEN of each instruction that is cut off by the next packet.
+    """Yield the ID and LEN of each instruction that is cut off by the next packet.
 
-    A master does not receive while it transmits: of another's packet, it hears only the part that preceded its own.
+    A master does not receive while it transmits: it hears only the part of another's packet that preceded its own.
     """
     at = received.find(HEADER)
     while (following := received.find(HEADER, at + len(HEADER))) >= 0:

@@ -20,7 +20,7 @@ SLOWEST_S = 0.1
 
 _TRIPS = 5
 _TIMES, _APART_S = 6, 0.05
-"""Number of repeated measurements before slow replies are attributed to the adapter, and the time in between [s]."""
+"""Number of repeated measurements before slow replies are attributed to the adapter, and the time between two [s]."""
 
 _PING_BYTES = 24  # on the wire: the ping and its status
 _STATUS_BYTES = 14
@@ -121,7 +121,7 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     secondary = servo.read("Secondary(Shadow) ID")
     if secondary in others:
         raise WrongSetting(
-            f"{joint.title}: its Secondary ID is {secondary}, so it also obeys commands to that servo. Remove it with "
+            f"{joint.title}: its Secondary ID is {secondary}, so it also obeys commands to that ID. Clear this ID with "
             f"hil setup {servo.port.url} --id {joint.id} --secondary-id 255."
         )
     if arms_itself(servo):
