@@ -262,6 +262,7 @@ class ServoBus(TorqueSwitch):
             status_every=status_every,
             interval=self.config.interval / every,
             patience=patience,
+            beside=read_back_spans(modes, tables),
         )
 
     @property

@@ -86,6 +86,7 @@ class Exchange:
     status_every: number of cycles between two status reads; there are none if `status` is None.
     interval: time between two cycles [s], 0 if unknown; a slow cycle can wait longer for a reply than a fast one.
     patience: minimum time to wait for replies [s]; by default the longest time that wire, servos and adapter may need.
+    beside: registers that are read back between cycles; a late reply to such a read is recognised by its length, too.
     """
 
     def __init__(
@@ -103,6 +104,7 @@ class Exchange:
         status_every: int = 20,
         interval: float = 0.0,
         patience: float = 0.0,
+        beside: Sequence[Span | Sequence[Span]] = (),
     ) -> None:
         goals = (goal,) * len(ids) if isinstance(goal, Register) else tuple(goal)
         for register in goals:
@@ -123,7 +125,7 @@ class Exchange:
         self._write = self._writes[0] if len(self._writes) == 1 else None
         every = [*spans] if status is None else [*spans, status]
         self._kinds = len(every)
-        every += _of_other_lengths(every, len(self.ids))
+        every += _of_other_lengths(every, beside, len(self.ids))
         reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
         self.heard = Heard(self.ids, reads)
         least = max(patience, min(PATIENCE_SHARE * interval, MOST_PATIENCE_S))
@@ -312,6 +314,7 @@ class Exchange:
             received = port.ask(read.request, read.reply_size, expected, start)
         if port.overheard:
             self._overhear()
+        self.heard.latest = received
         self._damaged = bool(received)
         servos = read.unpack(received)
         if servos is None:
@@ -352,6 +355,7 @@ class Exchange:
             received = self._ask_otherwise(sent, plan, before)
         if port.overheard:
             self._overhear()
+        self.heard.latest = received
         servos = read.unpack(received)
         after = self._now()
         took = after - before
@@ -509,9 +513,11 @@ class _GoalWrite:
         return packet + _pack_crc(_crc(packet))
 
 
-def _of_other_lengths(spans: Sequence[Span | Sequence[Span]], servos: int) -> list[tuple[Span, ...]]:
+def _of_other_lengths(
+    spans: Sequence[Span | Sequence[Span]], beside: Sequence[Span | Sequence[Span]], servos: int
+) -> list[tuple[Span, ...]]:
     """Return variants of the usual span with extra leading bytes, such that no two spans have the same length."""
-    taken = {one_each(span, servos)[0].size for span in spans}
+    taken = {one_each(span, servos)[0].size for span in (*spans, *beside)}
     usual = one_each(spans[0], servos)
     lengths = [size for size in range(usual[0].size + 1, usual[0].size + AFTER_LOSS + len(taken)) if size not in taken]
     return [tuple(each.longer(size - each.size) for each in usual) for size in lengths[:AFTER_LOSS]]

@@ -22,6 +22,9 @@ _BESIDE_DATA = 4  # INST, ERR, CRC
 _LONGEST_CUT_OFF = 64
 """Largest LEN of a truncated instruction that is recognised as such; a damaged LEN is usually larger."""
 
+_LEAST_REPEATED = 4
+"""Number of bytes from which part of a reply is recognised when it arrives again."""
+
 _PART_OF_A_REPLY = 8  # bytes; at least the header of a fast reply, whose first servos have then answered
 
 
@@ -35,10 +38,12 @@ class Heard:
         self._ids = tuple(ids)
         self._expected: frozenset[tuple[int, int]] = frozenset()
         self.expect(reads)
-        self.damaged_at = self.late_at = -math.inf
-        """Times of the latest incomplete or damaged replies, and of the latest late or repeated reply [s on the port's
-        clock].
+        self.damaged_at = self.late_at = self.repeated_at = -math.inf
+        """Times of the latest incomplete or damaged replies, of the latest late or repeated reply, and of the latest
+        reply that arrived again [s on the port's clock].
         """
+        self.latest = b""
+        """What was received in reply to the latest request."""
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
@@ -55,6 +60,10 @@ class Heard:
 
         now: time on the port's clock [s]. echoes: whether the adapter echoes what this program sends.
         """
+        if len(received) >= _LEAST_REPEATED and received in self.latest:
+            self.repeated_at = now
+            self._was_late(now)
+            return
         packets = _packets_within(received)
         self._count_strangers(packets, echoes=echoes)
         if any(packet.is_status for packet in packets):
@@ -93,6 +102,8 @@ class Heard:
     def advice(self, now: float, url: str) -> str:
         """Return advice on bytes received in the last 0.1 s instead of complete and timely replies; "" if none."""
         since = now - _RECENT_S
+        if self.repeated_at > since:
+            return "Replies are repeated in transit and collide with what is sent: check the adapter and the cables."
         if self.late_at > since:
             return (
                 "Replies did arrive, but too late or twice: check the adapter's latency timer and whether other "

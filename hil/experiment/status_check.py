@@ -37,6 +37,10 @@ _HELD_BEFORE = 4
 """If writes are lost, a servo may also hold one of this many goals that were sent before the latest matching status."""
 
 
+WHY_LOST = "Goals are being lost in transit, or the servo refuses them: check its cable and limits."
+"""Advice about lost goals where nothing that was heard explains them."""
+
+
 class StatusCheck:
     """Compares reported values with the commanded ones. `look` returns the fault, or None.
 
@@ -58,6 +62,8 @@ class StatusCheck:
         self._held: list[float | None] = [None] * len(config.joints)
         self._agreed_at = [0] * len(config.joints)
         self._is_foreign = [False] * len(config.joints)
+        self._missed_at = [-1] * len(config.joints)
+        """Number of goals sent when a status last differed, by joint."""
         self._foreign = [ForeignValues() for _ in config.joints]
         """Goals in the status that this program never sent, by joint."""
         # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
@@ -119,7 +125,8 @@ class StatusCheck:
             self._missed[joint] = 0
             self._held[joint], self._agreed_at[joint], self._is_foreign[joint] = None, self._cycles, False
             return None
-        self._held[joint] = status.goal
+        former, self._held[joint] = self._held[joint], status.goal
+        missed_at, self._missed_at[joint] = self._missed_at[joint], self._cycles
         foreign = self._foreign[joint]
         if self._never_sent(joint, status.goal):
             self._is_foreign[joint] = True
@@ -128,6 +135,11 @@ class StatusCheck:
         self._missed[joint] += 1
         if self._missed[joint] < _GOALS_MISSED and not is_repeated:
             return None
+        if former is not None and missed_at == self._cycles - 1 and self._is_late_by_one(joint, former, status.goal):
+            return Cause.STALE, (
+                "returns stale data: it holds the goal that it seemed to have missed one cycle before, so its replies "
+                "are a cycle late. Check the adapter, its latency and its cable."
+            )
         unit = self._unit[joint]
         held = f"it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent"
         if self._is_foreign[joint] or is_repeated:
@@ -136,10 +148,11 @@ class StatusCheck:
                 "Either another program or controller is commanding it (stop or unplug that one), or goals are being "
                 "corrupted on the bus (check the adapter and the cable)."
             )
-        return Cause.GOALS_LOST, (
-            f"does not accept goals: {held}, and it missed an earlier one too. Goals are being lost in transit, or the "
-            "servo refuses them: check its cable and limits."
-        )
+        return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {WHY_LOST}"
+
+    def _is_late_by_one(self, joint: int, former: float, held: float) -> bool:
+        """Whether a servo that held the goal `former` in the cycle before now holds the goal sent then."""
+        return abs(held - self._goals[-2][joint]) < self._half_tick[joint] <= abs(held - former)
 
     def _never_sent(self, joint: int, held: float) -> bool:
         """Whether the goal that is held differs from every goal sent to any joint since a status last matched.

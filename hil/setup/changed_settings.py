@@ -56,7 +56,8 @@ def settings_now(bus: ServoBus) -> Settings:
     """Read the settings that determine how servos move and what they report.
 
     Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
-    to an earlier request. If the two readings differ, the value is unknown and omitted.
+    to an earlier request. If the two readings differ, the value is unknown and omitted. If even the ID read last is not
+    the servo's, replies are late, and a value that was read twice may be that of another register.
     """
     found: dict[tuple[Joint, str], int] = {}
     for joint, servo in bus.drives.items():
@@ -64,7 +65,9 @@ def settings_now(bus: ServoBus) -> Settings:
         with suppress(DriverError):
             first = {register: servo.read(register, attempts=1) for register in known}
             again = {register: servo.read(register, attempts=1) for register in reversed(known)}
-            found |= {(joint, register): first[register] for register in known if first[register] == again[register]}
+            if servo.read("ID", attempts=1) == servo.id:
+                same = [register for register in known if first[register] == again[register]]
+                found |= {(joint, register): first[register] for register in same}
     return found
 
 

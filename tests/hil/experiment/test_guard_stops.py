@@ -482,6 +482,8 @@ def test_a_velocity_without_motion_before_the_start_is_a_false_reading_unless_it
     run = RunFolder.create(tmp_path / "run", config)
     with pytest.raises(ExperimentError, match=said):
         run_experiment(config, run, config.path, once(freeze, Phase.REST, since), plan)
+    is_braked = Phase.BRAKING in load_samples(run.samples_path, 2)["phase"]
+    assert is_braked == (said == MOVES), "no brake may rely on a false velocity"
     assert_stopped(ports[0])
 
 
