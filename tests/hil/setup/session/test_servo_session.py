@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +15,8 @@ from hil.cli.errors import message
 from hil.config.schema import load_config
 from hil.drivers.errors import BusShared, DriverError, PortLost, TorqueNotOff, WrongModel
 from hil.drivers.joint import Joint
+from hil.drivers.preparation.prepare import prepare_servo
+from hil.drivers.servo import Servo
 from hil.errors import Cause, ExperimentError, HilError, SafetyStop, StopRequested
 from hil.fakes.bus.faults import Fault
 from hil.setup.preflight import Finding, Level, check_arm
@@ -76,6 +79,50 @@ def test_torque_that_another_program_switches_on_between_two_runs_is_cut_and_nam
             pytest.fail("the next run began")
     assert not any(servo.torque_enabled for servo in bench.servos.values())
     assert "Torque is off on both servos, confirmed by reading it back." in stop.value.__notes__
+
+
+@pytest.mark.parametrize(
+    "after",
+    [
+        "hil.setup.session.servo_session.settings_now",  # while settings are saved
+        "hil.drivers.bus.check_quiet",  # while this program listens for others
+        "hil.drivers.bus.prepare_servo",  # the other servo refuses its mode
+        "hil.experiment.run._write_facts",  # both refuse their limits
+    ],
+)
+def test_torque_that_another_program_switches_on_during_the_set_up_is_cut_and_named(
+    arm: Arm, tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch, after: str
+) -> None:
+    module, _, name = after.rpartition(".")
+    before = getattr(sys.modules[module], name)
+    done: list[object] = []
+
+    def then(*given: Any) -> Any:
+        result = before(*given)
+        if not done:
+            done.append(bench.servos[2].write(64, b"\1"))
+        return result
+
+    monkeypatch.setattr(after, then)
+    with pytest.raises(BusShared, match=r"'elbow'.*switched on by another program") as stop:
+        play(arm(SHORT), tmp_path / "run")
+    assert bench.changed() == []
+    assert "Torque is off on both servos, confirmed by reading it back." in stop.value.__notes__
+
+
+def test_a_servo_whose_mode_has_just_been_set_has_no_goal(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A change of mode leaves Goal Current at Current Limit: torque that comes on then would drive it with that."""
+    goals: list[int] = []
+
+    def prepared(joint: Joint, servo: Servo, others: set[int]) -> None:
+        prepare_servo(joint, servo, others)
+        goals.append(bench.servos[joint.id].value("Goal Current"))
+
+    monkeypatch.setattr("hil.drivers.bus.prepare_servo", prepared)
+    with servo_session(arm(SHORT)):
+        assert goals == [0, 0]
 
 
 def test_a_check_reports_torque_that_came_on_meanwhile_and_leaves_it(
