@@ -73,8 +73,9 @@ def _trips(servo: Servo) -> list[float]:
 
 
 def check_quiet(port: Port) -> None:
-    """Raise BusShared if another master's instructions are received."""
+    """Raise BusShared if another master's instructions are received; the port then begins to count those to come."""
     port.discard_input()
+    port.strangers = 0
     heard = list(Framer().feed(port.read(_MOST_HEARD_BYTES, LISTEN_S)))
     targets = sorted({packet.id for packet in heard if not packet.is_status})
     if targets:

@@ -16,7 +16,7 @@ from pathlib import Path
 from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError, PortLost, ServoRefused
+from hil.drivers.errors import BusShared, DriverError, PortLost, ServoRefused
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import read_settings
 from hil.drivers.servo_model import Mode
@@ -232,6 +232,12 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             before = bus.torque_off_report
             with signals_held_back():
                 left = session.end()
+            if bus.port.strangers and not isinstance(stopped, BusShared):
+                left.append(
+                    "Another program has sent packets on this bus while the servos were set up or restored "
+                    f"({bus.port.strangers} were received). Their settings were read back, but end that program before "
+                    "the next start: its packets may destroy others, or move the arm."
+                )
             end_with(bus, stopped, left, before)
 
 

@@ -22,7 +22,7 @@ from hil.fakes.bus.faults import Fault
 from hil.setup.preflight import Finding, Level, check_arm
 from hil.setup.session.end_of_session import about_torque
 from hil.setup.session.saved_settings import SavedSettings
-from hil.setup.session.servo_session import COUNT_DOWN_S, SETTINGS_NAME, servo_session
+from hil.setup.session.servo_session import COUNT_DOWN_S, SETTINGS_NAME, ServoSession, servo_session
 from hil.setup.session.settings_file import settings_path
 from tests.support.bench import SHORT, Arm, Bench, play
 
@@ -123,6 +123,25 @@ def test_a_servo_whose_mode_has_just_been_set_has_no_goal(
     monkeypatch.setattr("hil.drivers.bus.prepare_servo", prepared)
     with servo_session(arm(SHORT)):
         assert goals == [0, 0]
+
+
+@pytest.mark.parametrize("is_run", [False, True])
+def test_packets_of_another_master_while_settings_are_restored_are_named(
+    arm: Arm, tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch, is_run: bool
+) -> None:
+    def begins(*given: Any) -> Any:
+        bench.port.bus.faults.add(Fault(kind="other_master", servo=1, at=bench.port.clock.now()))
+        return end(*given)
+
+    end = ServoSession.end
+    monkeypatch.setattr(ServoSession, "end", begins)
+    with pytest.raises(ExperimentError, match="Another program has sent packets on this bus"):
+        if is_run:
+            play(arm(SHORT), tmp_path / "run")
+        else:
+            with servo_session(arm(SHORT)):
+                pass
+    assert bench.changed() == []
 
 
 def test_a_check_reports_torque_that_came_on_meanwhile_and_leaves_it(
