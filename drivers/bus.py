@@ -19,6 +19,7 @@ from hil.drivers.preparation.prepare import (
     overruled,
     prepare_servo,
 )
+from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
 from hil.drivers.state import NAN, SETTINGS, Converter, State, fold, read_back_spans, spans
@@ -189,16 +190,22 @@ class ServoBus(TorqueSwitch):
         if self.config.take_over:
             let_sink(self._servos, self.port.clock)
         refuse_held(self._servos)
+        for servo in self._servos.values():
+            if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED and servo.read("Torque Enable"):
+                servo.write("Torque Enable", 0)  # so that any torque found from now on is another program's
 
     def prepare(self) -> None:
         """Set every servo's mode with torque off, and prepare the exchange.
 
-        Raises ServoFault, BusShared if another master is heard, and WrongSetting if a register rules out an experiment
-        and only the user may change it.
+        Torque must have been found off (`release_held`). Raises ServoFault, BusShared if another master is heard or
+        has switched torque on since, and WrongSetting if a register rules out an experiment and only the user may
+        change it.
         """
         check_quiet(self.port)
         ids = {drive.id for drive in self._drives}
         for joint, servo in self._servos.items():
+            if servo.read("Torque Enable"):
+                self.refuse_switched_on()
             prepare_servo(joint, servo, ids - {joint.id})
         self._measured = tuple(
             joint.within_turn(servo.read("Present Position")) for joint, servo in self._servos.items()

@@ -140,6 +140,8 @@ class Port:
         """Bytes that `ask` found pending before a request and kept apart from the reply: late replies, or replies to
         another master.
         """
+        self.strangers = 0
+        """Number of instructions of another master received during set-up work, since the count was last reset."""
         self._serial = opened
         self._timeout: float | None = opened.timeout
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()
@@ -403,7 +405,10 @@ class DescriptorPort(Port):
             raise
 
     def put_aside(self) -> None:
-        self.overheard = os.read(self._descriptor, _MOST_OVERHEARD)
+        try:
+            self.overheard = os.read(self._descriptor, _MOST_OVERHEARD)
+        except OSError as error:
+            raise self._lost(error) from error
         self.discard_input()
 
     def discard_input(self) -> None:

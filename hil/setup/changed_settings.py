@@ -7,15 +7,18 @@ from itertools import permutations
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
-from hil.drivers.servo_model import RETURN_DELAY_UNIT
+from hil.drivers.servo_model import RETURN_DELAY_UNIT, Mode
 from hil.errors import Cause
 
 __all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "may_be_later", "settings_now"]
 
 _MODE, _DELAY = "Operating Mode", "Return Delay Time"
-_REGISTERS = (_MODE, "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _DELAY)
+_GOAL_PWM = "Goal PWM"
+"""In current mode, a limit of the motor's voltage. A tripped watchdog leaves 0 there, which is nobody's setting."""
 
-WRITTEN = frozenset({"Operating Mode", "Current Limit"})
+_REGISTERS = (_MODE, "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _GOAL_PWM, _DELAY)
+
+WRITTEN = frozenset({"Operating Mode", "Current Limit", _GOAL_PWM})
 """Settings that this program writes itself."""
 
 _LATE = frozenset({Cause.LATE, Cause.MISSING})
@@ -68,6 +71,8 @@ def settings_now(bus: ServoBus) -> Settings:
             if servo.read("ID", attempts=1) == servo.id:
                 same = [register for register in known if first[register] == again[register]]
                 found |= {(joint, register): first[register] for register in same}
+            if joint.mode is not Mode.CURRENT or not found.get((joint, _GOAL_PWM)):
+                found.pop((joint, _GOAL_PWM), None)
     return found
 
 
