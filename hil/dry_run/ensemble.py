@@ -118,7 +118,7 @@ def result_draws(result: Result, count: int, farther: float = 1.0, seed: int = 0
 
 
 def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: int) -> Array:
-    """Draw from a normal distribution (count, parameters), scaled because parameters differ by orders of magnitude."""
+    """Draw from a normal distribution (count, parameters), via correlations: parameters differ by orders of magnitude."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     correlation = covariance / np.outer(scale, scale)
     size, axes = np.linalg.eigh(0.5 * (correlation + correlation.T))

@@ -44,7 +44,7 @@ def parameters_of(result: Result, truth: Mapping[str, float] | None = None, note
 def _table(
     entries: Mapping[str, Quantity], truth: Mapping[str, float], groups: Mapping[str, str], caption: str
 ) -> Table:
-    """Build a table; groups: composition of a spatial arm's base parameters, by name."""
+    """Build a table. groups: composition of a spatial arm's base parameters, by name."""
     head = ("parameter", "meaning", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
     rows = tuple(_row(name, entry, truth, groups) for name, entry in entries.items())
     return Table(head, rows, 3, caption, (1, 5) if truth else (1,))

@@ -165,9 +165,9 @@ def test_a_base_whose_shape_cannot_be_read_has_none(tmp_path: Path) -> None:
     ("shape", "said"),
     [
         ('<sphere radius="wide"/>', "radius='wide' must be a number"),
-        ('<box size="0.1 -0.1 0.1"/>', 'a box of its geometry has size="0.1 -0.1 0.1": lengths [m] cannot be negative'),
+        ('<box size="0.1 -0.1 0.1"/>', 'a box in its geometry has size="0.1 -0.1 0.1", but lengths [m] cannot'),
         ('<box size="0.1 0.1"/>', 'size="0.1 0.1" must be three numbers'),
-        ('<cylinder radius="0.1"/>', "a cylinder of its geometry has no length"),
+        ('<cylinder radius="0.1"/>', "a cylinder in its geometry has no length"),
         ('<mesh filename="a.stl" scale="0.001"/>', 'scale="0.001" must be three numbers'),
     ],
 )
