@@ -46,7 +46,7 @@ def near_by_design(space: Space) -> Iterator[str]:
 
 
 def _same_direction(config: Config, joint: JointConfig) -> str:
-    """Warn if both servos of a joint are configured to turn the same way, which is rarely right; otherwise return ""."""
+    """Warn if both servos of a joint are set to turn the same way, which is rarely right; otherwise return ""."""
     if len(joint.ids) == 1 or len(set(joint.directions)) > 1:
         return ""
     (first, second), sign = joint.ids, joint.direction

@@ -1,4 +1,4 @@
-"""Requirements on the configuration of a spatial arm, and its description read from a URDF."""
+"""Requirements on the configuration of a spatial arm, and the arm's description read from a URDF."""
 
 import math
 from collections.abc import Iterator

@@ -118,7 +118,7 @@ class Columns(_Table):
     def _consistent(self) -> Self:
         drives = [kind for kind in ("torque", "current", "voltage", "pwm") if getattr(self, kind) is not None]
         if len(drives) > 1:
-            raise ValueError(f"columns: {' and '.join(drives)} are both given: give only one of them")
+            raise ValueError(f"columns: {' and '.join(drives)} are both given; give only one of them")
         if self.time is not None and self.rate is not None:
             raise ValueError("columns: give either time or rate, not both")
         if self.current is not None and self.torque_constant is None:

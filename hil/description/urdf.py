@@ -126,8 +126,8 @@ def _without_inertia(root: ET.Element, links: Container[str | None]) -> Iterator
             continue
         if float(mass.get("value", "nan")) > 0.0:
             yield (
-                f'link "{element.get("name")}": it has a mass but no <inertia>, so it counts as a point '
-                "mass; this is used only as an initial guess"
+                f'link "{element.get("name")}" has a mass but no <inertia>, so it counts as a point '
+                "mass, which is used only as an initial guess"
             )
 
 

@@ -1,4 +1,4 @@
-"""Search by dry runs for the largest torque per joint that keeps the risk of exceeding a limit acceptably low."""
+"""Use dry runs to find the largest torque per joint that keeps the risk of exceeding a limit acceptably low."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor

@@ -73,7 +73,7 @@ class Found:
 class SafeShares:
     """The current belief about the arm, and the paths designed for it.
 
-    last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are fractions of the
+    last: share of the previous run. cap: largest share after a run that exceeded a limit. Both are fractions of the
     amplitude of `paths`, and are converted when these paths are replaced. tell: called with the progress of each
     simulation of the arms. designing: called with the progress of each path's design. trying: called with a description
     of each path and amplitude before it is simulated. simulated: motion simulated so far [s]. passed: on which sides of
@@ -95,7 +95,7 @@ class SafeShares:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether so much has been simulated that no further paths are tried."""
+        """Whether so much has been simulated that no further paths should be tried."""
         return self.simulated > MOST_SIMULATED_S
 
     @property

@@ -33,8 +33,8 @@ TORQUE_SHARE = 0.8  # of a joint's torque limit that a path may use: the rest is
 class PathSegment(Segment):
     """A path. Its multisine is the torque that is commanded for the path.
 
-    way, back: goals of the transitions from and to the rest pose (samples, joints) [A]. paths: the desired motions:
-    transition, period, transition back. thought: the assumed model from which the torque was computed. peaks: largest
+    way, back: goals of the transitions from and to the rest pose (samples, joints) [A]. paths: the desired motions
+    (transition, period, transition back). thought: the assumed model from which the torque was computed. peaks: largest
     goal for the path without the stabiliser (joints,) [A].
     """
 

@@ -71,7 +71,7 @@ def said(columns: Columns, table: Table) -> str:
     used = {table.find(name)[0] for name in (columns.time, *(columns.position or []), *getattr(columns, drive)) if name}
     unused = [name for name in table.columns if name not in used]
     left_out = f" Not used: {', '.join(name or 'a column without a name' for name in unused)}." if unused else ""
-    return f"{table.source}: columns read: time: {time}; position: {position}; {drive}: {driven}.{left_out}"
+    return f"{table.source}: columns read: time = {time}; position = {position}; {drive} = {driven}.{left_out}"
 
 
 def _described(kind: str, names: Sequence[str], columns: Columns, table: Table) -> str:
@@ -136,7 +136,7 @@ def _spaced(name: str) -> str:
 
 
 def _stem(name: str) -> str:
-    """The part of a column's name that all joints share: all but the joint's number, or all that precedes the last dot."""
+    """The part of a column's name that all joints share: all but the joint's number, or all before the last dot."""
     numbered = re.sub(r"\d+", "#", name)
     if numbered != name:
         return numbered

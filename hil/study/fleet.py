@@ -52,7 +52,7 @@ class FleetArm:
 
 @dataclass(frozen=True)
 class Fleet:
-    """Comparison of the arms of one type. spreads, unlike (outliers, largest first): empty if there are too few arms."""
+    """Comparison of the arms of one type. spreads, unlike (outliers, largest first): empty if there are too few."""
 
     type: str
     arms: tuple[FleetArm, ...]

@@ -24,7 +24,7 @@ def parameters(data: RunData) -> Section:
 
 
 def parameters_of(result: Result, truth: Mapping[str, float] | None = None, note: str = "") -> Section:
-    """Return the section on parameters for any kind of result. truth: true values in the result's units; note: a
+    """Return the section on parameters for any kind of result. truth: true values in the result's units. note: a
     sentence about them.
     """
     groups = {} if result.chain is None else result.chain.groups

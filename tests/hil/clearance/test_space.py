@@ -187,7 +187,7 @@ LIMITS = '<limit lower="-0.94" upper="1.38"'
         ((LIMITS, '<limit lower="-0.94" upper="0.9"'), "but position_limit lets it move from"),
         (('iyy="', 'iyy="9'), "no mass distribution can have this inertia"),
         ((LIMITS, '<limit lower="-80" upper="80"'), "are these degrees? Limits must be in radians: [-1.4, 1.4]"),
-        (("<inertia ", "<no_inertia "), "it has a mass but no <inertia>"),
+        (("<inertia ", "<no_inertia "), "has a mass but no <inertia>"),
         (("<box size=", "<mesh filename="), "replaced by a capsule"),
         (("", ""), ""),
     ],
