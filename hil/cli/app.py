@@ -1,7 +1,7 @@
 """The `hil` command: its subcommands in the order in which the help lists them, and its error handling.
 
-The modules imported here only define the arguments of the subcommands; the modules that do the work are imported inside
-the commands, so that `hil --help` responds immediately.
+The modules imported here only define the arguments of the subcommands; those that do the work are imported inside the
+commands, so that `hil --help` responds immediately.
 """
 
 import os

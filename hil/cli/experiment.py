@@ -1,6 +1,6 @@
 """The subcommands that identify, record and estimate.
 
-The modules that do the work are imported inside the commands, so that `hil --help` responds immediately.
+The modules that do the work are imported inside the commands, as in hil.cli.app.
 """
 
 from collections.abc import Iterator, Sequence

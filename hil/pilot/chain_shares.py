@@ -234,7 +234,7 @@ class SafeShares:
         return found, why, shortage
 
     def _found(self, config: Config, share: float, which: str) -> tuple[Found | None, str, float]:
-        """Return this share if it is safe, why it is not safe otherwise, and how much clearance it lacks [m]."""
+        """Return this share if it is safe, otherwise why it is not, and how much clearance it lacks [m]."""
         shortage = 0.0
         for count in (SEARCH_ARMS, ARMS):
             found, why, lacking = self._unsafe(config, share, count, which)
