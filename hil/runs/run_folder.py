@@ -120,7 +120,9 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path, config: Config) -> "RunFolder":
-        """Create the folder and copy the configuration. Raises RunFolderError if it is not empty or not writable."""
+        """Create the folder and copy the configuration. Raises RunFolderError if the folder is not empty or not
+        writable.
+        """
         run = cls(path)
         try:
             path.mkdir(parents=True, exist_ok=True)

@@ -427,7 +427,7 @@ def test_a_column_named_datetime_is_the_time_and_one_without_a_name_is_named() -
         encoding="utf-8",
     )
     (note, *_) = read(Path("a.csv")).notes
-    assert "time: datetime" in note and "Not used: a column without a name." in note
+    assert "time = datetime" in note and "Not used: a column without a name." in note
 
 
 def test_the_example_of_a_file_of_one_joint_has_its_own_names() -> None:
