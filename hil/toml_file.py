@@ -36,11 +36,11 @@ def parse_toml(text: str, path: Path) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise TomlFileError(_not_toml(path, error, text)) from error
     except RecursionError:
-        raise TomlFileError(f"{path} is not valid TOML: a value has too many nested brackets.") from None
+        raise TomlFileError(f"{path}: not valid TOML: a value has too many nested brackets.") from None
     except ValueError as error:  # Python's limit for integers
         found = re.search(r"\d[\d_]{4300,}", text)
         line = text.count("\n", 0, found.start()) + 1 if found else "?"
-        raise TomlFileError(f"{path} is not valid TOML: a number has too many digits (at line {line}).") from error
+        raise TomlFileError(f"{path}: not valid TOML: a number has too many digits (at line {line}).") from error
 
 
 def _encoding_of(path: Path, error: UnicodeDecodeError) -> str:
@@ -65,12 +65,12 @@ def _not_toml(path: Path, error: Exception, text: str) -> str:
     place = re.search(r"at line (\d+)", str(error))
     number = int(place[1]) if place else len(lines)
     if again := _given_twice(str(error), text, number):
-        return f"{path} is not valid TOML: {again}."
+        return f"{path}: not valid TOML: {again}."
     if place is None or not 0 < number <= len(lines):
-        return f"{path} is not valid TOML: {error}."
+        return f"{path}: not valid TOML: {error}."
     line = lines[number - 1].strip()
     cause = next((said for pattern, said in _SYNTAX if re.search(pattern, _unquoted(line))), "")
-    return f"{path} is not valid TOML: {error}:\n  {line}" + (f"\n{cause}" if cause else "")
+    return f"{path}: not valid TOML: {error}:\n  {line}" + (f"\n{cause}" if cause else "")
 
 
 def _given_twice(error: str, text: str, number: int) -> str:

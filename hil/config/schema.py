@@ -349,10 +349,10 @@ def parse_config(text: str, path: Path, *, recorded: bool = False) -> Config:
     if "path" in values:
         raise ConfigError(f"{path}: path is not a known key.")
     if "joints" not in values and "study" in values:
-        raise ConfigError(f"{path} describes a study, not an arm. Type: {command('study', path)}")
+        raise ConfigError(f"{path}: it describes a study, not an arm. Type: {command('study', path)}")
     if "joints" not in values and "columns" in values:
         raise ConfigError(
-            f"{path} describes the columns of a recording, not an arm. Type: "
+            f"{path}: it describes the columns of a recording, not an arm. Type: "
             f"{command('estimate', 'FILE.csv', '--config', path)}"
         )
     if isinstance(values.get("fake"), dict):

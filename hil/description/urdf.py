@@ -138,7 +138,7 @@ def _body(element: ET.Element | None, where: str, path: Path) -> Body:
     mass = element.find("mass")
     kilograms = 0.0 if mass is None else _number(mass, "value", where, path)
     if kilograms < 0.0:
-        raise ArmFileError(f"{path}: {where}: its mass, {kilograms:g} kg, cannot be negative")
+        raise ArmFileError(f"{path}: {where}: its mass is {kilograms:g} kg; it cannot be negative")
     inertia = np.zeros((3, 3))
     given = element.find("inertia")
     if given is not None:
@@ -147,7 +147,7 @@ def _body(element: ET.Element | None, where: str, path: Path) -> Body:
         ):
             inertia[row, column] = inertia[column, row] = _number(given, key, where, path, 0.0)
             if row == column and inertia[row, row] < 0.0:
-                raise ArmFileError(f"{path}: {where}: its {key}, {inertia[row, row]:g} kg m^2, cannot be negative")
+                raise ArmFileError(f"{path}: {where}: its {key} is {inertia[row, row]:g} kg m^2; it cannot be negative")
     return Body(kilograms, np.zeros(3), inertia).moved(rotation, translation)
 
 
