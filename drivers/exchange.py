@@ -44,12 +44,6 @@ AFTER_LOSS = 5
 many cycles late is recognised by its length.
 """
 
-_AGAIN_SHARE = 0.5
-_SHORT_CYCLE_S = 0.005
-"""In cycles of up to `_SHORT_CYCLE_S` [s], a lost read-back is repeated at once; this may delay the next cycle by the
-fraction `_AGAIN_SHARE` of a cycle. In longer cycles, read-backs are rarely lost, and a delay leaves joints unobserved.
-"""
-
 _LONGEST_REPLY = 1024
 _DOUBTS = 3
 
@@ -155,10 +149,7 @@ class Exchange:
         """Duration of the latest cycle [s]."""
         self._usual = self._latest_plan = self._plans[0]
         self._read_back: ReadBack | None = None
-        self._longest_again = _AGAIN_SHARE * interval if interval <= _SHORT_CYCLE_S else 0.0
-        self._asked_again_at = -math.inf
-        self._damaged = False
-        """Whether anything arrived in reply to the latest read-back."""
+        self._interval = interval
         self.awaited_until = -math.inf
         """Reply deadline of the latest repeated read-back, which may delay the next cycle [s on the port's clock]."""
         self.read_back_at = math.inf
@@ -213,7 +204,7 @@ class Exchange:
 
         goal: spans that end with the goal. mode: spans that end with the settings, whose values are `modes`.
         """
-        back = self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
+        back = self._read_back = ReadBack(self.ids, goal, mode, modes, interval=self._interval, fast=self.fast)
         self._wire_s |= {read: self._port.wire_time(self._bytes(read)) for read in back.reads}
         self.heard.expect(back.reads)
         self.read_back_at = -math.inf
@@ -279,18 +270,13 @@ class Exchange:
         if before + takes > due:  # woken up late
             self.read_back_at = before + TRY_AGAIN_S
             return None
-        servos = self._ask_back(read, before, due - before)
+        servos, has_answer = self._ask_back(read, before, due - before)
         now = self._now()
         # Where nothing at all arrived, the reply may be late, and another one would be mistaken for it.
-        if (
-            None in servos
-            and self._damaged
-            and takes < self._longest_again
-            and now > self._asked_again_at + TRY_AGAIN_S
-        ):
+        if None in servos and has_answer and back.may_repeat(now, takes):
             # The packet of another master may have destroyed the reply, and the next cycle overwrites what it wrote.
-            self._asked_again_at, self.awaited_until = now, now + takes + self._wire_s[read]
-            servos = self._ask_back(read, now, self.awaited_until - now)
+            self.awaited_until = now + takes + self._wire_s[read]
+            servos, _ = self._ask_back(read, now, self.awaited_until - now)
         self.read_back_at = now
         if None in servos:
             self._expect_late()
@@ -303,8 +289,8 @@ class Exchange:
             self.read_status_next()  # it distinguishes lost goals from another master's
         return found
 
-    def _ask_back(self, read: GroupRead, start: float, timeout: float) -> list[Answer]:
-        """Send the read at `start` [s]; return the answers that arrive within `timeout` [s]."""
+    def _ask_back(self, read: GroupRead, start: float, timeout: float) -> tuple[list[Answer], bool]:
+        """Send the read at `start` [s]; return the answers that arrive in `timeout` [s], and whether anything did."""
         port = self._port
         expected = port.reply_time(timeout, len(read.request))
         if self._echoes:
@@ -315,13 +301,12 @@ class Exchange:
         if port.overheard:
             self._overhear()
         self.heard.latest = received
-        self._damaged = bool(received)
         servos = read.unpack(received)
         if servos is None:
             # A master that writes between two cycles is heard here, and nowhere else if the next reply is complete.
             servos = read.search(received)[0]
             self.heard.beside(received, echoes=self._echoes)
-        return servos
+        return servos, bool(received)
 
     def cycle(self, goal_ticks: Sequence[int], *, between: bool = False) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.

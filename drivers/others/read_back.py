@@ -43,6 +43,12 @@ _UNSURE_S = 0.01
 TRY_AGAIN_S = 0.005
 """If a cycle leaves no time for a read-back, the read-back is tried again after this delay [s]."""
 
+_AGAIN_SHARE = 0.5
+_SHORT_CYCLE_S = 0.005
+"""In cycles of up to `_SHORT_CYCLE_S` [s], a lost read-back is repeated at once, which may delay the next cycle by the
+share `_AGAIN_SHARE` of one. In longer ones, read-backs are rarely destroyed, and a delay leaves joints unobserved.
+"""
+
 LOST_GOALS, LOST_OF = 3, 6
 """A servo that misses `LOST_GOALS` of `LOST_OF` goals counts as not accepting them, even if the next one arrives.
 
@@ -72,7 +78,8 @@ class ReadBack:
     """Reads back the goals that the servos hold right before a cycle, and occasionally their settings instead.
 
     mode: a span that ends with the settings; `modes` are their values, equally many for each servo. A change to one of
-    these settings reverses the motor, shifts every angle, or changes the meaning of goals.
+    these settings reverses the motor, shifts every angle, or changes the meaning of goals. interval: time between two
+    cycles [s], 0 if unknown.
 
     Every cycle overwrites the goals of another master. A master that writes less often than this program is therefore
     detected only if the goals are read before every cycle.
@@ -85,6 +92,7 @@ class ReadBack:
         mode: Span | Sequence[Span],
         modes: Sequence[Sequence[int]],
         *,
+        interval: float = 0.0,
         fast: bool,
     ) -> None:
         kind = FastSyncRead if fast else SyncRead
@@ -93,6 +101,8 @@ class ReadBack:
         """Duration of the longest recent read-back, without its wire time [s]; it decays from one read-back to the
         next.
         """
+        self._longest_again = _AGAIN_SHARE * interval if interval <= _SHORT_CYCLE_S else 0.0
+        self._repeated_at = -math.inf
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
         self._modes = tuple(map(tuple, modes))
         self._settings = one_each(mode, len(ids))[0].registers[-len(self._modes[0]) :]
@@ -125,6 +135,13 @@ class ReadBack:
 
     def took(self, seconds: float) -> None:
         self.longest = max(_FADES * self.longest, seconds)
+
+    def may_repeat(self, now: float, takes: float) -> bool:
+        """Whether a lost read-back, which takes `takes` [s], may be repeated at once; if so, it is taken to be."""
+        if takes >= self._longest_again or now <= self._repeated_at + TRY_AGAIN_S:
+            return False
+        self._repeated_at = now
+        return True
 
     def look(
         self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float, *, collided: bool = False
