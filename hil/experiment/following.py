@@ -22,7 +22,7 @@ the number of looks in a run determines `LEAST_RATIO`.
 
 A servo whose readings are frozen while its joint stands still shows no deviation until the goal has moved far from the
 frozen current. But a current that is controlled never stays exactly the same while its goal changes: if all three
-readings do for `FROZEN_S`, and the goal has meanwhile changed by more than two sigma, they are frozen. A current of zero
+readings do for `FROZEN_S` and the goal has meanwhile changed by more than two sigma, they are frozen. A current of zero
 does not count, since a sensor may have a dead zone there.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
