@@ -1,4 +1,4 @@
-"""The servos of one arm on one port: preparation and the control cycle; torque is switched by `hil.drivers.torque`."""
+"""Preparation and control cycle of the servos of one arm on one port; `hil.drivers.torque` switches their torque."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -34,13 +34,13 @@ _PROBES = 3
 
 @dataclass(frozen=True)
 class BusConfig:
-    """Location of the servos and how to communicate with them.
+    """Where the servos are connected and how to communicate with them.
 
     url: device or pyserial URL.
     one_write: send Sync Write and group read in one write; False if `hil check` finds that an arm needs two.
     fast_sync_read: use Fast Sync Read if the firmware of every servo supports it.
-    slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
-    voltage with temperature.
+    slow_every: number of samples between two slow reads, which alternately read the servo clock (Realtime Tick) and
+    voltage and temperature.
     watchdog_required: reject firmware without Bus Watchdog.
     take_over: what to do if torque is already on: if true, let the arm sink slowly and cut torque; if false, refuse to
     start.
@@ -60,7 +60,7 @@ class BusConfig:
     def __post_init__(self) -> None:
         ids = [drive.id for joint in self.joints for drive in joint.drives]
         if len(set(ids)) < len(ids):
-            raise ValueError(f"The servos' IDs are {', '.join(map(str, ids))}: each needs its own ID.")
+            raise ValueError(f"The servos' IDs are {', '.join(map(str, ids))}, but each must be unique.")
 
     def is_same_arm(self, other: "BusConfig") -> bool:
         """Return whether both configurations describe the same servos on the same port."""
@@ -73,7 +73,7 @@ class ServoBus(TorqueSwitch):
         with ServoBus.open(BusConfig("/dev/ttyUSB0", 1_000_000, joints)) as bus, bus.torque(watchdog=0.1):
             state = bus.exchange([0.1, 0.0])
 
-    After any error the same object can still cut torque; `torque_off_report` then says whether that succeeded.
+    After any error, the same object can still cut torque; `torque_off_report` then says whether that succeeded.
     """
 
     def __init__(self, port: Port, config: BusConfig) -> None:
@@ -83,7 +83,7 @@ class ServoBus(TorqueSwitch):
         self.config = config
         self.joints = config.joints
         self._drives = drives
-        """One entry per servo, each a joint with a single servo."""
+        """One single-servo joint per servo."""
         self._of = tuple(index for index, joint in enumerate(self.joints) for _ in joint.drives)
         self._in_pairs = len(self._drives) > len(self.joints)
         self._measured = self._drives
@@ -97,7 +97,7 @@ class ServoBus(TorqueSwitch):
 
     @classmethod
     def open(cls, config: BusConfig) -> "ServoBus":
-        """Open the port, check that the expected servos answer and that none has torque on, and set every servo's mode.
+        """Open the port, check that the expected servos answer and have torque off, and set every servo's mode.
 
         Raises PortNotOpened, NoReply, WrongModel, ServoFault, WrongSetting or TorqueHeld, after closing the port.
         """
@@ -145,7 +145,7 @@ class ServoBus(TorqueSwitch):
     def check_identity(self) -> None:
         """Ping every servo and compare its model and firmware with the configuration; raises NoReply, WrongModel.
 
-        The first reply also reveals whether the adapter is slower than its type suggests, once its timer is lowered.
+        Also lowers the adapter's latency timer and measures whether the adapter is slower than its type suggests.
         """
         self.port.lower_latency()
         learn_latency(next(iter(self._servos.values())))
@@ -155,7 +155,7 @@ class ServoBus(TorqueSwitch):
                 known = model_names().get(number)
                 found = with_article(known) if known else f"a servo with model number {number}"
                 raise WrongModel(
-                    f"{joint.title}: {found} answers at ID {joint.id}, but the configuration has "
+                    f"{joint.title}: {found} answers at ID {joint.id}, but the configuration specifies "
                     f"{with_article(joint.servo.name)}. Correct `model` or `id` in the configuration, or change the "
                     "servo's ID."
                 )
@@ -164,7 +164,7 @@ class ServoBus(TorqueSwitch):
             except NoReply as error:
                 raise NoReply(
                     f"{joint.title} answers pings but not reads: its Status Return Level is probably 0. Power-cycle "
-                    "it, which sets that level to 2."
+                    "it to reset that level to 2."
                 ) from error
             if firmware < joint.servo.watchdog_firmware:
                 self._no_watchdog(joint, firmware)
@@ -179,10 +179,10 @@ class ServoBus(TorqueSwitch):
         self._without_watchdog.add(joint)
 
     def release_held(self, ours: Collection[Joint] = ()) -> None:
-        """Ensure that no servo has torque on before anything is written.
+        """Ensure that every servo's torque is off before anything is written.
 
-        If one has, raises TorqueHeld, or lets the arm sink if `BusConfig.take_over` is set.
-        ours: joints that an earlier program of this user left with torque on; their torque is cut immediately.
+        If it is not, raises TorqueHeld, or lets the arm sink if `BusConfig.take_over` is set.
+        ours: joints whose torque was left on by an earlier program of this user; that torque is cut immediately.
         """
         for joint in ours:
             if self._servos[joint].read("Torque Enable"):
@@ -237,7 +237,7 @@ class ServoBus(TorqueSwitch):
         one_write: send the goals and the read request in one write instead of two.
         slow_every: cycles between two slow reads; by default `BusConfig.slow_every`.
         status: read the servos' status periodically, if there is time.
-        patience: shortest time to wait for replies before they count as lost [s].
+        patience: minimum time to wait for replies before they count as lost [s].
         """
         servos = self._servos.values()
         tables = [servo.table for servo in servos]
@@ -273,18 +273,14 @@ class ServoBus(TorqueSwitch):
         return self._exchange
 
     def read_positions(self) -> tuple[float, ...]:
-        """Read each joint's angle [rad] outside the control cycle. If a joint has several servos, the first one is
-        read.
-        """
+        """Read each joint's angle [rad], from its first servo, outside the control cycle."""
         first = [self._of.index(index) for index in range(len(self.joints))]
         return tuple(
             self._measured[place].angle(self._servos[self._drives[place]].read("Present Position")) for place in first
         )
 
     def read_drives(self, joint: Joint) -> tuple[float, ...]:
-        """Read the joint angle [rad] according to each servo of a joint, in the order of the servos; see
-        `read_positions`.
-        """
+        """Read a joint's angle [rad] from each of its servos, in order; see `read_positions`."""
         return tuple(
             self._measured[self._drives.index(drive)].angle(self._servos[drive].read("Present Position"))
             for drive in joint.drives
@@ -312,10 +308,10 @@ class ServoBus(TorqueSwitch):
         return fold(state, self._of, len(self.joints)) if self._in_pairs else state
 
     def first_hides_others(self, patience: float) -> bool:
-        """Whether only the first servo is silent and hides the replies of the others, which do answer. Raises PortLost.
+        """Whether only the first servo is silent and masks the replies of the others. Raises PortLost.
 
-        In a group read, a servo that does not answer hides the replies of those after it. So the last servo and the
-        first one are asked, in this order. patience: how long to wait for their replies [s].
+        In a group read, a silent servo masks the replies of those after it. This therefore reads the last servo, then
+        the first. patience: how long to wait for their replies [s].
         """
         drives = (self._drives[-1], self._drives[0])
         read = SyncRead([each.id for each in drives], Span.of([self._servos[each].table for each in drives], ["ID"]))
@@ -335,29 +331,24 @@ class ServoBus(TorqueSwitch):
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:
-        """Index of a joint that has missed many of the latest goals, and a text with the value read back; None if there
-        is none.
-        """
+        """Index of a joint that has missed many of the latest goals, and text with the value read back; else None."""
         if (lost := self.prepared.lost) is None:
             return None
         return self._of[lost.place], f"its {lost.register} reads {lost.value} but {lost.written} was written"
 
     @property
     def modes_seen_ago(self) -> float:
-        """Time since every servo was last found to be in the mode that was set [s]; infinite if it never was."""
+        """Time since all servos were last confirmed to be in their modes [s]; infinite if they never were."""
         return self.prepared.modes_seen_ago
 
     @property
     def heard_instead(self) -> str:
-        """Message about what was received in the last 0.1 s instead of complete and timely replies, with advice; "" if
-        nothing was received.
-        """
+        """Advice on bytes received in the last 0.1 s instead of complete and timely replies; "" if there were none."""
         return self.prepared.heard.advice(self.port.clock.now(), self.port.url)
 
     @property
     def commanded_by_another(self) -> str:
-        """Sentence about a servo that held a value not written by this program when goals were last read back; "" if
-        none.
+        """Sentence on a servo that held a value not written by this program when last read back; "" if there is none.
 
         One such value does not prove another master: a servo that misses writes holds an older goal.
         """
@@ -372,24 +363,22 @@ class ServoBus(TorqueSwitch):
         )
 
     def bear_others(self) -> None:
-        """From now on, do not raise BusOverheard for packets of another master; its writes are still detected."""
+        """Stop raising BusOverheard for packets from another master; its writes are still detected."""
         self.prepared.heard.strangers = -math.inf
 
     def read_status_next(self) -> None:
-        """Read the servos' status in the next exchange, if they report one at all."""
+        """Read the servos' status in the next exchange, if the status is read at all."""
         self.prepared.read_status_next()
 
     def check_alerts(self, state: State) -> None:
-        """Read the hardware error of every servo that has raised its alert bit; raises ServoFault, which names all of
-        them.
-        """
+        """Read the hardware error of every servo with its alert bit set; raises ServoFault, which names all of them."""
         raised = [joint for joint, error in zip(self.joints, state.error, strict=True) if error & ALERT]
         faults = [text for joint in raised if (text := self._faults(joint))]
         if faults:
             raise ServoFault(" ".join(faults))
 
     def _faults(self, joint: Joint) -> str:
-        """Return the faults of a joint's servos after one of them has raised its alert."""
+        """Describe the faults of a joint's servos after one of them has set its alert bit."""
         texts = [self._fault(drive, alone=len(joint.drives) == 1) for drive in joint.drives]
         return " ".join(filter(None, texts))
 

@@ -1,4 +1,4 @@
-"""Time as a parameter: everything that waits is given a Clock.
+"""Clocks, which are passed to everything that waits.
 
 The in-process fake bus has its own clock, on which sleeping takes no real time; see `hil.fakes.bus.clock`.
 """
@@ -7,13 +7,12 @@ import time
 from typing import Protocol
 
 SPIN_S = 300e-6
-"""Time before a deadline at which the wall clock stops sleeping and spins instead [s]: a sleep can end up to 0.2 ms
-late.
+"""Time before a deadline at which the wall clock stops sleeping and spins instead [s]: a sleep can overrun by 0.2 ms.
 """
 
 
 class Clock(Protocol):
-    """Monotonic time in seconds, and a way to wait until a given time."""
+    """A monotonic clock, in seconds, that can wait until a given time."""
 
     def now(self) -> float:
         """Return the seconds since an arbitrary start; never decreases."""

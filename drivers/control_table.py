@@ -1,7 +1,7 @@
 """Control tables: the registers of each servo model and their addresses.
 
-They are read from the `.model` files that the `dynamixel-sdk` package ships (one per model, tab-separated), so that no
-table is copied here. The files hold addresses and sizes; the meaning of each register is in the ROBOTIS e-Manual.
+They are read from the `.model` files of the `dynamixel-sdk` package (one per model, tab-separated), not copied here.
+The files contain addresses and sizes; the ROBOTIS e-Manual explains the meaning of each register.
 """
 
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""A local serial device, beyond what pyserial knows: who else has it open, its true baud rate, which adapter it is."""
+"""Properties of local serial devices that pyserial does not provide: other users, actual baud rate, adapter name."""
 
 import fcntl
 import os
@@ -14,21 +14,21 @@ _USB_PORTS = ("ttyUSB*", "ttyACM*")
 
 
 def is_pseudo_terminal(device: str) -> bool:
-    """Whether this is a pty, at whose other end is a program; that program may keep this end open too."""
+    """Whether this is a pty; the program at its other end may also keep this end open."""
     return Path(device).resolve().parent == Path("/dev/pts")
 
 
 def keep_others_out(descriptor: int) -> None:
-    """Let the system refuse further openings of this device, except by root.
+    """Make the system refuse any further attempt to open this device, except by root.
 
-    pyserial's `exclusive` is a lock that only programs that ask for it respect: DYNAMIXEL SDK and Wizard do not.
+    pyserial's `exclusive` is an advisory lock, which DYNAMIXEL SDK and Wizard do not check.
     """
     with suppress(OSError):
         fcntl.ioctl(descriptor, termios.TIOCEXCL)
 
 
 def other_users(device: str, proc: Path = _PROC) -> list[str]:
-    """Return the other programs that have this device open, as far as this user may know: "NAME (PID 12)"."""
+    """Return the other programs that have this device open and are visible to this user, as "NAME (PID 12)"."""
     wanted, found = os.path.realpath(device), []
     for process in proc.glob("[0-9]*"):
         with suppress(OSError):
@@ -47,7 +47,7 @@ def _leads_to(link: Path, wanted: str) -> bool:
 def true_baud(descriptor: int) -> int | None:
     """Return the baud rate at which the driver runs the device; None if the system does not say.
 
-    A driver does not refuse a rate that its adapter cannot do: it sets another one.
+    A driver does not refuse a rate that its adapter does not support, but sets another one.
     """
     speeds = bytearray(_SPEEDS.size)
     try:
@@ -58,9 +58,9 @@ def true_baud(descriptor: int) -> int | None:
 
 
 def adapter_name(device: str, sysfs: Path = _SYSFS) -> str:
-    """Return a name of the USB adapter behind a device that it keeps when it is plugged in again under another name.
+    """Return a persistent name for a device's USB adapter, unchanged if it is replugged as a different device.
 
-    It is "" if there is none: for an adapter without a serial number, or if two adapters present have the same one.
+    Returns "" if the adapter has no serial number, or shares it with another adapter that is plugged in.
     """
     if "://" in device:
         return ""
@@ -72,14 +72,14 @@ def adapter_name(device: str, sysfs: Path = _SYSFS) -> str:
 
 
 def device_of(name: str, sysfs: Path = _SYSFS) -> str | None:
-    """Return the device that the adapter with this lasting name has now; None if it is not plugged in."""
+    """Return the current device of the adapter with this persistent name; None if it is not plugged in."""
     ports = sysfs / "class" / "tty"
     found = [each for pattern in _USB_PORTS for each in ports.glob(pattern) if _identity(each / "device") == name]
     return f"/dev/{found[0].name}" if name and len(found) == 1 else None
 
 
 def _identity(device: Path) -> str:
-    """Vendor, product, serial number and interface of a USB device in sysfs; "" if one of them is missing."""
+    """Vendor, product, serial number and interface of a USB device in sysfs; "" if any of them is missing."""
     place = device.resolve()
     with suppress(OSError, StopIteration):
         interface = next(each for each in (place, *place.parents) if (each / "bInterfaceNumber").is_file())

@@ -1,4 +1,4 @@
-"""Errors between the computer and the servos.
+"""Errors raised by the servo drivers.
 
 DriverError
 ├── UnknownModel        no control table describes this model name or number
@@ -37,7 +37,7 @@ __all__ = [
 
 
 class DriverError(Exception):
-    """Base class of all errors between the computer and the servos.
+    """Base class of all errors raised by the servo drivers.
 
     last_samples: the last samples that an experiment recorded before the error, if one was running.
     """
@@ -84,7 +84,7 @@ class BusShared(DriverError):
 
 
 class BusOverheard(BusShared):
-    """Packets of another master have been heard, but nothing shows that it has written anything. Example: a program
+    """Packets from another master were heard, but nothing shows that it has written anything. Example: a program
     that polls the servos' temperatures.
     """
 

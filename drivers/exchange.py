@@ -1,9 +1,9 @@
 """The control cycle on the wire: goals out and states in, with one write and one bounded read.
 
-Servos in current mode and servos in PWM mode have their goals in different registers. Each of these registers is
-written by its own Sync Write; all leave in the same write.
+Current mode and PWM mode have different goal registers. Each is written by its own Sync Write; all are sent in the same
+write to the port.
 
-A Sync Write has no reply, so the group read that follows it can leave in the same write: one adapter transaction
+A Sync Write has no reply, so the group read that follows it can be sent in the same write: one adapter transaction
 instead of two. All packets are prepared in advance; a cycle only packs the goals and computes one CRC.
 
 The registers that are read vary from cycle to cycle. Most cycles read `spans[0]`. Every `slow_every`-th cycle reads one
@@ -31,7 +31,7 @@ from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRea
 from hil.drivers.turns import NEVER, Turns
 
 HOST_S = 0.75e-3
-"""Time allowed for the computer itself, including USB frames, on top of wire, servos and adapter [s]."""
+"""Time allowed for the computer itself, including USB frames, in addition to wire, servos and adapter [s]."""
 
 PATIENCE_SHARE = 0.5
 """Minimum reply timeout as a fraction of the time between two cycles."""
@@ -47,7 +47,7 @@ many cycles late is recognised by its length.
 _AGAIN_SHARE = 0.5
 _SHORT_CYCLE_S = 0.005
 """In cycles of up to `_SHORT_CYCLE_S` [s], a lost read-back is repeated at once, which may delay the next cycle by the
-share `_AGAIN_SHARE` of one. In longer ones, read-backs are rarely destroyed, and a delay leaves joints unobserved.
+fraction `_AGAIN_SHARE` of its length. In longer ones, read-backs are rarely lost, and a delay leaves joints unobserved.
 """
 
 _LONGEST_REPLY = 1024
@@ -85,7 +85,7 @@ class Exchange:
     slow_every: number of cycles between two reads of a slow span, i.e. one of `spans[1:]`.
     status_every: number of cycles between two status reads; there are none if `status` is None.
     interval: time between two cycles [s], 0 if unknown; a slow cycle can wait longer for a reply than a fast one.
-    patience: shortest time to wait for replies [s]; by default the longest time that wire, servos and adapter may need.
+    patience: minimum time to wait for replies [s]; by default the longest time that wire, servos and adapter may need.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class Exchange:
         goals = (goal,) * len(ids) if isinstance(goal, Register) else tuple(goal)
         for register in goals:
             if register.size != 2:
-                raise ValueError(f"{register.name} has {register.size} bytes; a goal of 2 bytes is needed.")
+                raise ValueError(f"{register.name} has {register.size} bytes; a goal must have 2.")
         self._port = port
         self._now = port.clock.now
         self._echoes: bool = getattr(port, "echoes", False)  # detected during set-up
@@ -115,7 +115,7 @@ class Exchange:
         self.fast = fast
         self.one_write = one_write
         self._is_plain = one_write and not self._echoes
-        """Whether goals and request leave in one write, and nothing but the reply comes back."""
+        """Whether goals and request are sent in one write, and only the reply is received."""
         self._writes = [
             _GoalWrite(register, self.ids, [place for place, own in enumerate(goals) if own == register])
             for register in dict.fromkeys(goals)
@@ -143,11 +143,11 @@ class Exchange:
         self._doubts = _DOUBTS
         self._turns = Turns(len(spans) - 1, slow_every, NEVER if status is None else status_every)
         self._usual_left = self._turns.plan()
-        """Number of cycles that still read the usual span before another one may be due."""
+        """Number of remaining cycles that read the usual span before another one may be due."""
         self._late_possible = False
         self._after_loss = 0
         self._cut_off = b""
-        """The part of a reply that had been received when time was up in the latest exchange."""
+        """The part of a reply received before the latest exchange timed out."""
         self._sent: deque[Sequence[int]] = deque(maxlen=REMEMBERED)
         self._took = math.inf
         """Duration of the latest cycle [s]."""
@@ -158,17 +158,15 @@ class Exchange:
         self._damaged = False
         """Whether anything arrived in reply to the latest read-back."""
         self.awaited_until = -math.inf
-        """Until when the reply to the latest second read-back was awaited, even if it delayed the next cycle [s on the
-        port's clock].
-        """
+        """Reply deadline of the latest repeated read-back, which may delay the next cycle [s on the port's clock]."""
         self.read_back_at = math.inf
-        """When `overruled` should be called again, before the next cycle [s on the port's clock]."""
+        """When to call `overruled` again, before the next cycle [s on the port's clock]."""
 
     @property
     def command_to_sample(self) -> float:
         """Wire time from the goals' arrival at the servos to the arrival of the read request [s].
 
-        With two writes the adapter may add a pause, which is not included.
+        With two writes, the adapter may add a pause, which is not included.
         """
         return self._port.wire_time(len(self._plans[0].read.request))
 
@@ -193,8 +191,8 @@ class Exchange:
         return self._port.reply_time(plan.reply_time.timeout + seconds, self._sent_bytes(plan.read))
 
     def accept_any_order(self) -> None:
-        """From now on, accept answers in any order. Use this only where the replies to one request have all arrived, or
-        count as lost, before the next request: nothing else shows to which request an answer belongs.
+        """From now on, accept answers in any order. Use this only if all replies to one request have arrived, or count
+        as lost, before the next request: nothing else shows which request an answer belongs to.
         """
         for plan in self._plans:
             if isinstance(plan.read, SyncRead):
@@ -209,8 +207,9 @@ class Exchange:
     def add_read_back(
         self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[Sequence[int]]
     ) -> None:
-        """Prepare the read-backs that `overruled` makes (see `ReadBack`). goal: spans that end with the goal. mode:
-        spans that end with the settings; `modes` are their values.
+        """Prepare the read-backs made by `overruled` (see `ReadBack`).
+
+        goal: spans that end with the goal. mode: spans that end with the settings, whose values are `modes`.
         """
         back = self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
         self._wire_s |= {read: self._port.wire_time(self._bytes(read)) for read in back.reads}
@@ -219,26 +218,26 @@ class Exchange:
 
     @property
     def is_in_doubt(self) -> bool:
-        """Whether a read-back has just found a value that this program did not write."""
+        """Whether a read-back has recently found a value that this program did not write."""
         return self._read_back is not None and self._now() < self._read_back.doubts_until
 
     @property
     def sighted(self) -> Overruled | None:
-        """A value that a servo held a moment ago although this program did not write it; None if there was none."""
+        """A recently read-back value that this program did not write; None if there is none."""
         return self._read_back.sighted if self._read_back is not None and self.is_in_doubt else None
 
     @property
     def modes_seen_ago(self) -> float:
-        """Time since every servo was last found to be in the mode that was set [s]; infinite if it never was."""
+        """Time since all servos were last confirmed to be in their modes [s]; infinite if they never were."""
         return math.inf if self._read_back is None else self._now() - self._read_back.modes_seen_at
 
     @property
     def lost(self) -> Overruled | None:
-        """A servo that has missed many of the latest goals, as read-backs showed; None if there is none."""
+        """A servo that read-backs show to have missed many of the latest goals; None if there is none."""
         return self._read_back.lost if self._read_back is not None else None
 
     def overruled(self, due: float) -> Overruled | None:
-        """Read goals or settings back if there is time before the next cycle, which is due at `due` [s].
+        """Read back goals or settings if there is time before the next cycle, due at `due` [s].
 
         The next cycle overwrites another master's goals before its own replies are sampled, so only what the servos
         hold right before a cycle shows who commands them. Missing replies are ignored here; the next cycle detects
@@ -260,12 +259,12 @@ class Exchange:
         return self._held(back, due)
 
     def _takes(self, read: GroupRead, back: ReadBack) -> float:
-        """Longest time that a read-back is expected to take [s]."""
+        """Return the longest time that a read-back is expected to take [s]."""
         off_wire = self._took - self._latest_plan.wire_s
         return self._wire_s[read] + max(off_wire, back.longest)
 
     def _held(self, back: ReadBack, due: float) -> Overruled | None:
-        """Read back once if that is possible before `due` [s]."""
+        """Read back once if this is possible before `due` [s]."""
         port, now, read = self._port, self._now(), back.read
         takes = self._takes(read, back)
         if now + takes > due or self._late_possible:
@@ -324,8 +323,8 @@ class Exchange:
     def cycle(self, goal_ticks: Sequence[int], *, between: bool = False) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.
 
-        between: an extra cycle between two samples. Slow spans are left for the next sample, since only samples are
-        recorded.
+        between: whether this is an extra cycle between two samples. Slow spans then wait for the next sample, since
+        only samples are recorded.
 
         Raises PortLost; ValueError for the wrong number of goals or a goal that does not fit into two bytes.
         """
@@ -365,7 +364,7 @@ class Exchange:
         return _reply((before, after, plan.span, servos))
 
     def _look_again(self, plan: "_Plan", received: bytes, servos: list[Answer] | None, before: float) -> list[Answer]:
-        """Return the answers if the reply is irregular (no `servos`), or if it came too soon."""
+        """Return the answers to a request whose reply is irregular (`servos` is None) or came too soon."""
         deadline = before + plan.reply_time.timeout
         if servos is not None:
             return self._latest(plan.read, servos, deadline)
@@ -375,13 +374,13 @@ class Exchange:
         return servos
 
     def _expect_late(self) -> None:
-        """Let the next cycle prepare for replies that are still on their way."""
+        """Make the next cycle allow for replies that are still in transit."""
         self._late_possible = True
         self._turns.count(self._usual_left)
         self._usual_left = self._turns.usual = 0
 
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
-        """Handle replies that arrive sooner than the wire allows: they may belong to an earlier request.
+        """Handle replies that arrive sooner than the wire time allows: they may belong to an earlier request.
 
         A duplicated reply is still in the input when the next request is sent; from then on every reply would be one
         cycle old. If the true reply follows, it is used. If none follows, the port is not a real serial line (a pty),
@@ -411,7 +410,7 @@ class Exchange:
         return span
 
     def _search(self, read: GroupRead, received: bytes, deadline: float) -> list[Answer]:
-        """Extract the answers if some are stuffed, damaged or missing; read on until all have arrived or time is up."""
+        """Extract the answers, some perhaps stuffed, damaged or missing; read until all have arrived or time is up."""
         while True:
             answers, over = read.search(received)
             remaining = deadline - self._now()
@@ -434,7 +433,7 @@ class Exchange:
         self._port.overheard = b""
 
     def _ask_otherwise(self, sent: bytes, plan: "_Plan", start: float) -> bytes:
-        """Return the reply if it takes two writes, or if the adapter echoes what is sent; the echo is removed."""
+        """Return the reply, without an echo, when two writes are needed or the adapter echoes what is sent."""
         port, read = self._port, plan.read
         count = read.reply_size + (len(sent) if self._echoes else 0)
         if self.one_write:
@@ -501,8 +500,8 @@ class _GoalWrite:
         self.size = packet.size + 2
 
     def pack(self, goal_ticks: Sequence[int]) -> bytes:
-        """Return the packet for these goals, one per servo of the subset; raises struct.error for one that is too
-        large, ValueError or struct.error for a wrong number of goals.
+        """Return the packet for these goals, one per servo of the subset; raises struct.error if one is too large,
+        ValueError or struct.error if their number is wrong.
         """
         fields = self.fields
         fields[2::2] = goal_ticks
@@ -511,7 +510,7 @@ class _GoalWrite:
 
 
 def _of_other_lengths(spans: Sequence[Span | Sequence[Span]], servos: int) -> list[tuple[Span, ...]]:
-    """Return variants of the usual span with more bytes in front, no two spans being of the same length."""
+    """Return variants of the usual span with extra leading bytes, such that no two spans have the same length."""
     taken = {one_each(span, servos)[0].size for span in spans}
     usual = one_each(spans[0], servos)
     lengths = [size for size in range(usual[0].size + 1, usual[0].size + AFTER_LOSS + len(taken)) if size not in taken]

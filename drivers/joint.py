@@ -10,7 +10,7 @@ __all__ = ["Joint", "SecondServo"]
 
 
 class SecondServo(NamedTuple):
-    """Another servo on the same joint.
+    """An additional servo on a joint.
 
     id: its bus ID.
     direction: +1 or -1, the joint's sense of rotation relative to this servo's.
@@ -27,9 +27,9 @@ class Joint:
     direction: +1 or -1, the joint's sense of rotation relative to the servo's.
     zero_ticks: Present Position at joint angle zero.
     mode: kind of goal, a current [A] or a voltage [V]. Raises ValueError for current mode if the servo has none.
-    near: approximate joint angle when the bus is opened [rad], which selects the turn; None to take Present Position as
-    it is.
-    seconds: further servos of the same model on this joint. A goal is divided equally among all servos; the measured
+    near: approximate joint angle when the bus is opened [rad], which selects the turn; None to use Present Position
+    unchanged.
+    seconds: additional servos of the same model on this joint. A goal is divided equally among all servos; the measured
     current (in PWM mode the voltage) is their sum; angle and velocity are the first servo's.
     """
 
@@ -48,7 +48,7 @@ class Joint:
 
     @property
     def drives(self) -> tuple["Joint", ...]:
-        """The joint as single-servo joints, one for each of its servos."""
+        """The joint split into single-servo joints, one per servo."""
         first = replace(self, seconds=())
         return first, *[replace(first, id=servo_id, direction=sign, near=None) for servo_id, sign in self.seconds]
 
@@ -63,9 +63,9 @@ class Joint:
         return self.direction * VELOCITY_UNIT
 
     def drive_unit(self, supply_voltage: float) -> float:
-        """Return the drive quantity per tick of the goal and of its measured counterpart, with the joint's sign.
+        """Return the current or voltage per tick of the goal and of the measured value, with the joint's sign.
 
-        The unit is A or V, depending on `mode`. supply_voltage [V]: a PWM of 885 ticks applies all of it.
+        The unit is A or V, depending on `mode`. supply_voltage: voltage applied at a PWM of 885 ticks [V].
         """
         if self.mode is Mode.CURRENT:
             assert self.servo.current_unit is not None  # checked in __post_init__
@@ -73,7 +73,7 @@ class Joint:
         return self.direction * supply_voltage / FULL_PWM_TICKS
 
     def current_limit_ticks(self, limit: float) -> int:
-        """The smallest Current Limit [ticks] with which a servo of this joint accepts every goal up to `limit` [A]."""
+        """Return the lowest Current Limit [ticks] at which this joint's servos accept all goals up to `limit` [A]."""
         return math.ceil(limit / abs(self.drive_unit(0.0)) - 1e-9)
 
     def angle(self, position_ticks: int) -> float:
@@ -83,9 +83,9 @@ class Joint:
     def within_turn(self, position_ticks: int) -> "Joint":
         """Return this joint with its zero shifted by whole turns, so that its angle is closest to `near`.
 
-        Without `near` the joint is returned unchanged. A servo measures its position within one turn when it is
-        switched on, and counts turns from there. The reading of a joint that rests just beyond the end of that turn is
-        therefore a whole turn away from the expected one.
+        Without `near`, the joint is returned unchanged. At power-up, a servo measures its position within one turn and
+        counts turns from there. The reading of a joint that rests just beyond the end of that turn is therefore off by
+        a whole turn.
         """
         if self.near is None:
             return self

@@ -34,7 +34,7 @@ def latency_timer(url: str, sysfs: Path = _SYSFS) -> Path | None:
 
 
 def read_latency_ms(file: Path) -> int:
-    """Return the timer's value [ms]; an adapter that was just unplugged is taken to have the factory setting."""
+    """Return the timer's value [ms]; if the adapter has just been unplugged, the factory setting."""
     try:
         return int(file.read_text())
     except (OSError, ValueError):
@@ -42,7 +42,7 @@ def read_latency_ms(file: Path) -> int:
 
 
 def write_latency_ms(file: Path, value_ms: int = WANTED_MS) -> bool:
-    """Set the timer and return whether it then reads back as set. Needs root, or a udev rule that opens the file."""
+    """Set the timer; return whether it reads back as set. Requires root, or a udev rule that grants write access."""
     try:
         file.write_text(str(value_ms))
     except OSError:

@@ -1,4 +1,4 @@
-"""Dynamixel Protocol 2.0 packets in both directions: CRC, byte stuffing, encoding, and finding packets in a stream.
+"""Dynamixel Protocol 2.0 packets: CRC, byte stuffing, encoding, and finding packets in a byte stream.
 
 Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0". A packet on the wire is
 
@@ -19,7 +19,7 @@ HEADER = b"\xff\xff\xfd\x00"
 BROADCAST_ID = 0xFE
 MAX_ID = 252
 MAX_LENGTH = 1024
-"""Largest LEN that is accepted; with a larger one, the bytes count as noise that looks like a header."""
+"""Largest accepted LEN; a header with a larger one is treated as noise."""
 
 _FRONT = Struct("<4sBH")  # header, ID, LEN
 _STUFFED = b"\xff\xff\xfd"
@@ -74,15 +74,13 @@ class HardwareError(IntFlag):
 
 
 class Packet(NamedTuple):
-    """One packet with its stuffing removed. `body` is everything between INST and the CRC; in a status it begins with
-    ERR.
-    """
+    """One packet without its stuffing. `body` is everything between INST and CRC; in a status, it begins with ERR."""
 
     id: int
     instruction: int
     body: bytes
     damaged: bool = False
-    """True when the CRC does not match. A `Framer` only returns such packets if created with `damaged=True`."""
+    """True if the CRC does not match. A `Framer` only returns such packets if created with `damaged=True`."""
 
     @property
     def is_status(self) -> bool:
@@ -100,7 +98,7 @@ class Packet(NamedTuple):
 
 
 crc: Callable[[bytes], int] = crc16.umts
-"""The CRC-16 that the servos use: polynomial 0x8005, initial value 0, not reflected."""
+"""The CRC-16 used by the servos: polynomial 0x8005, initial value 0, not reflected."""
 
 
 def stuff(payload: bytes) -> bytes:
@@ -153,7 +151,7 @@ class Framer:
 
     @property
     def pending(self) -> int:
-        """Number of buffered bytes: received, but neither returned as a packet nor dropped as noise."""
+        """Number of received bytes neither returned in a packet nor dropped as noise yet."""
         return len(self._buffer)
 
     def reset(self) -> None:

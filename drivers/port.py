@@ -1,8 +1,8 @@
-"""A serial port that cannot hang: any pyserial URL, bounded reads, and one error when the cable is unplugged.
+"""A serial port that cannot hang: any pyserial URL, bounded reads, and PortLost when the cable is unplugged.
 
 Open one with `open_port`. `Port` does its I/O through pyserial and so supports every URL that pyserial does;
-`NetworkPort` avoids what pyserial waits for on a network; `DescriptorPort` reads and writes a local device directly, at
-half of pyserial's cost per cycle.
+`NetworkPort` avoids pyserial's waits on a network; `DescriptorPort` reads and writes a local device directly, at half
+of pyserial's cost per cycle.
 """
 
 import contextlib
@@ -41,15 +41,15 @@ _REASONS = {
 """Explanations of the operating system's error messages."""
 
 _MOST_OVERHEARD = 4096
-"""Largest number of pending bytes that are examined; the others are discarded."""
+"""Maximum number of pending bytes that are examined; the rest are discarded."""
 
 _LOOKS = 100
-"""Number of replies in a row, each complete and none too early, after which `DescriptorPort.ask` no longer looks for
+"""Number of consecutive replies, all complete and none too early, after which `DescriptorPort.ask` no longer checks for
 pending input in advance: on such a line, pending input is detected because it arrives too early.
 """
 
 _LOOKS_AFTER_LOSS = 2 * _LOOKS
-"""Like `_LOOKS`, but after input was pending or a reply was lost: a late reply may then arrive at any time."""
+"""Like `_LOOKS`, but after pending input or a lost reply: a late reply may then arrive at any time."""
 
 _ALWAYS = 1 << 62
 """Like `_LOOKS`, but for a line whose replies usually arrive earlier than its baud rate allows, such as a pty."""
@@ -60,7 +60,7 @@ transmitted at this number of bits. The true number is ten; the difference allow
 """
 
 _BAUD_TOLERANCE = 0.03
-"""Largest relative error of a baud rate with which bytes are still received."""
+"""Largest relative baud rate error at which bytes are still received."""
 
 _WRITE_PATIENCE_S = 0.1
 """How long a device may refuse to accept bytes before it counts as lost [s]."""
@@ -94,8 +94,8 @@ def _claim(url: str, opened: serial.Serial) -> None:
     keep_others_out(opened.fileno())
     if users := other_users(url):
         raise PortNotOpened(
-            f"Cannot open port {url!r}: {' and '.join(users)} has it open too and would take replies or send goals of "
-            "its own. Close that program first."
+            f"Cannot open port {url!r}: {' and '.join(users)} has it open too and would steal replies or send its own "
+            "goals. Close that program first."
         )
 
 
@@ -110,10 +110,10 @@ def _check_baud(url: str, opened: serial.Serial, baud: int) -> None:
 
 
 class ReplyTime(NamedTuple):
-    """When the reply to a request may arrive, counted from the start of the request; made by `Port.reply_time`.
+    """When a reply may arrive, counted from the start of its request; created by `Port.reply_time`.
 
-    timeout: when it counts as lost [s]. whole_ms: the whole milliseconds of that. earliest: when the request can have
-    been transmitted at the earliest [s].
+    timeout: when it counts as lost [s]. whole_ms: `timeout` in whole milliseconds. earliest: earliest time at which the
+    request can have been transmitted [s].
     """
 
     timeout: float
@@ -155,7 +155,7 @@ class Port:
         return count * 10 / self.baud
 
     def reply_time(self, timeout: float, sent: int) -> ReplyTime:
-        """Return what `ask` needs for a request of `sent` bytes whose reply counts as lost after `timeout` [s]."""
+        """Return the ReplyTime that `ask` needs for a request of `sent` bytes with this timeout [s]."""
         return ReplyTime(timeout, int(timeout * 1e3), _EARLY_BITS * sent / self.baud)
 
     def write(self, data: bytes) -> None:
@@ -202,7 +202,7 @@ class Port:
         return self.read(count, expected.timeout)
 
     def put_aside(self) -> None:
-        """Move bytes that were received but not read to `overheard`."""
+        """Move received but unread bytes to `overheard`."""
         try:
             self.overheard = self._serial.read(self._serial.in_waiting)
         except _FAILURES as error:
@@ -248,7 +248,7 @@ class Port:
             self._serial.close()
 
     def reopen(self) -> bool:
-        """Open the port again once its device is back, as after a reset of the USB hub; return whether it is."""
+        """Reopen the port once its device is back, e.g. after a USB hub reset; return whether it was reopened."""
         try:
             self._serial.close()
             self._serial.open()
@@ -303,7 +303,7 @@ class DescriptorPort(Port):
         super().__init__(url, baud, opened)
         self._adapter = adapter_name(url)
         self._looks = _LOOKS
-        """Number of requests for which `ask` will still look for pending input before it writes."""
+        """Number of further requests for which `ask` checks for pending input before it writes."""
         self._use(opened)
 
     def _use(self, opened: Any) -> None:
@@ -376,13 +376,13 @@ class DescriptorPort(Port):
             raise self._lost(error) from error
 
     def _ask_on(self, received: bytes, count: int, deadline: float, looks: int) -> bytes:
-        """Return a complete reply when only a part of it, or nothing yet, was received within whole milliseconds."""
+        """Read the rest of a reply that is still incomplete after waiting for whole milliseconds."""
         received = self._read_on(received, count, deadline)
         self._looks = max(0, looks - 1) if len(received) == count else max(looks, _LOOKS_AFTER_LOSS)
         return received
 
     def _ask_behind_pending(self, count: int, early_until: float, deadline: float) -> bytes:
-        """Keep apart what arrives before the request can have been transmitted, then read the reply as `ask` does."""
+        """Set aside what arrives before the request can have been transmitted, then read the reply as `ask` does."""
         self._looks = _LOOKS_AFTER_LOSS
         while select.select([self._descriptor], [], [], max(0.0, deadline - _now()))[0]:
             is_early = _now() < early_until
@@ -436,7 +436,7 @@ class DescriptorPort(Port):
             )
 
     def _write_rest(self, data: bytes) -> None:
-        """Write what the device did not accept at once, as its buffer drains."""
+        """Write the bytes that the device did not accept at once, as its buffer drains."""
         deadline = _now() + self.wire_time(len(data)) + _WRITE_PATIENCE_S
         try:
             while data:
@@ -454,7 +454,7 @@ def _never_ready(_timeout_ms: float | None = None, /) -> list[tuple[int, int]]:
 
 
 def _why(error: BaseException, baud: int | None = None) -> str:
-    """Return the reason for a failure, without the error numbers and repetitions in the exception's text."""
+    """Return the reason for a failure, without the exception text's error numbers and repetitions."""
     text = str(error.args[-1] if error.args else error)
     of_device = "open port" in text or "configure port" in text
     for known, said in _REASONS.items():
@@ -469,7 +469,7 @@ def _advice(error: BaseException, url: str) -> str:
     if "Permission denied" in text:
         return "Add yourself to the port's group (`sudo usermod -aG dialout $USER`), then log out and in again."
     if "exclusively lock" in text or "busy" in text:
-        return "Another program has it open; close that program first. ModemManager opens new ports for half a minute."
+        return "Another program has it open; close it first. ModemManager holds new ports open for half a minute."
     if "No such file" in text and "://" in url:
         return "The file in this URL does not exist; a relative path is resolved from the file or folder that names it."
     if "No such file" in text:

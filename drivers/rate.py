@@ -1,4 +1,4 @@
-"""A fixed rate from absolute deadlines: one late cycle does not delay later ones."""
+"""A fixed rate based on absolute deadlines: a late cycle does not delay later ones."""
 
 from functools import partial
 from typing import NamedTuple
@@ -13,7 +13,7 @@ class Tick(NamedTuple):
 
     deadline: when the wait should have ended [s, on the clock].
     now: when it ended [s].
-    missed: whether it ended a whole interval or more too late; if so, the caller should skip this sample.
+    missed: whether it ended at least a whole interval late; if so, the caller should skip this sample.
     """
 
     deadline: float
@@ -27,8 +27,8 @@ _tick = partial(tuple.__new__, Tick)  # half the time of Tick(...)
 class FixedRate:
     """Deadlines at `rate` per second; the first is one interval after the first call of `wait`.
 
-    After a stall the missed deadlines are returned at once, one by one and marked as missed. A caller that plays back
-    samples thus stays in step with the clock without sending a burst. `missed` counts them.
+    After a stall, each missed deadline is returned without waiting, marked as missed and counted in `missed`. A caller
+    that plays back samples thus stays in step with the clock without sending a burst.
     """
 
     def __init__(self, clock: Clock, rate: float) -> None:

@@ -1,5 +1,5 @@
-"""The port on which the packet handler of `dynamixel-sdk` works, in place of the SDK's own PortHandler, and a packet
-handler that finds the answer despite noise before it.
+"""Replacements for two classes of `dynamixel-sdk`: a port handler on top of our open port, and a packet handler that
+finds a reply despite preceding noise.
 """
 
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, Protocol2PacketHandler
@@ -8,7 +8,7 @@ from hil.drivers.packet import HEADER, MAX_LENGTH, NO_ID, Instruction, crc, unst
 from hil.drivers.port import Port
 
 PATIENCE_S = 0.018
-"""Time that set-up work waits for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
+"""How long set-up work waits for a reply beyond its wire time [s]; an EEPROM write takes a few ms."""
 
 
 _SHORTEST = 11
@@ -21,7 +21,7 @@ _BEFORE_LENGTH, _FRONT = 7, 8
 class SdkPort:
     """Adapts our open port to `dynamixel-sdk`, removing the echo of an adapter that receives its own transmissions.
 
-    Unlike with the SDK's own port, reads block instead of polling, and time is the port's clock. A failure cannot leave
+    Unlike in the SDK's own port, reads block instead of polling, and time is the port's clock. A failure cannot leave
     the port marked as in use, which would make it impossible to cut torque. The method names are the SDK's.
     """
 
@@ -29,9 +29,9 @@ class SdkPort:
         self._port = port
         self._deadline = 0.0
         self._sent = b""
-        """The bytes written last, kept as long as their echo may still arrive."""
+        """The last bytes written, kept as long as their echo may still arrive."""
         self._held = b""
-        """Bytes received that may be the beginning of the echo."""
+        """Received bytes that may be the beginning of the echo."""
 
     @property
     def is_using(self) -> bool:
@@ -87,10 +87,10 @@ class SdkPort:
 
 
 class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
-    """The SDK's packet handler, except that noise before a reply does no harm.
+    """The SDK's packet handler, made robust to noise before a reply.
 
-    The SDK gives up where bytes that look like the beginning of a packet turn out not to be one. Here the search
-    continues after them, until time is up.
+    The SDK gives up when bytes that look like the beginning of a packet turn out not to be one. Here, the search
+    continues after them until the timeout.
     """
 
     def rxPacket(self, port: SdkPort, _fast_option: bool) -> tuple[list[int], int]:  # noqa: N802
@@ -108,10 +108,10 @@ class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
 
 
 def _first_status(received: bytes) -> tuple[bytes, int]:
-    """Return the first intact status packet in what was received, and 0.
+    """Return the first intact status packet among the received bytes, and 0.
 
-    If there is none, return b"" and how many more bytes to read: never more than the packet that has begun may have, so
-    that the next one stays whole.
+    If there is none, return b"" and the number of bytes to read next, which never exceeds the rest of the packet that
+    has begun, so that the next one stays whole.
     """
     missing = _SHORTEST - next(size for size in range(len(HEADER) - 1, -1, -1) if received.endswith(HEADER[:size]))
     at = received.find(HEADER)

@@ -1,7 +1,7 @@
-"""One servo on a port, for set-up work: ping, and read and write registers by name, with up to three attempts each.
+"""One servo on a port, for set-up work: pings, and register reads and writes by name, with up to three attempts each.
 
-Everything goes through the packet handler of `dynamixel-sdk`. Writes are read back, because a status packet only says
-that the instruction was understood, not what the register now holds.
+Everything goes through the packet handler of `dynamixel-sdk`. Writes are read back, because a status packet only
+confirms that the instruction was understood, not what the register now holds.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ _ATTEMPTS = 3
 
 
 _LATE_S = 0.06
-"""How late a reply to an exchange that has timed out may still arrive [s]."""
+"""How long after a timed-out exchange its reply may still arrive [s]."""
 
 _DATA = 9
 """Index of the first data byte in a status packet."""
@@ -60,13 +60,13 @@ class Servo:
         return self.read_entry(self.table[register], attempts)
 
     def read_despite_error(self, register: str, attempts: int = _ATTEMPTS) -> int:
-        """Read a register as `read` does, but also accept a reply that carries its value and reports an error."""
+        """Read a register like `read`, but also accept a reply that contains the value and reports an error."""
         return self.read_entry(self.table[register], attempts, despite_error=True)
 
     def read_entry(self, entry: Register, attempts: int = _ATTEMPTS, *, despite_error: bool = False) -> int:
-        """Read a register that is missing from the model's table. Raises the same errors as `read`.
+        """Read a register that need not be in the model's table. Raises the same errors as `read`.
 
-        despite_error: also accept a reply that carries the value and reports an error.
+        despite_error: also accept a reply that contains the value and reports an error.
         """
 
         def ask() -> tuple[list[int], int, int]:
@@ -101,20 +101,20 @@ class Servo:
         """Write a register and read it back. Raises the same errors as `read`, and ServoRefused if another value is
         read back.
 
-        attempts: how often the write, and then the read, may be tried; by default as often as in all set-up work.
+        attempts: maximum number of attempts at the write, and then at the read; by default, as in all set-up work.
         """
         self._write_and_read_back(register, value, attempts, despite_error=False)
 
     def write_despite_error(self, register: str, value: int) -> None:
-        """Write a register as `write` does, but ignore errors that replies report if the value reads back as written.
+        """Write a register like `write`, but ignore errors reported in replies if the value reads back as written.
 
-        Writes that make an arm safe or restore it must not fail because of a servo that reports errors but obeys.
+        Writes that make an arm safe or restore it must not fail because a servo reports errors but obeys.
         """
         self._write_and_read_back(register, value, None, despite_error=True)
 
     def write_once(self, register: str, value: int) -> None:
-        """Write a register as `write_despite_error` does, but try once only; raise NoReply if the write itself is not
-        answered, without sending anything more.
+        """Write a register like `write_despite_error`, but try only once; if the write itself is not answered, raise
+        NoReply without sending anything more.
         """
         with suppress(ServoRefused):
             self.write_only(register, value, attempts=1)
@@ -195,7 +195,7 @@ def _two_bytes(value: int) -> tuple[int, int]:
 
 
 def describe_error(error: HardwareError) -> str:
-    """Return hardware errors in words, e.g. "overload, overheating"."""
+    """Return a description of hardware errors, e.g. "overload, overheating"."""
     known = [bit.name.replace("_", " ").lower() for bit in HardwareError if bit in error and bit.name]
     rest = int(error) & ~sum(HardwareError)
     return ", ".join(known + ([f"unknown bits {rest:#04x}"] if rest else [])) or NO_ERROR
@@ -206,7 +206,7 @@ def _not_held(title: str, register: str, value: int, actual: int) -> ServoRefuse
 
 
 def describe_status_error(code: int) -> str:
-    """Return the error number of a status packet in words, e.g. "data range error"."""
+    """Return a description of a status packet's error number, e.g. "data range error"."""
     try:
         return StatusError(code).name.replace("_", " ").lower() + " error"
     except ValueError:

@@ -1,4 +1,4 @@
-"""The meaning of each model's ticks: facts that the SDK's control tables leave out.
+"""Units and motor data of each servo model, which the SDK's control tables leave out.
 
 Sources: ROBOTIS e-Manual, page of each model (current unit, resolution, Operating Mode, stall figures). None of the
 torque constants below was measured in this project.
@@ -45,8 +45,8 @@ FULL_PWM_TICKS = 885
 """Goal PWM that applies the whole supply voltage to the motor [ticks]."""
 
 LEAST_SUPPLY = 0.6
-"""A voltage across a motor counts as the full supply voltage if it is at least this fraction of the lowest one
-published: supplies sag, and resistance and no-load speed differ by tens of percent from servo to servo.
+"""A voltage across a motor counts as the full supply voltage if it is at least this fraction of the lowest published
+one: supplies sag, and resistance and no-load speed differ by tens of percent from servo to servo.
 """
 
 LEAST_OF_MEASURED = 0.75
@@ -88,7 +88,7 @@ class NoLoad(NamedTuple):
 
 
 class Published(NamedTuple):
-    """A torque constant as published: the median of the figures, and the lowest and highest of them.
+    """A published torque constant: the median, lowest and highest of the figures.
 
     It is uncertain even where the figures agree: the stall torque is a servo's peak torque, friction included, and an
     individual servo can differ from it by tens of percent. If it matters, measure the constant with a known weight.
@@ -113,8 +113,8 @@ class ServoModel:
     watchdog_firmware: first firmware with a Bus Watchdog.
     fast_sync_read_firmware: first firmware that supports Fast Sync Read; None if none does.
     senses_supply: whether Present Current is the supply current, that is, the motor current times the bridge's duty
-    cycle, which is far less than the commanded current while the joint is slow. So it is in the 330 series (e-Manual,
-    Current Limit: the XL330 "measures current at its input power source").
+    cycle, which is far less than the commanded current while the joint is slow. This is true of the 330 series
+    (e-Manual, Current Limit: the XL330 "measures current at its input power source").
     """
 
     name: str
@@ -135,7 +135,7 @@ class ServoModel:
 
     @property
     def default_mode(self) -> Mode:
-        """Current mode if the servo has it, otherwise PWM."""
+        """Current mode if the servo has it, otherwise PWM mode."""
         return Mode.PWM if self.current_unit is None else Mode.CURRENT
 
     @property
@@ -186,8 +186,8 @@ class ServoModel:
     def torque_per_volt(self) -> Published:
         """Torque at the output shaft per volt at standstill [N m/V]: stall torque divided by supply voltage.
 
-        In PWM mode the motor's torque is this times the applied voltage, minus the effect of the back-EMF; an
-        identified viscous friction then includes the back-EMF.
+        In PWM mode, the motor torque is this value times the applied voltage, minus the effect of the back-EMF, which
+        identified viscous friction then includes.
         """
         return _spread([stall.torque / stall.voltage for stall in self.stalls])
 
@@ -295,10 +295,10 @@ def servo_model(name: str) -> ServoModel:
 
 
 def with_article(name: str) -> str:
-    """Precede the name of a servo model by "a" or "an", as it is read aloud: "an XM430-W350", "a PH42"."""
+    """Return a model name preceded by "a" or "an", as it is read aloud: "an XM430-W350", "a PH42"."""
     return f"{'an' if name[:1] in _READ_WITH_A_VOWEL else 'a'} {name}"
 
 
 def fastest_no_load() -> float:
-    """No-load speed of the fastest model [rad/s]."""
+    """Return the no-load speed of the fastest model [rad/s]."""
     return max(model.no_load.speed for model in _MODELS)

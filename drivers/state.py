@@ -17,8 +17,7 @@ NAN = float("nan")
 
 
 class Slow(NamedTuple):
-    """Values that are read alternately, a few times a second; NaN if not read in this cycle, or if the servo did not
-    reply.
+    """Values that are read in turn, a few times a second; NaN if not read in this cycle, or if the servo did not reply.
 
     tick: the servo's own clock [s], which wraps at 32.768 s. voltage: supply voltage [V]. temperature: temperature
     inside the servo [degrees C].
@@ -57,8 +56,8 @@ class State(NamedTuple):
     error: the ERR bytes, 0 if missing.
     missing: whether the servo returned no values.
     slow, status: values that are only read in some cycles, otherwise None.
-    apart: for each joint, the angles of its further servos minus the first's [rad], NaN if one did not reply; None on
-    an arm with one servo per joint. Horns may be mounted at any angle, so only a change is meaningful.
+    apart: for each joint, the angles of its additional servos minus the first's [rad], NaN if one did not reply; None
+    on an arm with one servo per joint. Horns may be mounted at any angle, so only a change is meaningful.
     """
 
     time_before_write: float
@@ -130,7 +129,7 @@ def _status_names(mode: Mode) -> tuple[str, ...]:
 
 
 SETTINGS = ("Drive Mode", "Operating Mode", "Homing Offset")
-"""Settings that determine what goals and angles mean, and that another program may change while torque is on, or by
+"""Settings that define the meaning of goals and angles. Another program may change them while torque is on, or by
 rebooting the servo.
 """
 
@@ -138,8 +137,8 @@ rebooting the servo.
 def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans]:
     """Return the span of registers that ends with the goal, and the one that ends with SETTINGS.
 
-    They begin at an earlier address than necessary, so that the answers differ in length from those that other programs
-    usually request.
+    They begin at an earlier address than necessary, so that the answers differ in length from those to other programs'
+    usual requests.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
     goals = [_status_names(own)[:2] for own in modes]
@@ -233,11 +232,11 @@ class Converter:
 
     def _wrong(self, goals: Sequence[float]) -> ValueError:
         if len(goals) != len(self._joints):
-            return ValueError(f"{len(goals)} goals for {len(self._joints)} joints: give one for each.")
+            return ValueError(f"{len(goals)} goals for {len(self._joints)} joints: give one per joint.")
         for joint, goal in zip(self._joints, goals, strict=True):
             if not abs(goal) < float("inf"):
                 return ValueError(
-                    f"{joint.title} was given a goal of {goal} {joint.mode.goal_unit}: that is not a number."
+                    f"{joint.title} was given a goal of {goal} {joint.mode.goal_unit}, which is not finite."
                 )
         return ValueError(f"goals {list(goals)} cannot be sent.")
 
@@ -258,8 +257,8 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
 
     of: the joint index of each servo, in ascending order. count: number of joints.
     Goals and currents are summed; angle, velocity and clock are the first servo's; the lowest voltage and the highest
-    temperature are taken; an error or a missing reply of one servo applies to its joint. `apart` shows how the servos
-    of one joint disagree.
+    temperature are taken; an error or missing reply of one servo applies to its joint. `apart` shows by how much the
+    servos of one joint disagree.
     """
     servos = [[place for place, joint in enumerate(of) if joint == wanted] for wanted in range(count)]
     first = [places[0] for places in servos]
@@ -285,7 +284,7 @@ def fold(state: State, of: Sequence[int], count: int) -> State:
 
 
 def _told(statuses: Sequence[Status | None]) -> Status | None:
-    """Return the combined status of one joint's servos: goals are summed, and a fault of any servo counts."""
+    """Return the combined status of one joint's servos: goals are summed; a fault of any servo counts."""
     told = [status for status in statuses if status is not None]
     if len(told) < len(statuses):
         return None

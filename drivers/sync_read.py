@@ -60,7 +60,7 @@ class Span:
         end = next((at for at in range(end, _ADDRESSES) if all(table.defines(at - 1) for table in tables)), 0)
         if not end:
             models = ", ".join(sorted({table.model for table in tables}))
-            raise ValueError(f"{models} have no range of addresses in common that holds these registers.")
+            raise ValueError(f"{models} have no common address range that contains these registers.")
         return tuple(
             cls(
                 span.registers,
@@ -72,7 +72,7 @@ class Span:
         )
 
     def longer(self, by: int) -> "Span":
-        """Return the span with `by` more bytes in front of the same registers."""
+        """Return the span with `by` extra bytes before its registers."""
         return Span(self.registers, self.address - by, self.size + by, "x" * by + self.format)
 
     @classmethod
@@ -98,9 +98,9 @@ def one_each(span: Span | Sequence[Span], count: int) -> tuple[Span, ...]:
 
 
 class GroupRead(Protocol):
-    """A group read as the exchange needs it. `request` is sent; the reply usually has `reply_size` bytes.
+    """Interface of a group read. `request` is sent; the reply usually has `reply_size` bytes.
 
-    expected: ID and number of data bytes of each status packet that answers it.
+    expected: ID and number of data bytes of each status packet in the reply.
     """
 
     request: bytes
@@ -124,16 +124,16 @@ class GroupRead(Protocol):
 
 
 class SyncRead:
-    """Each servo answers with its own status packet, in the order of `ids`.
+    """A Sync Read: each servo answers with its own status packet, in the order of `ids`.
 
-    span: the registers to read, for all servos or one per servo (`Span.each`). The spans then cover the same addresses
-    but differ in which values are decoded.
+    span: the registers to read, one span for all servos or one per servo (`Span.each`). The latter cover the same
+    addresses but decode different values.
     """
 
     def __init__(self, ids: Sequence[int], span: Span | Sequence[Span]) -> None:
         self._ids = tuple(ids)
         self.in_any_order = False
-        """Whether answers are accepted in any order, as when some of them are late and others are not."""
+        """Whether answers are accepted in any order, as when only some of them are late."""
         spans = one_each(span, len(self._ids))
         self._values = {servo_id: Struct(f"<B{own.format}") for servo_id, own in zip(ids, spans, strict=True)}
         span = spans[0]
@@ -210,7 +210,7 @@ class SyncRead:
 
 
 class FastSyncRead:
-    """All servos append to one status packet, which is never stuffed: `ERR ID data CRC` each.
+    """A Fast Sync Read: each servo appends `ERR ID data CRC` to one status packet, which is never stuffed.
 
     Each CRC covers everything from the packet's header on, so the last one covers the whole packet.
     """
@@ -266,12 +266,12 @@ class FastSyncRead:
         return [packet[start + 1] for _, start in self._intact(packet)]
 
     def _packet(self, received: bytes) -> bytes:
-        """The received bytes from the start of the status packet."""
+        """Return the received bytes from the start of the status packet."""
         at = received.find(self._front)
         return received[at:] if at >= 0 else b""
 
     def _intact(self, packet: bytes) -> Iterator[tuple[int, int]]:
-        """The parts before the first missing or damaged one: the ID that was addressed, and where its part starts."""
+        """Yield the addressed ID and the start of each part before the first missing or damaged one."""
         for servo_id, start, end in self._parts:
             if len(packet) < end or _crc(packet[: end - 2]) != int.from_bytes(packet[end - 2 : end], "little"):
                 return

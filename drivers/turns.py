@@ -1,15 +1,15 @@
-"""When a cycle reads a span other than the usual one: slow registers, or the status."""
+"""Schedule of the cycles that read slow registers or the status instead of the usual span."""
 
 __all__ = ["NEVER", "Turns"]
 
 NEVER = 1 << 62
-"""Number of cycles after which nothing is ever due."""
+"""A number of cycles that is never reached."""
 
 
 class Turns:
     """Counts cycles until spans other than the usual one are due.
 
-    A cycle only decrements one counter, the number of usual cycles that `plan` has promised. From this counter, `count`
+    A cycle only decrements one counter, the number of usual cycles returned by `plan`. From this counter, `count`
     derives how many cycles have passed.
 
     slow_spans: number of slow spans. slow_every: samples between two of them. status_every: cycles between two status
@@ -22,19 +22,19 @@ class Turns:
         self._status_every = self._until_status = status_every
         self._slow = 0
         self.usual = 0
-        """Number of planned cycles with the usual span that have not been counted yet."""
+        """Number of planned cycles with the usual span not yet counted."""
         self.between = 0
-        """Number of cycles between two samples that have not been counted yet."""
+        """Number of cycles between two samples not yet counted."""
 
     def count(self, left: int) -> None:
-        """Count the cycles so far; `left` of the planned ones have not taken place (-1: one more than planned has)."""
+        """Count the cycles run so far. left: number of planned cycles not yet run (-1: one more was run)."""
         passed = self.usual - left
         self._until_status -= passed
         self._until_slow -= passed - self.between
         self.usual, self.between = left, 0
 
     def due(self, between: bool) -> int:
-        """Return the span to read now, once all cycles including this one are counted; 0 is the usual one."""
+        """Return the span to read now, with all cycles including this one counted; 0 is the usual one."""
         if self._until_slow <= 0 and not between:
             self._until_slow = self._slow_every
             # If a status is due as well, it waits for the next cycle, so that the two long reads never coincide.
@@ -56,6 +56,6 @@ class Turns:
             self._until_status = min(self._until_status, 1)
 
     def plan(self) -> int:
-        """Return how many cycles will read the usual span; if all of them lie between samples, there will be more."""
+        """Return the minimum number of cycles needed to read the usual span; cycles between samples may increase it."""
         self.usual = max(0, min(self._until_slow, self._until_status) - 1)
         return self.usual

@@ -12,13 +12,13 @@ def register() -> None:
 
 
 def register_for(url: str) -> None:
-    """Call `register` if `url` is that of a fake arm; for a real arm pyserial is left untouched."""
+    """Call `register` if `url` is that of a fake arm; for a real arm, leave pyserial untouched."""
     if url.startswith("fake://"):
         register()
 
 
 def allow_code(allowed: bool = True) -> None:
-    """Permit (or forbid) [fake] tables opened from now on to call functions of other packages through `plant`.
+    """Allow (or forbid) [fake] tables opened from now on to call functions of other packages through `plant`.
 
     See `hil.fakes.plants.plant` for why this is off by default.
     """

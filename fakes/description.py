@@ -1,4 +1,4 @@
-"""The [fake] table of an arm's TOML file: the fake servos on the bus, and what they move."""
+"""The [fake] table of an arm's TOML file: the fake servos on the bus, and the mechanism that they move."""
 
 from difflib import get_close_matches
 from pathlib import Path
@@ -67,7 +67,7 @@ class FakeServo(Described):
         Overload | None, Field(description="conditions of its overload shutdown; by default it never shuts down")
     ] = None
     registers: Annotated[
-        dict[str, int], Field(description="other EEPROM registers with values different from the factory defaults")
+        dict[str, int], Field(description="values of other EEPROM registers that differ from the factory defaults")
     ] = {}  # noqa: RUF012  # pydantic copies it
 
     @field_validator("model")
@@ -111,7 +111,7 @@ class FakeServo(Described):
 class FakeArm(Described):
     """The whole [fake] table: an adapter, the servos on its bus, and the arm that they move."""
 
-    seed: Annotated[int, Field(ge=0, description="random seed of noise and faults")] = 0
+    seed: Annotated[int, Field(ge=0, description="random seed for noise and faults")] = 0
     adapter_latency_us: Annotated[
         float, Field(ge=0, le=1e6, description="delay of every byte between wire and host [us]")
     ] = 0.0
@@ -141,11 +141,11 @@ class FakeArm(Described):
         count = max(self.joints) + 1
         if set(self.joints) != set(range(count)):
             moved = ", ".join(str(joint + 1) for joint in self.joints)
-            raise ValueError(f"servos: they move the joints {moved}, but each joint from 1 upwards needs a servo")
+            raise ValueError(f"servos: they move joints {moved}, but every joint from 1 upwards needs a servo")
         arm = self.arm or self.chain
         if arm is not None and count != len(arm.drives):
             servos = f"{len(ids)} servos" + (f" on {count} joints" if count != len(ids) else "")
-            raise ValueError(f"{servos} for {len(arm.drives)} drives of the arm: one servo per drive")
+            raise ValueError(f"{servos} for {len(arm.drives)} drives of the arm: each drive needs a servo")
         for fault in self.faults:
             if fault.servo is not None and fault.servo not in ids:
                 raise ValueError(
@@ -192,15 +192,15 @@ def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def found_beside(folder: Path, name: str) -> Path:
-    """Return the file that a TOML file in `folder` refers to as `name`; if it does not exist, the file of the same name
-    in `folder`.
+    """Return the file that a TOML file in `folder` refers to as `name`, or its namesake in `folder` if it does not
+    exist.
     """
     named = folder / name
     return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name
 
 
 def _known_names(name: str) -> str:
-    """The hint for a bare name that is not that of an arm."""
+    """Return a hint for a bare name that does not name an arm."""
     if "." in name or "/" in name:
         return ""
     close = get_close_matches(name, arm_names(), 1, 0.75)
@@ -228,9 +228,9 @@ def load_fake(path: Path | str) -> FakeArm:
 
 
 def make_bus(fake: FakeArm, clock: Clock) -> FakeBus:
-    """Return the described bus: servos switched on at the clock's current time, the arm at rest in its initial pose.
+    """Return the described bus: servos powered up at the clock's current time, the arm at rest in its initial pose.
 
-    Raises PlantError if a custom plant cannot be created, or does not support the faults or moves that are described.
+    Raises PlantError if a custom plant cannot be created, or does not support the described faults or moves.
     """
     servos = [
         EmulatedServo(

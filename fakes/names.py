@@ -1,4 +1,4 @@
-"""Fake arms by name: those shipped for use by other programs, and those of hil's own configurations."""
+"""Named fake arms: those shipped for use by other programs, and those of hil's own configurations."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def arm_names() -> tuple[str, ...]:
 
 
 def find_arm(path: Path | str) -> Path:
-    """Return `path` itself or, if it is a bare name and not a file, the file of the arm of that name."""
+    """Return `path` itself or, if it is a bare name and not a file, the file of the arm with that name."""
     path = Path(path)
     if path.name != str(path) or path.suffix or path.exists():
         return path

@@ -6,12 +6,11 @@ is one of the arms bundled with hil (`fake://koch`; see `hil.fakes.names`). `ope
 without a file. pyserial finds this module by its name.
 
 Time is that of `port.clock`: a program that waits must wait on that clock (or in `read`), because wall-clock time does
-not move the arm. In particular dynamixel-sdk's own port handler, which polls with timeout 0 against `time.time()`,
-receives no replies. With `fake://PATH/TO/ARM.toml?time=real` the arm runs in real time and works with any program.
+not move the arm. In particular, dynamixel-sdk's own port handler, which polls with timeout 0 against `time.time()`,
+receives no replies. With `fake://PATH/TO/ARM.toml?time=real`, the arm runs in real time and works with any program.
 
 An unplugged cable (see `hil.fakes.bus.faults`) fails as on Linux: writing and reading raise `serial.SerialException`,
-`reset_input_buffer` raises `termios.error`. The port must then be closed and, once the cable is replugged, opened
-again.
+`reset_input_buffer` raises `termios.error`. The port must then be closed and reopened once the cable is replugged.
 """
 
 import errno
@@ -43,9 +42,8 @@ class _Unplugged(serial.SerialException):
 class FakeSerial(SerialBase):
     """A pyserial port connected to a fake bus.
 
-    The arm is created when the port is first opened and lives as long as the port object: after closing and reopening,
-    it is as it was left, except that time has passed. Real servos behave in the same way. Two port objects never share
-    an arm.
+    The arm is created when the port is first opened and lives as long as the port object: when the port is reopened,
+    the arm is as it was left, except that time has passed, as with real servos. Two port objects never share an arm.
 
     It has the attributes `clock` and `bus` in addition to pyserial's interface.
     """
@@ -113,17 +111,17 @@ class FakeSerial(SerialBase):
         self.is_open = False
 
     def _reconfigure_port(self, force_update: bool = False) -> None:
-        """Apply the only setting that has an effect here: the baud rate. The frame format is always 8N1."""
+        """Apply the baud rate, the only setting with an effect here. The frame format is always 8N1."""
         if self.baudrate <= 0:
-            raise ValueError(f"a baud rate of {self.baudrate} is not positive")
+            raise ValueError(f"the baud rate must be positive, not {self.baudrate}")
         if self._bus is not None:
             self._bus.baud = self.baudrate
 
     def read(self, size: int = 1) -> bytes:
         """Return up to `size` bytes, waiting on `clock` for at most the port's timeout.
 
-        With timeout None a real port would wait forever for bytes that never arrive. Since nothing else can send them
-        here, such a read raises `serial.SerialException`; bytes that have already been received can still be read.
+        With timeout None, a real port would wait forever for bytes that never arrive. Since nothing else can send them
+        here, such a read raises `serial.SerialException`; bytes already received can still be read.
         """
         bus = self._open_bus()
         timeout = self.timeout
@@ -138,7 +136,7 @@ class FakeSerial(SerialBase):
         return taken
 
     def write(self, data: bytes | bytearray) -> int:  # type: ignore[override]  # pyserial's stub allows any buffer
-        """Put bytes on the wire; returns immediately, like a driver with a buffer."""
+        """Put bytes on the wire and return immediately, like a buffered driver."""
         self._open_bus().write(bytes(data))
         return len(data)
 
@@ -148,7 +146,7 @@ class FakeSerial(SerialBase):
 
     @property
     def in_waiting(self) -> int:
-        """Number of bytes that have arrived and have not been read."""
+        """Number of bytes that have arrived but have not been read."""
         return self._open_bus().in_waiting
 
     def reset_input_buffer(self) -> None:
@@ -174,7 +172,7 @@ class FakeSerial(SerialBase):
         return bus
 
     def _unplugged(self, bus: FakeBus) -> _Unplugged:
-        """Wait until the cable is unplugged, of which the bus may know in advance, and return the error."""
+        """Wait until the cable is unplugged, which the bus may know in advance, and return the error."""
         self.clock.wait_until(bus.pulled_at)
         return _Unplugged()
 

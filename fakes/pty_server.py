@@ -1,7 +1,7 @@
 """A fake arm on a terminal device, in real time, for programs in any language.
 
-The host opens `path` like a serial adapter and sets the baud rate on the terminal. An unplugged cable hangs up the
-terminal; replugging creates a new terminal, to which the symbolic link then points.
+The host opens `path` like a serial adapter and sets the baud rate on the terminal. Unplugging the cable hangs up the
+terminal; replugging it creates a new terminal, to which the symbolic link then points.
 """
 
 import contextlib
@@ -29,15 +29,15 @@ OVERRUN_S = 1e-3
 """A reply delivered more than this long after it was due counts as a real-time overrun [s]."""
 
 TOO_SLOW_S = 5e-3
-"""If simulating the arm takes this much longer than the simulated time, twice in a row, the excess is not simulated
-[s]. After a single stall of the computer, the arm catches up instead.
+"""If simulating the arm takes this much longer than the simulated time twice in a row, the excess is not simulated [s].
+After a single stall of the computer, the arm catches up instead.
 """
 
 LONGEST_SLEEP_S = 0.05
-"""Longest wait before the server checks faults, watchdogs and whether to stop [s]."""
+"""Longest wait before the server checks for faults, watchdog trips and a request to stop [s]."""
 
 PRIORITY = 10
-"""Priority for SCHED_FIFO, if it is permitted: below that of a control loop on the same computer."""
+"""Priority under SCHED_FIFO, if permitted: below that of a control loop on the same computer."""
 
 _TCGETS2 = 0x802C542A
 _PR_SET_TIMERSLACK = 29
@@ -49,7 +49,7 @@ class LinkError(OSError):
 
 
 class ServerClock:
-    """The machine's monotonic clock minus the time that was not simulated. Only the server itself waits on it."""
+    """The machine's monotonic clock, minus the time that was not simulated. Only the server itself waits on it."""
 
     def __init__(self) -> None:
         self.lost_s = 0.0
@@ -248,8 +248,8 @@ def _baud_of(master: int) -> int:
 def _wake_up_in_time() -> None:
     """Request timers with microsecond resolution and real-time scheduling from Linux, for the serving thread.
 
-    Without them each wait ends about 50 us late, and on a busy computer the servos would fall silent for many
-    milliseconds, which real ones never do.
+    Without them, each wait ends about 50 us late, and on a busy computer the servos would fall silent for many
+    milliseconds, unlike real ones.
     """
     with contextlib.suppress(OSError):  # not permitted: the server then competes with all other programs
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))

@@ -1,4 +1,4 @@
-"""Access to the hand of a fake arm that another process serves on a terminal, through a socket.
+"""Access through a socket to the hand of a fake arm that another process serves on a terminal.
 
 A request is the text `move ID:to=ANGLE,...`, `release ID` or `release`; the reply is empty, or the error message.
 """
@@ -22,7 +22,7 @@ class NoHand(OSError):
 
 
 def socket_path(terminal: str) -> Path:
-    """Return the path of the socket that belongs to a terminal served for this user."""
+    """Return the path of the socket of a terminal served for this user."""
     name = terminal.strip("/").replace("/", "-")
     return Path(tempfile.gettempdir()) / f"hil-hand-{os.getuid()}-{name}"
 

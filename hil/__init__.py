@@ -5,7 +5,7 @@
     result = hil.identify("fake_two_link")
     result.parameters["inertia_1"].value
 
-A function with the name of a command does the same as that command. The functions are loaded on first use, so that
+Each function named after a command does the same as that command. The functions are loaded on first use, so that
 `import hil` takes almost no time.
 """
 

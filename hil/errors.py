@@ -57,7 +57,7 @@ class Cause(Enum):
     JUMP = "encoder jump"
     NOT_FOLLOWING = "current does not follow"
     OUT_OF_VOLTAGE = "supply too low for this speed"
-    GOALS_CHANGED = "goals changed on the way"
+    GOALS_CHANGED = "goals altered in transit"
     TORQUE_OFF = "torque lost"
     WATCHDOG = "servo's watchdog"
     GOALS_LOST = "goals not accepted"
@@ -124,7 +124,7 @@ class CsvError(HilError):
 
 
 class MissingExtra(HilError):
-    """An optional package is not installed. Example: `hil compare --mujoco` without the extra `peers`."""
+    """An optional package is not installed. Example: `hil compare --mujoco` without the `peers` extra."""
 
     exit_code = 2
 

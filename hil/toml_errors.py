@@ -120,7 +120,7 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
 
 
 def _exact_length(detail: Any, root: type[BaseModel]) -> str:
-    """For a list that is too short or too long: how many entries it must have, if there is only one such number."""
+    """Say how many entries a list that is too short or too long must have, if only one number is allowed."""
     if detail["type"] not in {"too_short", "too_long"}:
         return ""
     field = _field_of(detail, root)
@@ -137,14 +137,14 @@ def _field_of(detail: Any, root: type[BaseModel]) -> Any:
 
 
 def _brackets_hint(key: str, detail: Any) -> str:
-    """For a table written once where a list of tables is expected: how such a list is written."""
+    """Say how to write a list of tables, if a single table was given instead."""
     if detail["type"] not in {"list_type", "tuple_type"} or not isinstance(detail["input"], dict):
         return ""
     return f". Write [[{key}]] with double brackets, once for each entry, instead of [{key}]"
 
 
 def _as_list(detail: Any, joints: int | None) -> str:
-    """For a number given where a list with one entry per joint is expected: what to write instead."""
+    """Say what to write instead of a number where a list with one entry per joint is expected."""
     value = detail["input"]
     if joints is None or detail["type"] != "list_type" or isinstance(value, bool) or not isinstance(value, int | float):
         return ""

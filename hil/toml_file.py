@@ -124,13 +124,13 @@ def _repeated(what: str, table: str, number: int, first: int | None) -> str:
 
 
 def _is_within(given: tuple[str, str], name: str) -> bool:
-    """Whether a table and key belong to the tables `name`; the key of a header is the header, its table ""."""
+    """Whether a table and key belong to the tables `name`; a header counts as a key of the table ""."""
     table, key = given
     return re.match(rf"(?:the )?\[\[?{re.escape(name)}[\].]", table or key) is not None
 
 
 def _beginnings(text: str) -> list[int]:
-    """Numbers of the lines, from 1, on which a statement begins: those within a value of several lines do not count."""
+    """Numbers of the lines, from 1, on which a statement begins: lines within a multi-line value do not count."""
     found, line, depth = [1], 1, 0
     for token in _TOKEN.findall(text):
         line += token.count("\n")
@@ -160,7 +160,7 @@ _SYNTAX = (
     (r"^\w[\w.-]*\s*:", "Write = between key and value, not a colon."),
     (r"[“”‘’„]", "Use straight quotes."),
 )
-"""Patterns of a rejected line without its comment and quoted texts, and the likely cause of each."""
+"""Patterns of a rejected line without its comment and quoted strings, and the likely cause of each."""
 
 
 def _unquoted(line: str) -> str:

@@ -11,9 +11,11 @@ import pytest
 import serial
 from threadpoolctl import threadpool_limits
 
+from benchmarks.spatial.remembered import remembered
 from hil.config.schema import Config, load_config
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
+from hil.plan import chain_plan, plan
 from hil.runs.run_folder import RunFolder
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
@@ -53,6 +55,15 @@ def _no_waiting_for_disks() -> Iterator[None]:
     """Only a power failure would show the difference, and each call takes a virtual disk several milliseconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _designs_remembered() -> Iterator[None]:
+    """Most tests use one of a few multisines or paths, and a design takes as long as a short run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "design_multisine", remembered(plan.design_multisine))
+        patch.setattr(chain_plan, "design_path", remembered(chain_plan.design_path))
         yield
 
 

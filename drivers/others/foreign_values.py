@@ -1,4 +1,4 @@
-"""Detection of values on a servo that this program cannot have written, found too often to be chance."""
+"""Detection of servo values that this program cannot have written, read too often to be chance."""
 
 from collections import deque
 
@@ -6,7 +6,7 @@ __all__ = ["ForeignValues"]
 
 ENOUGH, WITHIN_S = 3, 10.0
 """Number of values not written by this program, and the time within which they prove that something else writes to the
-servo or changes what is written [s]. Noise cannot change a value, since its checksum would fail.
+servo or alters what is written [s]. Noise cannot alter a value, since the checksum would fail.
 """
 
 

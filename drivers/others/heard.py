@@ -1,4 +1,4 @@
-"""Unexpected bytes on the wire, in addition to the requested replies or instead of them, and advice for the user."""
+"""Unexpected bytes received in addition to the requested replies or instead of them, and advice for the user."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,7 +20,7 @@ _FRONT_SIZE = 8  # header, ID, LEN, INST
 _BEFORE_LENGTH = 7  # header, ID, LEN
 _BESIDE_DATA = 4  # INST, ERR, CRC
 _LONGEST_CUT_OFF = 64
-"""Largest LEN of an instruction that is recognised although its end is missing; a damaged LEN is usually larger."""
+"""Largest LEN of an instruction that is recognised with its end missing; a damaged LEN is usually larger."""
 
 _PART_OF_A_REPLY = 8  # bytes; at least the header of a fast reply, whose first servos have then answered
 
@@ -36,15 +36,13 @@ class Heard:
         self._expected: frozenset[tuple[int, int]] = frozenset()
         self.expect(reads)
         self.damaged_at = self.late_at = -math.inf
-        """Times at which incomplete or damaged replies last arrived, and at which an unexpected reply last arrived [s
-        on the port's clock].
+        """Times of the latest incomplete or damaged replies, and of the latest late or repeated reply [s on the port's
+        clock].
         """
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """Number of replies since the last late one that had one answer per servo, but IDs that do not match the
-        request.
-        """
+        """Number of replies since the last late one with one answer per servo but IDs not matching the request."""
         self.strangers: float = 0
         """Number of received packets that this program neither sent nor requested: another master is on the bus."""
 
@@ -93,9 +91,7 @@ class Heard:
             self._was_late(now)
 
     def advice(self, now: float, url: str) -> str:
-        """Return a message about what was received in the last 0.1 s instead of complete and timely replies, with
-        advice; "" if nothing was received.
-        """
+        """Return advice on bytes received in the last 0.1 s instead of complete and timely replies; "" if none."""
         since = now - _RECENT_S
         if self.late_at > since:
             return (
@@ -107,14 +103,14 @@ class Heard:
         if strange := [each for each in self.senders if each not in self._ids]:
             return (
                 f"Intact replies came with ID {', '.join(map(str, dict.fromkeys(strange)))}, which was not addressed: "
-                f"a servo's ID has changed, or its reply is another servo's. `hil scan {url}` lists the IDs."
+                f"a servo's ID has changed, or the reply is another servo's. `hil scan {url}` lists the IDs."
             )
         if self.mixed_up or len(set(self.senders)) < len(self.senders):
             return self.mixed_up_advice(url)
         return "Bytes arrived, but damaged or incomplete: check the cables and what else may be sending on the bus."
 
     def mixed_up_advice(self, url: str) -> str:
-        """Advice to the user about replies whose IDs do not match the request."""
+        """Return advice for the user about replies whose IDs do not match the request."""
         return (
             f"Intact replies came with the IDs {', '.join(map(str, self.senders))}, although each servo was "
             "asked once: replies are repeated or mixed up, or two servos have the same ID. "
@@ -126,9 +122,7 @@ class Heard:
             self.strangers += sum(self._is_strange(packet) for packet in packets)
 
     def _is_strange(self, packet: Packet) -> bool:
-        """Whether this is another master's instruction or a reply to one. A reply without data, such as an error, may
-        be ours.
-        """
+        """Whether this is another master's instruction or a reply to one. Errors without data may be ours."""
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
@@ -140,7 +134,7 @@ class Heard:
 
 
 def _packets_within(received: bytes) -> list[Packet]:
-    """Return all whole packets, also those behind or within one that was cut off by a collision."""
+    """Return all complete packets, including those after or within one cut off by a collision."""
     found: list[Packet] = []
     at = received.find(HEADER)
     while at >= 0:
@@ -152,7 +146,7 @@ def _packets_within(received: bytes) -> list[Packet]:
 
 
 def _fronts_of_replies(received: bytes) -> Iterator[tuple[int, int]]:
-    """ID and number of data bytes, without stuffing, of each status packet, whether it is complete or not."""
+    """Yield ID and number of data bytes, without stuffing, of each status packet, complete or not."""
     at = received.find(HEADER)
     while at >= 0:
         front = received[at : at + _FRONT_SIZE]
@@ -164,9 +158,9 @@ def _fronts_of_replies(received: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:
-    """ID and LEN of each instruction that is cut off by the next packet.
+    """Yield ID and LEN of each instruction that is cut off by the next packet.
 
-    A master does not receive while it transmits: it hears only the part of another one's packet that preceded its own.
+    A master does not receive while it transmits: of another's packet, it hears only the part that preceded its own.
     """
     at = received.find(HEADER)
     while (following := received.find(HEADER, at + len(HEADER))) >= 0:

@@ -16,7 +16,7 @@ __all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack"]
 _MODES_S = 0.025
 """Mean time between two read-backs of the modes [s]; all others read the goals.
 
-The actual time is random. Otherwise another program that overwrites goals regularly might always do so just when the
+The actual time is random. Otherwise, a program that overwrites goals periodically might always do so just when the
 modes are read.
 """
 
@@ -30,7 +30,7 @@ REMEMBERED = 128
 """Number of recent goals that a servo may still hold if writes are lost and the status has not yet detected that."""
 
 _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
-"""Numbers of read-backs of a foreign value that prove another writer, and the time in which they must occur [s].
+"""Numbers of read-backs of a foreign value that prove another writer, and the time within which they must occur [s].
 
 Three of the same value are required for a goal that this program may have written in an earlier cycle, and for 0, which
 a servo itself may have set. By then, the status would have revealed lost writes, a tripped watchdog or a reboot; and
@@ -38,14 +38,13 @@ writes that are lost occasionally leave a different goal each time.
 """
 
 _UNSURE_S = 0.01
-"""Minimum time between the first and the last of these three [s], in which the status is read."""
+"""Minimum time between the first and last of `_UNSURE_SIGHTINGS` [s], in which the status is read."""
 
 TRY_AGAIN_S = 0.005
 """If a cycle leaves no time for a read-back, the read-back is tried again after this delay [s]."""
 
 LOST_GOALS, LOST_OF = 3, 6
-"""A servo that misses `LOST_GOALS` of `LOST_OF` goals counts as not accepting them, although the next one may
-arrive.
+"""A servo that misses `LOST_GOALS` of `LOST_OF` goals counts as not accepting them, even if the next one arrives.
 
 The status check needs two consecutive missed goals: if every second goal is lost, it may not notice for 0.1 s. If one
 goal in a hundred is lost, missing three of six is rarer than missing two consecutive ones.
@@ -53,7 +52,7 @@ goal in a hundred is lost, missing three of six is rarer than missing two consec
 
 _FADES = 0.98
 _IN_DOUBT_S = 0.3
-"""Time after a foreign value was read during which more such values are expected [s]."""
+"""Time during which more foreign values are expected after one was read [s]."""
 
 
 _Sightings = deque[tuple[float, int]]
@@ -61,7 +60,7 @@ _Sightings = deque[tuple[float, int]]
 
 
 class Overruled(NamedTuple):
-    """A servo (by its place among the IDs) that holds a goal, or another setting, that this program did not write."""
+    """A servo (by its index among the IDs) that holds a goal or other setting that this program did not write."""
 
     place: int
     register: str
@@ -72,8 +71,8 @@ class Overruled(NamedTuple):
 class ReadBack:
     """Reads back the goals that the servos hold right before a cycle, and occasionally their settings instead.
 
-    mode: a span that ends with the settings, whose values are `modes`, equally many for each servo. A change of one of
-    these settings reverses the motor, shifts every angle, or gives goals another meaning.
+    mode: a span that ends with the settings, whose values are `modes`, the same number for each servo. A change to one
+    of these settings reverses the motor, shifts every angle, or changes the meaning of goals.
 
     Every cycle overwrites the goals of another master. A master that writes less often than this program is therefore
     detected only if the goals are read before every cycle.
@@ -111,7 +110,7 @@ class ReadBack:
         self.is_unexpected = False
         """Whether the latest read-back found anything other than the latest goals or the modes that were set."""
         self.lost: Overruled | None = None
-        """A servo that has missed `LOST_GOALS` of `LOST_OF` goals, and the older goal that it holds."""
+        """A servo that has missed `LOST_GOALS` of `LOST_OF` goals, with the older goal that it holds."""
         self._looks = 0  # read-backs of goals so far
         self._missed: list[deque[int]] = [deque(maxlen=LOST_GOALS) for _ in ids]
         """Indices of the latest read-backs that found an older goal of this program, by servo."""
@@ -121,7 +120,7 @@ class ReadBack:
 
     @property
     def read(self) -> GroupRead:
-        """The group read to send next: of the goals, or of the operating modes."""
+        """The next group read to send: goals or operating modes."""
         return self.reads[self.is_of_modes]
 
     def took(self, seconds: float) -> None:
@@ -166,7 +165,7 @@ class ReadBack:
         return None
 
     def _choose_next(self, now: float) -> None:
-        """Choose what to read next; a change of mode resets the goal, so a foreign goal may be its first sign."""
+        """Choose what to read next; since a mode change resets the goal, a foreign goal may be its first sign."""
         if self.is_of_modes:
             self._modes_due, self._goals_since = now + _MODES_S * (0.5 + self._draw.random()), 0
         else:
@@ -175,7 +174,7 @@ class ReadBack:
         self.is_of_modes = now >= self._modes_due and self._goals_since >= enough
 
     def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], *, collided: bool) -> list[Overruled]:
-        """What each servo holds that this program did not write."""
+        """Return the values held by servos that this program did not write."""
         if self.is_of_modes:
             found = self._other_settings(servos)
             self.is_unexpected = bool(found)
@@ -197,7 +196,7 @@ class ReadBack:
         ]
 
     def _other_settings(self, servos: Sequence[Answer]) -> list[Overruled]:
-        """The first setting of each servo that is not as this program left it."""
+        """Return the first setting of each servo that differs from what this program wrote or found."""
         found = []
         for place, (answer, modes) in enumerate(zip(servos, self._modes, strict=True)):
             if answer is None or answer[-len(modes) :] == modes:
@@ -218,5 +217,5 @@ class ReadBack:
 
 
 def _intact(answer: Answer) -> Answer:
-    """The answer of a servo that has sent values without an error; None for any other."""
+    """Return the answer if it contains values and no error, otherwise None."""
     return answer if answer is not None and len(answer) > 1 and not answer[0] & ~ALERT else None

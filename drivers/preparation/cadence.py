@@ -1,4 +1,4 @@
-"""How often the servos are read: exchanges per sample, and the status read between them, as far as the wire allows."""
+"""How often the servos are read: exchanges per sample and status reads between them, as far as wire time allows."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ STATUS_S = 0.035
 
 _SHARE, _MOST_SHARE = 0.6, 0.9
 """Fraction of a control cycle that a status read may take on the wire; the rest is for the adapter and the computer.
-The second value applies to servos that report the supply current, which reveals a loss of torque only late.
+The second value applies to servos that report the supply current, which is slow to reveal a loss of torque.
 """
 
 

@@ -1,4 +1,4 @@
-"""Preparation for the control cycle: measure adapter delay, check that the bus is quiet, set servo modes."""
+"""Preparation for the control cycle: measure the adapter's delay, check that the bus is quiet, set servo modes."""
 
 from contextlib import suppress
 
@@ -16,7 +16,7 @@ LISTEN_S = 0.05
 """How long the bus must be quiet before this program starts to use it [s]."""
 
 SLOWEST_S = 0.1
-"""Delay of the slowest adapter that is supported [s]."""
+"""Delay of the slowest supported adapter [s]."""
 
 _TRIPS = 5
 _TIMES, _APART_S = 6, 0.05
@@ -35,8 +35,8 @@ TIME_BASED_PROFILE = 0x04
 def learn_latency(servo: Servo) -> None:
     """Increase the port's reply timeout if this servo's replies are slow, as over Bluetooth or a network.
 
-    The port's `latency` is raised to the measured value, with a margin, if that exceeds what this kind of adapter
-    should need: a full-speed USB adapter needs 1 to 2.5 ms.
+    The port's `latency` is raised to the measured value plus a margin if that exceeds what this kind of adapter should
+    need; a full-speed USB adapter needs 1 to 2.5 ms.
     """
     port, usual = servo.port, servo.port.latency
     trips = latest = _trips(servo)
@@ -96,7 +96,7 @@ def overruled(joint: Joint, found: Overruled) -> BusShared:
     if found.register in SETTINGS and found.register != "Operating Mode":
         by, before = "was changed", f"and read {found.written} before the start"
     if found.register not in SETTINGS:
-        check = " If there is none, goals are being changed on the way: check the adapter and the cable."
+        check = " If there is none, goals are being altered in transit: check the adapter and the cable."
     return BusShared(
         f"{joint.title[0].upper()}{joint.title[1:]} {by} by another program: its {found.register} reads "
         f"{found.value}, {before}. Stop that program, or unplug its controller.{check}"
@@ -121,7 +121,7 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     secondary = servo.read("Secondary(Shadow) ID")
     if secondary in others:
         raise WrongSetting(
-            f"{joint.title}: its Secondary ID is {secondary}, so it also obeys commands to that servo. Remove it: "
+            f"{joint.title}: its Secondary ID is {secondary}, so it also obeys commands to that servo. Remove it with "
             f"hil setup {servo.port.url} --id {joint.id} --secondary-id 255."
         )
     if arms_itself(servo):
@@ -146,14 +146,14 @@ def shuts_down(servo: Servo, error: HardwareError) -> bool:
 def fault_text(joint: Joint, cause: str, *, shuts_down: bool = True) -> str:
     """Return the message for a servo that has raised its alert.
 
-    shuts_down: whether its Shutdown register makes it cut its torque for this cause.
+    shuts_down: whether its Shutdown register makes it cut its torque in this case.
     """
     if cause == NO_ERROR:
         return (
-            f"{joint.title} raised its alert, but reports no hardware error now. Check its supply and its plug, then "
+            f"{joint.title} raised its alert, but reports no hardware error now. Check its supply and connector, then "
             "power-cycle it."
         )
     raised = f"{joint.title} raised its alert; hardware error: {cause}."
     if not shuts_down:
-        return f"{raised} Its Shutdown setting lets it keep its torque. Find the cause, then power-cycle it."
-    return f"{raised} It stays without torque until it is rebooted: find the cause, then power-cycle it."
+        return f"{raised} Its Shutdown setting leaves its torque on. Find the cause, then power-cycle it."
+    return f"{raised} Its torque stays off until it is rebooted: find the cause, then power-cycle it."

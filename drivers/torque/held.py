@@ -1,6 +1,4 @@
-"""Torque that is already on at the start: detect it, and either refuse to start or take over and let the arm sink
-slowly.
-"""
+"""Torque that is already on at the start: either refuse to start, or take over and let the arm sink slowly."""
 
 from collections.abc import Mapping
 
@@ -16,7 +14,7 @@ FADE_S = 1.0
 """Time over which a held servo's output limit is reduced to zero [s]."""
 
 SINKING_S = 4.0
-"""Longest time a joint may go on sinking, braked by its own motor, before torque is cut [s]."""
+"""Longest time for which joints may sink, braked by their motors, before torque is cut [s]."""
 
 _STEPS = 20
 _STILL_TICKS = 2  # Present Velocity below which a joint counts as still
@@ -47,20 +45,20 @@ def refuse_held(servos: Mapping[Joint, Servo]) -> None:
 
 
 def switched_on(servos: Mapping[Joint, Servo]) -> str:
-    """Say which servos have torque on, and with which current; "" if none has. Same errors as `Servo.read`."""
+    """Describe the servos with torque on and their currents; "" if none. Raises the same errors as `Servo.read`."""
     on = [servo for servo in servos.values() if servo.read("Torque Enable") and has_torque(servo)]
     return " and ".join(f"{servo.title}{_current(joint, servo)}" for joint, servo in servos.items() if servo in on)
 
 
 def _current(joint: Joint, servo: Servo) -> str:
-    """The servo's present current in brackets; "" if it does not measure one."""
+    """Return the servo's present current in parentheses; "" if it does not measure one."""
     if joint.servo.current_unit is None:
         return ""
     return f" (Present Current {servo.read('Present Current') * joint.servo.current_unit:.3f} A)"
 
 
 def let_sink(servos: Mapping[Joint, Servo], clock: Clock) -> None:
-    """Reduce the output of held servos to zero step by step, wait until the joints no longer sink, then cut torque.
+    """Ramp the output of held servos down to zero, wait until the joints no longer sink, then cut torque.
 
     With zero PWM and torque on, the motor's terminals are shorted and it brakes. Raises the same errors as
     `Servo.write`.

@@ -1,11 +1,11 @@
 """Cutting torque: torque off is sent to every servo and read back, regardless of failures and interrupts.
 
-The order matters. Every packet feeds the Bus Watchdog of every servo that receives it, whatever its ID. For a servo
-that receives but does not obey, because it refuses instructions or its ID has changed, that watchdog is the only thing
-that ends its current. So torque off is first sent to all servos at once, which takes 0.3 ms; then each servo is polled,
-until one does not reply. From then on, the bus stays silent for as long as the Bus Watchdogs wait. If a servo was
-silent before torque is cut, torque off is sent three times, since a packet may have been lost, and the silence begins
-at once. After it, all servos that are not confirmed yet are polled again, several times.
+The order matters. Every packet feeds the Bus Watchdog of every servo that receives it, whatever ID it addresses. If a
+servo receives but does not obey, because it refuses instructions or its ID has changed, only that watchdog stops its
+current. So torque off is first sent to all servos at once, which takes 0.3 ms; then each servo is polled until one does
+not reply. From then on, the bus stays silent until the Bus Watchdogs time out. If a servo was already silent before
+torque is cut, torque off is sent three times, since a packet may be lost, and the silence begins at once. After it, all
+servos not yet confirmed are polled again, several times.
 
 Ctrl-C raises KeyboardInterrupt at any point of the program, even between two servos while torque is being cut. A
 program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
@@ -32,7 +32,7 @@ _INTERRUPTS_BORNE = 5
 """Number of attempts to confirm that a servo is off before repeated interrupts (Ctrl-C) count as a failure."""
 
 TRIP_S = WATCHDOG_UNIT + 5e-3
-"""Largest time by which a watchdog may act later than its timeout [s], since it counts in steps of 20 ms."""
+"""Maximum delay of a watchdog beyond its timeout [s], since it counts in steps of 20 ms."""
 
 _REPEATS, _REPEAT_S = 2, 0.001
 """Number of further torque-off packets and the time between them [s]: a packet that collides with a reply is lost."""
@@ -47,7 +47,7 @@ class TorqueOff:
     unwatched: joints, of either group, whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
     rebooted: confirmed joints whose servos had lost the watchdog that was armed before torque came on.
-    driven: joints in neither group: their servos' torque is on, because another program switches it on whenever it is
+    driven: joints in neither group, whose servos' torque is on because another program switches it on whenever it is
     cut.
     """
 
@@ -60,11 +60,11 @@ class TorqueOff:
 
     @property
     def is_off(self) -> bool:
-        """Whether torque is off on every servo, read back."""
+        """Whether torque off was read back from every servo."""
         return not self.unconfirmed and not self.driven
 
     def with_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> "TorqueOff":
-        """The report after another program has switched torque on again.
+        """Return the report after another program has switched torque on again.
 
         on: joints whose servos have torque on again each time it is cut. silent: joints whose servos have not
         answered since.
@@ -78,7 +78,7 @@ class TorqueOff:
         )
 
     def with_later(self, joint: Joint, *, rebooted: bool) -> "TorqueOff":
-        """The report after the servo of an unconfirmed joint has answered again and been read back as off."""
+        """Return the report after an unconfirmed joint's servo has answered again and been read back as off."""
         return replace(
             self,
             confirmed=(*self.confirmed, joint),
@@ -91,7 +91,7 @@ class TorqueOff:
         return " ".join((self._outcome(), *self._answers()))
 
     def _answers(self) -> Iterator[str]:
-        """Sentences about servos that were silent or rebooted and have answered since."""
+        """Yield sentences on servos that were silent or rebooted and have answered since."""
         for joint in self.confirmed:
             if joint in self.later:
                 yield f"{joint.title} did not answer at first, but answers again."
@@ -102,7 +102,9 @@ class TorqueOff:
                 )
 
     def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:
-        """Each reason why servos are unconfirmed, with their joints; those that differ only in the name are merged."""
+        """Yield each reason why servos are unconfirmed, with their joints; reasons that differ only in the joint's name
+        are merged.
+        """
         yield from by_reason(self.unconfirmed).items()
 
     def _outcome(self) -> str:
@@ -119,7 +121,7 @@ class TorqueOff:
         return " ".join(told)
 
     def _outcome_alone(self) -> str:
-        """The outcome for the servos that no other program drives."""
+        """Return the outcome for the servos that no other program drives."""
         if not self.unconfirmed:
             count = len(self.confirmed)
             servos = {1: "the servo", 2: "both servos"}.get(count, f"all {count} servos")
@@ -207,7 +209,7 @@ def tell_watchdogs(port: Port, servos: Mapping[Joint, Servo], seconds: float) ->
 
 
 def _tell(port: Port, servos: Mapping[Joint, Servo], register: str, value: int, times: int = 1) -> None:
-    """Write a register of one byte on all servos, without waiting for an answer. Raises PortLost."""
+    """Write a one-byte register of all servos, without waiting for an answer. Raises PortLost."""
     every = list(servos.values())
     if not every:
         return
@@ -238,7 +240,7 @@ def cut_again(servo: Servo, *, armed: bool) -> bool:
 
 
 def is_torque_on(servo: Servo) -> bool | None:
-    """Whether a servo's torque is on; None if that is unknown (`has_torque`) or if it does not answer."""
+    """Whether a servo's torque is on; None if this is unknown (`has_torque`) or the servo does not answer."""
     with suppress(DriverError):
         return has_torque(servo)
     return None
@@ -256,9 +258,9 @@ def has_torque(servo: Servo) -> bool | None:
 
 
 def was_rebooted(servo: Servo) -> bool:
-    """Whether a servo's watchdog was armed but no longer is; False if the servo does not answer.
+    """Whether a servo's watchdog has been disarmed, as by a reboot; False if the servo does not answer.
 
-    A late reply to an earlier request would be taken for the answer, so another register is read before and after.
+    A late reply to an earlier request would be mistaken for the answer, so another register is read before and after.
     """
     with suppress(DriverError):
         return servo.read("ID") == servo.id and servo.read("Bus Watchdog") == 0 and servo.read("ID") == servo.id
@@ -268,7 +270,7 @@ def was_rebooted(servo: Servo) -> bool:
 def _confirm(servo: Servo, interrupts: list[BaseException], *, at_once: bool) -> Exception | None:
     """Write torque off and read it back; return None, or the failure.
 
-    at_once: try once only, and do not send anything after a missing reply.
+    at_once: try only once, and send nothing after a missing reply.
     """
     write = servo.write_once if at_once else servo.write_despite_error
     return _uninterrupted(lambda: write("Torque Enable", 0), interrupts)
@@ -292,7 +294,7 @@ def _uninterrupted(action: Callable[[], None], interrupts: list[BaseException]) 
 
 
 def by_reason(failures: Iterable[tuple[Joint, str]]) -> dict[str, list[Joint]]:
-    """The joints for which each reason applies; reasons that differ only in the joint's name are merged."""
+    """Return the joints to which each reason applies; reasons that differ only in the joint's name are merged."""
     joints: dict[str, list[Joint]] = {}
     own = {joint: _of_it(why.replace(joint.title, "It").replace(str(joint), "it")) for joint, why in failures}
     for joint, why in own.items():
@@ -304,7 +306,7 @@ def by_reason(failures: Iterable[tuple[Joint, str]]) -> dict[str, list[Joint]]:
 
 
 def _of_it(why: str) -> str:
-    """The reason without the name in front of a colon: "It: reading failed" becomes "Reading failed"."""
+    """Return the reason without the name before a colon: "It: reading failed" becomes "Reading failed"."""
     rest = why.removeprefix("It: ")
     return rest[:1].upper() + rest[1:]
 

@@ -49,13 +49,14 @@ class TorqueSwitch:
         return self._servos
 
     def _silent(self) -> set[Joint]:
-        """The servos that did not answer when they were asked last."""
+        """Return the servos that did not answer the last request."""
         return set()
 
     def refuse_switched_on(self) -> None:
-        """Check that torque is still off, after this program has found it off or switched it off.
+        """Check that torque is still off after this program has found it off or switched it off.
 
-        If it is on, another program has switched it on: torque is cut on all servos. Raises BusShared, or TorqueNotOff.
+        If it is on, another program has switched it on; torque is then cut on all servos. Raises BusShared or
+        TorqueNotOff.
         """
         if not (found := switched_on(self._servos)):
             return
@@ -84,7 +85,7 @@ class TorqueSwitch:
 
     @contextmanager
     def torque(self, watchdog: float) -> Iterator[None]:
-        """Switch torque on for the block and off afterwards, however the block is left.
+        """Switch torque on for the block and off afterwards, however the block exits.
 
         watchdog: time without packets after which a servo stops by itself [s] (in steps of 20 ms, at most 2.54 s).
         Raises BusShared if another program has switched torque on; TorqueNotOff on exit if torque off could not be
@@ -129,7 +130,7 @@ class TorqueSwitch:
                 raise
 
     def torque_off(self) -> TorqueOff:
-        """Cut torque on every servo and read it back (`hil.drivers.torque.off`). All servos are tried, whatever fails.
+        """Cut torque on every servo and read it back (`hil.drivers.torque.off`), even if some servos fail.
 
         Signals are held back meanwhile; an interrupt that still arrives is raised once all servos have been tried and
         `torque_off_report` is set.
@@ -152,7 +153,7 @@ class TorqueSwitch:
     def shorten_watchdogs(self, seconds: float) -> None:
         """Shorten the armed Bus Watchdogs to `seconds` [s], if they are longer, until torque is off.
 
-        Nothing is read back: a servo that misses the packet keeps its former time.
+        Nothing is read back: a servo that misses the packet keeps its previous timeout.
         """
         if seconds < self._watchdog:
             tell_watchdogs(self.port, {drive: self._servos[drive] for drive in self._armed}, seconds)
@@ -163,13 +164,13 @@ class TorqueSwitch:
             tell_torque_off(self.port, self._servos)
 
     def torque_now(self) -> dict[Joint, bool | None]:
-        """Read whether each servo's torque is on, except for those reported as unconfirmed; None if it is unknown."""
+        """Read whether each servo's torque is on, except those reported as unconfirmed; None if unknown."""
         report = self.torque_off_report
         unconfirmed = set() if report is None else {joint for joint, _ in report.unconfirmed}
         return {joint: is_torque_on(servo) for joint, servo in self._servos.items() if joint not in unconfirmed}
 
     def has_torque(self) -> bool:
-        """Read whether torque is on at every servo, outside the control cycle; False if one does not answer."""
+        """Read, outside the control cycle, whether torque is on at all servos; False if one does not answer."""
         return all(is_torque_on(servo) for servo in self._servos.values())
 
     def cut_foreign_torque(self, on: Collection[Joint]) -> None:
@@ -181,7 +182,7 @@ class TorqueSwitch:
             raise interrupts[0]
 
     def report_driven(self, on: Collection[Joint], silent: Collection[Joint]) -> None:
-        """Let `torque_off_report` say that another program keeps torque on (`TorqueOff.with_driven`)."""
+        """Record in `torque_off_report` that another program keeps torque on (`TorqueOff.with_driven`)."""
         report = self.torque_off_report or TorqueOff(tuple(self._servos), ())
         self.torque_off_report = report.with_driven(on, silent)
 
@@ -202,7 +203,7 @@ class TorqueSwitch:
     def _fault(self, drive: Joint, *, alone: bool = True) -> str:
         """Return the fault of one servo as text, or "" if it reports none and may not be the one that raised the alert.
 
-        alone: the joint has no other servo, so the alert is certainly this one's.
+        alone: whether it is the joint's only servo, in which case the alert is certainly its own.
         """
         try:
             error = self._servos[drive].hardware_error()

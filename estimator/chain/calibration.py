@@ -1,6 +1,6 @@
 """Torque constants of a spatial arm from a known mass: one fit to two settled periods, without and with the mass.
 
-A single recording only determines the ratios of the torque constants. A known mass on a link changes the base
+A single recording determines only the ratios of the torque constants. A known mass on a link changes the base
 parameters by amounts known in kilograms and metres. In units of the first joint's assumed torque constant, this change
 appears multiplied by the ratio of assumed to true constant, which is a parameter of the fit (`ADDED_MASS`).
 """
@@ -21,18 +21,16 @@ from hil.estimator.errors import ModelError
 
 @dataclass(frozen=True)
 class MassOnLink:
-    """A mass bolted to a link, compact enough that its inertia about its own centre can be taken as equal in all
-    directions.
-    """
+    """A mass bolted to a link, compact enough that its inertia about its centre of mass is practically isotropic."""
 
     mass: float
     """Mass [kg]."""
     at: tuple[float, float, float]
-    """Centre of this mass in the link's frame [m]."""
+    """Position of its centre of mass in the link's frame [m]."""
     link: int
     """Index of the joint that moves the link, from 0."""
     inertia: float = 0.0
-    """Inertia about its own centre [kg m^2]."""
+    """Inertia about its centre of mass [kg m^2]."""
 
     def added(self, base: BaseParameters) -> Array:
         """Return the change in the base parameters (base parameters,) [SI]; raises ModelError for impossible values."""
@@ -70,7 +68,7 @@ class ChainCalibration:
 
     @property
     def misfit(self) -> float:
-        """Mean square of both runs' residuals, each divided by the noise of its run; 1 for noise alone."""
+        """Mean square of both runs' residuals, each relative to its run's noise; 1 for noise alone."""
         return float(np.mean((self.residual_steps / self.noise_steps) ** 2))
 
 

@@ -1,6 +1,6 @@
 """Choice of a spatial arm's model: terms are added as long as the recording supports them.
 
-Torque scales are not chosen in this way: they belong to the model if the torque constants are uncertain.
+Torque scales are not chosen this way: they belong to the model whenever the torque constants are uncertain.
 """
 
 import time
@@ -19,7 +19,7 @@ from hil.estimator.errors import ConvergenceError
 
 @dataclass(frozen=True)
 class ChoiceOptions:
-    """Options of the choice among models."""
+    """Options for model selection."""
 
     significance: float = 1e-3
     """Significance level at which a term is kept (likelihood ratio, corrected for the residual's correlation)."""
@@ -30,7 +30,7 @@ OPTIONS = ChoiceOptions()
 
 @dataclass(frozen=True)
 class ChainTrial:
-    """One model that was tried."""
+    """A model that was tried, and its fit."""
 
     model: ChainModel
     estimate: ChainEstimate | None
@@ -46,14 +46,14 @@ class ChainTrial:
 
 @dataclass(frozen=True)
 class ChainChoice:
-    """The best-supported estimate, and the models that were tried, in order; the first is the simplest."""
+    """The best-supported estimate, and all models tried, in order, the simplest first."""
 
     estimate: ChainEstimate
     trials: tuple[ChainTrial, ...]
 
     @property
     def gained(self) -> float:
-        """Ratio of the simplest model's error to the chosen one's."""
+        """Ratio of the simplest model's error to that of the chosen model."""
         return self.trials[0].error / ChainTrial(self.estimate.model, self.estimate, 0.0).error
 
 
@@ -100,9 +100,9 @@ def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, 
 
 
 def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) -> float:
-    """Return the increase of twice the log likelihood beyond that due to chance; each joint's noise level is unknown.
+    """Return the increase of twice the log likelihood beyond what chance explains; each joint's noise level is unknown.
 
-    The residual's correlation is that of the richer model: what the simpler one leaves out is not noise.
+    The residual's correlation is taken from the richer model: what the simpler one omits is not noise.
     """
     before, after = (np.nansum(np.square(each.residual), axis=1) for each in (simple, rich))
     samples = np.isfinite(simple.residual).sum(axis=1)

@@ -9,11 +9,11 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.models.conflicts import Conflict, Source, conflict, worst_first
 
 DRIVES = ("back_emf", "lag_ratio")
-"""Drive terms whose typical values are known beforehand; the other terms of `SHAPES` may well be zero."""
+"""Drive terms whose typical values are known beforehand; the other terms of `SHAPES` may be zero."""
 
 
 def chain_conflicts(names: tuple[str, ...], value: Array, std: Array, prior: Prior) -> tuple[Conflict, ...]:
-    """Return the contradictions among the parameters `names`, worst first; `names` begins with the base parameters."""
+    """Return the parameters that contradict prior knowledge, worst first; `names` begins with the base parameters."""
     precision = prior.scale_precision
     scales = np.empty(0) if precision is None else np.sqrt(np.diag(linalg.inv(precision)))
     found: list[Conflict | None] = []

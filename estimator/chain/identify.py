@@ -28,8 +28,8 @@ this value.
 """
 
 SYSTEMATIC = 1.1
-"""The residual contains a model error rather than noise if a base parameter's standard error is more than this multiple
-of that under white noise.
+"""The residual contains a model error rather than noise if the ratio of a base parameter's standard error to that under
+white noise exceeds this value.
 
 The ratio is 0.6 to 0.9 for encoder rounding and noise. Torque ripple of 0.2 %, or load-dependent friction of 0.3 % of
 the torque, raises it to 2 or 3, while the residual still exceeds the noise by less than a tenth. With a noisy encoder,
@@ -37,8 +37,8 @@ load-dependent friction of one joint raises it to 1.5 or more.
 """
 
 SIGNIFICANCE, LARGE_ZERO = 1e-3, 0.005
-"""Significance level for errors of fixed encoder zeros, and the smallest error that is reported [rad]: three encoder
-steps, less than the usual error of an adjusted zero.
+"""Significance level for errors of fixed encoder zeros, and the smallest reported error [rad]: three encoder steps,
+less than the usual error of an adjusted zero.
 """
 
 BELIEVED = 0.5  # standard errors under white noise above this fraction of the prior's: values come from the prior
@@ -59,7 +59,7 @@ class ChainEstimate(FittedParameters):
     outliers: int
     correlation_time: float
     systematic: float
-    """Median ratio of the base parameters' standard errors to those under white noise: how far model errors exceed
+    """Largest ratio of the base parameters' standard errors to those under white noise: how far model errors exceed
     noise at the frequencies that determine the parameters.
     """
     softness: float
@@ -71,8 +71,8 @@ class ChainEstimate(FittedParameters):
     unseen: tuple[str, ...]
     """Encoder zero errors and base tilts that the data barely constrain, which are therefore taken as zero."""
     doubtful_zeros: tuple[tuple[int, float], ...]
-    """Joints, from 1, whose encoder zeros the model holds fixed although the recording contradicts them, and their
-    errors (true minus measured angle) [rad]. Empty if they were not tested.
+    """Joints, from 1, whose encoder zeros the model holds fixed although the recording contradicts them, each with its
+    zero error (true minus measured angle) [rad]. Empty if not tested.
     """
     noise_steps: Array
     """Noise of one sample of each angle, encoder rounding included (joints,) [encoder steps]; rounding alone is 0.2887.
@@ -80,7 +80,7 @@ class ChainEstimate(FittedParameters):
     at_bound: tuple[str, ...] = ()
     """Parameters at a bound although the data favour values beyond it; empty unless this affects base parameters."""
     conflicts: tuple[Conflict, ...] = ()
-    """Values far from what was known beforehand, the largest contradiction first."""
+    """Values that contradict prior knowledge, worst first."""
 
     @property
     def over_noise(self) -> Array:
@@ -102,7 +102,7 @@ def identify_chain(
     *,
     test_zeros: bool = False,
 ) -> ChainEstimate:
-    """Estimate the parameters of `model` from settled periods: regression on their lines, then maximum likelihood.
+    """Estimate the parameters of `model` from settled periods by regression, then maximum likelihood.
 
     `prior` supplies what the data barely constrain (`ChainEstimate.from_prior`). `added`: see `fit_lines`; for a
     model with `added_mass`. test_zeros: whether to test the encoder zeros that `model` holds fixed
@@ -153,10 +153,10 @@ def identify_chain(
 
 
 def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int, float], ...]:
-    """Return the joints, from 1, whose fixed zeros are significantly off, and by more than LARGE_ZERO.
+    """Return the joints, from 1, whose fixed zeros are off significantly and by more than LARGE_ZERO, and their errors.
 
-    A model error that widens the standard errors by the factor `systematic` can mimic errors of zeros, so it raises
-    the threshold.
+    A model error that widens the standard errors by the factor `systematic` can mimic zero errors, so it raises the
+    threshold.
     """
     if held is None or held.gain <= max(systematic, 1.0) ** 2 * float(chdtri(held.shift.size, SIGNIFICANCE)):
         return ()
@@ -164,9 +164,9 @@ def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int
 
 
 def largest_ratio(one: Array, other: Array) -> float:
-    """Return the largest element-by-element ratio of two vectors of standard errors; infinite if no element is finite.
+    """Return the largest element-by-element ratio of two vectors of standard errors; infinite if no pair is finite.
 
-    The largest ratio is used, not the median, because an effect that the model lacks may act in one joint alone.
+    The largest ratio is used, not the median, because an unmodelled effect may act on only one joint.
     """
     known = np.isfinite(one) & np.isfinite(other)
     return float(np.max(one[known] / other[known])) if known.any() else np.inf
@@ -180,9 +180,10 @@ def _best_fit(
     options: ChainOptions,
     added: Sequence[Array | None],
 ) -> ChainFit:
-    """Fit; while the motion is not explained, fit again from narrower Coulomb steps and keep the best minimum.
+    """Fit; while the motion remains unexplained, refit from narrower Coulomb steps and keep the best minimum.
 
-    Where a joint often turns or sticks, the sum of squares has several minima in the shape of its friction.
+    If a joint often reverses or sticks, the sum of squares has several minima with respect to the shape of its
+    friction.
     """
     best = fit_periods(periods, model, linear, prior, options, added)
     widths = np.array([kind_of(name) == "coulomb_width" for name in model.names])

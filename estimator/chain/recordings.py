@@ -1,4 +1,4 @@
-"""Chains estimated from recordings of arbitrary motion, from any experiment: no settled period is needed.
+"""Estimation of chains from recordings of arbitrary motion; no settled period is needed.
 
 Stage 1 is filtered inverse dynamics. Stage 2 is the same likelihood as for settled periods: its observer needs no
 periodic motion, only torque that was commanded. A measured torque already responds to the motion, so a simulation
@@ -33,7 +33,7 @@ VELOCITY_SAMPLES = 9  # at the beginning, from which the initial velocity is tak
 
 @dataclass(frozen=True)
 class MotionPiece(SettledPeriod):
-    """A recording sampled at equal intervals, for the likelihood of settled periods. Its motion need not be periodic.
+    """A recording resampled at equal intervals for the likelihood of settled periods; its motion need not be periodic.
 
     The torque before the first sample is assumed to be that of the last sample; the initial state absorbs the error.
     """
@@ -73,7 +73,7 @@ class RecordedChain:
     value: Array
     covariance: Array
     simulated: bool
-    """Whether stage 2 was used; False if only the regression was, because the torque was measured."""
+    """Whether stage 2 was used; False if only the regression was used because the torque was measured."""
     residual_over_noise: Array
     """RMS of the one-step-ahead residual relative to the noise of the angles (joints,); NaN for a regression."""
     residual: Array
@@ -87,12 +87,12 @@ class RecordedChain:
     from_prior: tuple[str, ...]
     """Base parameters that the data barely constrain."""
     reached: bool = True
-    """Whether the fit has reached its minimum; always so for a regression."""
+    """Whether the fit has reached its minimum; always True for a regression."""
     systematic: float = 1.0
-    """Median ratio of the base parameters' standard errors to those under white noise; 1 for a regression."""
+    """Largest ratio of the base parameters' standard errors to those under white noise; 1 for a regression."""
     at_bound: tuple[str, ...] = ()
     conflicts: tuple[Conflict, ...] = ()
-    """Values far from what was known beforehand, the largest contradiction first."""
+    """Values that contradict prior knowledge, worst first."""
 
     @property
     def std(self) -> Array:
@@ -114,7 +114,7 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
     """
     for recording in recordings:
         if recording.joints != model.joints:
-            raise ModelError(f"the model has {model.joints} joints and a recording {recording.joints}: they must agree")
+            raise ModelError(f"the model has {model.joints} joints but a recording has {recording.joints}")
     value, std, cutoff = _regression(recordings, model, prior)
     left = _torque_residual(recordings, model, value, cutoff)
     count = model.base.count
@@ -202,7 +202,7 @@ def _torque_residual(recordings: Sequence[Recording], model: ChainModel, value: 
 
 
 def _beginning(piece: MotionPiece) -> PeriodicMotion:
-    """Return the motion, with velocities from smoothed angles; only those at its beginning and their RMS matter."""
+    """Return the motion, with velocities from smoothed angles; only its initial state and RMS velocity are used."""
     position = piece.filled()
     kernel = np.ones(VELOCITY_SAMPLES) / VELOCITY_SAMPLES
     padded = np.pad(position, ((0, 0), (VELOCITY_SAMPLES // 2,) * 2), mode="edge")

@@ -1,8 +1,8 @@
 """Smooth minimisation by limited-memory BFGS (Nocedal and Wright, Numerical Optimization, 2nd ed., algorithm 7.5).
 
-It is implemented here because a seed must give the same wave on every machine. Library implementations use a BLAS whose
-order of summation depends on the processor, and after a few hundred evaluations the torque differs by up to 4e-4 of its
-peak (docs/dependencies.md).
+It is implemented here because a seed must give the same phases on every machine. Library implementations use a BLAS
+whose order of summation depends on the processor, and after a few hundred evaluations the torque differs by up to 4e-4
+of its peak (docs/dependencies.md).
 """
 
 from collections import deque
@@ -18,12 +18,17 @@ Function = Callable[[Array], tuple[float, Array]]
 MEMORY = 20  # steps remembered
 HALVINGS = 20
 ENOUGH = 1e-4  # minimum decrease as a fraction of that predicted by the slope
+GRID = 2.0**-24  # multiple to which each step is rounded
 Pairs = deque[tuple[Array, Array, float]]
 _sum: Callable[[Array], Any] = np.add.reduce  # np.sum takes three times as long for so few numbers
 
 
 def descend(function: Function, x: Array, steps: int) -> Array:
-    """Minimise `function`, which returns value and gradient, in at most `steps` steps from `x`; return the last `x`."""
+    """Minimise `function`, which returns value and gradient, in at most `steps` steps from `x`; return the last `x`.
+
+    Steps are rounded to a grid. Otherwise the last bit of a cosine, which depends on the processor, would make a
+    difference that grows from step to step, until another minimum is found.
+    """
     value, gradient = function(x)
     pairs: Pairs = deque(maxlen=MEMORY)
     for _ in range(steps):
@@ -31,18 +36,23 @@ def descend(function: Function, x: Array, steps: int) -> Array:
         slope = float(_sum(gradient * direction))
         length = 1.0 if pairs else 1.0 / max(1.0, float(np.sqrt(_sum(gradient**2))))
         for _ in range(HALVINGS):
-            there, gradient_there = function(x + length * direction)
+            reached = _on_grid(x + length * direction)
+            there, gradient_there = function(reached)
             if there <= value + ENOUGH * length * slope:
                 break
             length *= 0.5
         else:
             return x
-        moved, turned = length * direction, gradient_there - gradient
+        moved, turned = reached - x, gradient_there - gradient
         curvature = float(_sum(moved * turned))
         if curvature > 0.0:
             pairs.append((moved, turned, 1.0 / curvature))
-        x, value, gradient = x + moved, there, gradient_there
+        x, value, gradient = reached, there, gradient_there
     return x
+
+
+def _on_grid(x: Array) -> Array:
+    return np.asarray(np.rint(x / GRID) * GRID)
 
 
 def _direction(gradient: Array, pairs: Pairs) -> Array:

@@ -121,7 +121,7 @@ class TorqueChange:
 
     @property
     def is_seen(self) -> Mask:
-        """Whether each joint's torque changed significantly and noticeably (joints,)."""
+        """Whether each joint's torque changed significantly, and by enough to matter (joints,)."""
         seen: Mask = (np.abs(self.change) > 3.0 * self.std) & (np.abs(self.change) > self.noticed)
         return seen
 

@@ -102,7 +102,7 @@ class Stabilised:
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
-    """Return the physics with the lag reduced by `command_to_sample` [s], by which commands take effect earlier."""
+    """Return the physics with the lag reduced by `command_to_sample` [s], the time by which commands act earlier."""
     return replace(physics, lag=max(physics.lag - command_to_sample, 1e-5))
 
 

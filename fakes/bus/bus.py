@@ -3,8 +3,8 @@
 Bytes take wire time (ten bits each). A packet takes effect when its last byte arrives: the plant is advanced to that
 moment with the previous motor currents, then the addressed servos act. Replies start after the servo's return delay and
 reach the host `adapter_latency_us` later. When the host writes, everything up to the last packet of that write is
-computed, even if it lies ahead of the clock. Between two packets only Bus Watchdogs, the servos' own loops and faults
-can act, and the plant's advance is split at the moments when they do.
+computed, even if it lies ahead of the clock. Between two packets, only Bus Watchdogs, the servos' own loops and faults
+can act; the plant's advance is split at those times.
 
 When host and servo, or two servos with different IDs, transmit at once, the later packet and the rest of the earlier
 one are lost. Which servos act and reply is decided in `hil.fakes.bus.instructions`.
@@ -61,9 +61,9 @@ class FakeBus:
         self.plant = plant
         self.clock = clock
         self.packets = 0
-        """Number of valid packets that the host has sent."""
+        """Number of valid packets sent by the host."""
         self.pulls = 0
-        """Number of times the adapter's cable was unplugged. A port that was open at the time stays lost."""
+        """Number of times the adapter's cable was unplugged. A port that was open when this happened stays lost."""
         self.cable_is_out = False
         self.pulled_at = -math.inf
         """Time on `clock` at which the cable was last unplugged [s]."""
@@ -90,8 +90,8 @@ class FakeBus:
     def baud(self) -> int:
         """The host's baud rate. Servos set to another rate cannot decode anything and stay silent.
 
-        If it is changed while a reply is being received, the rest arrives as the garbage that a receiver at the wrong
-        rate reads.
+        If it is changed while a reply is being received, the rest arrives as garbage, as read by a receiver at the
+        wrong rate.
         """
         return self._wire.baud
 
@@ -102,7 +102,7 @@ class FakeBus:
 
     @property
     def servos(self) -> dict[int, EmulatedServo]:
-        """The servos by current ID (of several with one ID, the last), in their state at the clock's current time."""
+        """The servos by current ID (the last if several share one), in their state at the clock's current time."""
         self.advance(self.clock.now())
         return {servo.id: servo for servo in self._servos}
 
@@ -183,12 +183,12 @@ class FakeBus:
 
     @property
     def in_waiting(self) -> int:
-        """Number of bytes that have reached the host and have not been read."""
+        """Number of bytes that have reached the host but have not been read."""
         return self._wire.count_by(self.clock.now())
 
     @property
     def on_the_way(self) -> int:
-        """Number of bytes that have reached the host or will do so without a further write."""
+        """Number of bytes that have reached the host or will reach it without another write."""
         return self._wire.on_the_way
 
     @property
@@ -211,7 +211,7 @@ class FakeBus:
     # Time
 
     def notice_faults(self) -> None:
-        """Start and end the faults that are due by the clock."""
+        """Start and end faults that are due by now."""
         now = self.clock.now()
         if now - self._origin >= self.faults.next_change:
             self.advance(now)
@@ -237,7 +237,7 @@ class FakeBus:
             self._move_plant(until)
 
     def _advance_by_events(self, until: float) -> None:
-        """Stop at each tick, fault and watchdog trip, so that the plant sees the effect from that moment on."""
+        """Advance, stopping at each tick, fault and watchdog trip so that it affects the plant from then on."""
         while self._now < until:
             counting = [servo for servo in self._servos if servo.watchdog_s]
             trip = min((servo.heard_at + servo.watchdog_s for servo in counting), default=math.inf)
@@ -272,7 +272,7 @@ class FakeBus:
         self._now = until
 
     def _servo_changed(self) -> None:
-        """Update routing and ticking after a servo has changed its ID or its need for ticks."""
+        """Update routing and ticking after a servo's ID or need for ticks has changed."""
         self._instructions.route()
         self._ticks_wanted()
 
@@ -317,7 +317,7 @@ class FakeBus:
             self._instructions.receive(packet, now)
 
     def _receive_with_faults(self, packet: Packet, now: float) -> None:
-        """Act like `_receive`; a fault of one servo makes it miss every packet, including those to all servos."""
+        """Receive a packet under faults; a fault of one servo makes it miss every packet, even those to all servos."""
         deaf: set[int] = set()
         for fault in self.faults.on_instructions:
             if not self.faults.strikes(fault, packet.id if fault.servo is None else fault.servo, now - self._origin):
@@ -383,7 +383,7 @@ class FakeBus:
         return bool(self.faults.on_answers)
 
     def fault_error(self, servo: EmulatedServo, now: float) -> int:
-        """Return the ERR byte that an active fault makes this servo answer with; 0 without a fault."""
+        """Return the ERR byte with which an active fault makes this servo answer; 0 without a fault."""
         return self.faults.error(servo.id, now - self._origin)
 
     def count_collision(self) -> None:

@@ -1,11 +1,10 @@
-"""Virtual time: the clock of a fake arm, if nothing outside the process depends on it."""
+"""Virtual time: the clock of a fake arm that nothing outside the process depends on."""
 
 
 class VirtualClock:
     """A `hil.drivers.clock.Clock` that stands still while the program computes and jumps when it waits.
 
-    A run on it is deterministic and as fast as the program: twenty seconds of virtual time take only as long as it
-    takes to compute the bytes sent and the plant's motion in that time.
+    A run on this clock is deterministic and takes only as long as computing the bytes sent and the plant's motion.
     """
 
     def __init__(self, start: float = 0.0) -> None:

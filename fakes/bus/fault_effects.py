@@ -58,7 +58,7 @@ def end(fault: Fault, servos: Sequence[EmulatedServo], joints: Sequence[int], pl
 def put_with_faults(faults: Faults, wire: "Wire", servo_id: int, data: bytes, start: float, now: float) -> float:
     """Put a reply on the wire as modified by the active faults; return the time at which the transmission ends.
 
-    start, now: start of the transmission on the clock, and the same moment since the bus was created [s].
+    start, now: time at which the transmission starts, by the clock and since the bus was created [s].
     """
     late_s = 0.0
     copies = 1
@@ -100,5 +100,5 @@ def _flipped(data: bytes, bits: Sequence[int]) -> bytes:
 def jam(plant: Plant, joint: int, *, jammed: bool) -> None:
     """Block a joint or release it; raises PlantError if the plant does not support this."""
     if not isinstance(plant, CanJam):
-        raise PlantError(f"{type(plant).__name__} has no jam(joint, jammed): the fault stuck_joint needs it")
+        raise PlantError(f"{type(plant).__name__} has no jam(joint, jammed), needed by the fault stuck_joint")
     plant.jam(joint, jammed)

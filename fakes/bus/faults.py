@@ -1,12 +1,12 @@
-"""Faults of a fake bus: what can go wrong in cable, adapter, servos and joints, scheduled and seeded.
+"""Scheduled, seeded faults of a fake bus, in its cable, adapter, servos and joints.
 
     bus.faults.add(Fault(kind="lost_reply", servo=2, at=3.0, duration=0.5, probability=0.2))
 
 Faults can also be given in TOML, as `[[fake.faults]]` with the same keys, and on the command line, as `--fault
 lost_reply:servo=2,at=3`. `FAULTS` describes each kind. Times are seconds since the bus was created (`bus.time`).
 
-Faults of packets (replies, instructions, noise) affect each packet with the given probability while they last. Any
-other fault happens at most once, at its time, with the given probability. The same seed gives the same faults.
+Packet faults (replies, instructions, noise) affect each packet with the given probability while they last. Any other
+fault occurs at most once, at its time, with the given probability. The same seed yields the same faults.
 """
 
 import difflib
@@ -69,7 +69,7 @@ FAULTS: Mapping[FaultKind, FaultFacts] = {
     FaultKind.CORRUPTED_REPLY: FaultFacts("bits of a status packet are flipped", "bits", 1),
     FaultKind.TRUNCATED_REPLY: FaultFacts("a status packet ends early"),
     FaultKind.DUPLICATED_REPLY: FaultFacts("a status packet arrives twice"),
-    FaultKind.LATE_REPLY: FaultFacts("the adapter delays a status packet and with it all later bytes", "seconds", 0.02),
+    FaultKind.LATE_REPLY: FaultFacts("the adapter delays a status packet and all bytes after it", "seconds", 0.02),
     FaultKind.NOISE: FaultFacts("random bytes precede a status packet", "bytes", 8),
     FaultKind.LOST_INSTRUCTION: FaultFacts("an instruction packet is lost on its way to one servo, or to all servos"),
     FaultKind.CORRUPTED_INSTRUCTION: FaultFacts(
@@ -111,12 +111,10 @@ _LEAST_REPEAT_S = 1e-3
 
 
 class Fault(Described):
-    """One injected fault, immutable. `servo` is the servo's bus ID when the fault begins; None means all servos."""
+    """One injected fault (immutable). `servo` is the servo's bus ID when the fault begins; None means all servos."""
 
     kind: Annotated[FaultKind, Field(strict=False, description="kind of fault; see FAULTS")]
-    at: Annotated[
-        float, Field(ge=0, allow_inf_nan=False, description="when it begins [s since the bus was created]")
-    ] = 0.0
+    at: Annotated[float, Field(ge=0, allow_inf_nan=False, description="start time [s since the bus was created]")] = 0.0
     duration: Annotated[float, Field(gt=0, description="duration [s]; unlimited by default")] = math.inf
     servo: Annotated[int | None, Field(ge=0, le=252, description="bus ID of the servo; all servos by default")] = None
     probability: Annotated[
@@ -129,7 +127,7 @@ class Fault(Described):
 
     @property
     def end(self) -> float:
-        """Time at which it ends [s since the bus was created]."""
+        """Time at which the fault ends [s since the bus was created]."""
         return self.at + self.duration
 
     @property
@@ -139,7 +137,7 @@ class Fault(Described):
 
     @property
     def repeats_every(self) -> float:
-        """Period with which it recurs while it lasts [s]; infinite for a fault that happens once."""
+        """Period with which the fault recurs [s]; infinite for a fault that happens once."""
         return max(self.size, _LEAST_REPEAT_S) if self.kind is FaultKind.OTHER_MASTER else math.inf
 
     def concerns(self, servo_id: int) -> bool:
@@ -176,7 +174,7 @@ class Faults:
         self._repeats: list[tuple[float, Fault]] = []
 
     def add(self, *faults: Fault) -> None:
-        """Add faults. One whose time has passed begins immediately."""
+        """Add faults; those whose start time has passed begin immediately."""
         self._to_come.extend(faults)
         self._look_ahead()
 
@@ -189,7 +187,7 @@ class Faults:
 
     @property
     def lasting(self) -> tuple[Fault, ...]:
-        """The faults that have begun but not ended."""
+        """The faults that have begun but not yet ended."""
         return tuple(self._lasting)
 
     def change(self, now: float) -> None:

@@ -7,8 +7,8 @@
 Moves can also be given in TOML, as `[[fake.moves]]` with the same keys, on the command line, as `--move 2:to=0.5,at=4`,
 and while a fake terminal is being served, with `hil hand /tmp/arm 2:to=0.5`.
 
-The hand overcomes friction and gravity but never opposes motor torque: it releases a joint as soon as the torque of one
-of its servos comes on, and does not grip a joint whose torque is on.
+The hand overcomes friction and gravity but never opposes motor torque: it does not grip a joint whose torque is on, and
+releases a joint as soon as one of its servos switches torque on.
 """
 
 import math
@@ -30,7 +30,7 @@ _PULL_S = 0.01
 
 
 class Move(Described):
-    """One movement of the hand, after which it holds the joint for `hold` seconds, indefinitely by default."""
+    """One movement of the hand, after which it holds the joint for `hold` seconds; by default, indefinitely."""
 
     servo: Annotated[int, Field(ge=0, le=252, description="bus ID of one of the joint's servos")]
     to: Annotated[
@@ -38,7 +38,7 @@ class Move(Described):
         Field(ge=-4 * math.pi, le=4 * math.pi, allow_inf_nan=False, description="joint angle at the end [rad]"),
     ] = None
     ticks: Annotated[int | None, Field(description="Present Position at the end, instead of `to`")] = None
-    at: Annotated[float, Field(ge=0, le=86400, allow_inf_nan=False, description="delay before it starts [s]")] = 0.0
+    at: Annotated[float, Field(ge=0, le=86400, allow_inf_nan=False, description="delay before the start [s]")] = 0.0
     duration: Annotated[float, Field(gt=0, le=600, allow_inf_nan=False, description="duration of the movement [s]")] = (
         1.0
     )
@@ -73,8 +73,7 @@ class _Grip:
 class Hand:
     """The hand of one bus. Times are in seconds since the bus was created.
 
-    tell: called whenever a move, a grip or a release may have changed `busy`: while busy, the hand needs the bus's
-    ticks.
+    tell: called whenever a move, grip or release may have changed `busy`: while busy, the hand needs the bus's ticks.
     """
 
     def __init__(self, joints: Joints, plant: Plant, time: Callable[[], float], tell: Callable[[], None]) -> None:
@@ -104,7 +103,7 @@ class Hand:
         free = {self._joint_of(move) for move in moves} - self._grips.keys()
         if moves and not isinstance(self._plant, CanBeHeld):
             raise PlantError(
-                f"{type(self._plant).__name__} has no hold(joint, velocity): moving a joint by hand needs it"
+                f"{type(self._plant).__name__} has no hold(joint, velocity), needed to move a joint by hand"
             )
         for joint in free:
             self._hold(joint, None)  # a custom plant that cannot be held is refused now, not in the middle of a run
@@ -121,7 +120,7 @@ class Hand:
         self._tell()
 
     def tick(self, now: float) -> None:
-        """Start moves that are due, and move the joints that are held; called once per period of the servos' loops.
+        """Start moves that are due, and move the joints in hand; called once per period of the servos' loops.
 
         now: time since the bus was created [s].
         """

@@ -1,7 +1,7 @@
 """Which servos act on an instruction packet, which reply, and in which order.
 
-docs/fake-bus.md, "Conformance", states what is chosen where the manual is silent. In a group read each servo waits for
-the whole status of the one listed before it (source: ROBOTIS in DynamixelSDK issue 364).
+"Conformance" in docs/fake-bus.md lists the choices made where the manual is silent. In a group read, each servo waits
+for the complete status of the one listed before it (source: ROBOTIS in DynamixelSDK issue 364).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,11 +25,11 @@ from hil.fakes.servo.backup import RESET_ALL
 from hil.fakes.servo.servo import EmulatedServo
 
 Part = tuple[int, int, int]
-"""The part of a group read that concerns one servo: its ID, and the address and number of the bytes to read."""
+"""One servo's part of a group read: its ID, and the address and number of bytes to read."""
 
 
 class Line(Protocol):
-    """Interface of the bus as the servos need it, implemented by `hil.fakes.bus.bus.FakeBus`."""
+    """Interface of the bus to the servos, implemented by `hil.fakes.bus.bus.FakeBus`."""
 
     @property
     def baud(self) -> int: ...
@@ -57,7 +57,7 @@ class Line(Protocol):
         ...
 
     def fault_error(self, servo: EmulatedServo, now: float) -> int:
-        """Return the ERR byte that an active fault makes this servo answer with.
+        """Return the ERR byte with which an active fault makes this servo answer.
 
         If its error number (without the Alert bit) is not 0, the servo does not execute the instruction.
         """
@@ -67,7 +67,7 @@ class Line(Protocol):
 
 
 class Instructions:
-    """The servos on a line as receivers of packets. `route` must be called whenever an ID has changed."""
+    """How the servos on a line act on packets. `route` must be called whenever an ID has changed."""
 
     def __init__(self, servos: Sequence[EmulatedServo], line: Line) -> None:
         self._servos = tuple(servos)
@@ -152,7 +152,7 @@ class Instructions:
         self._line.send(self._overlaid(answers), now)
 
     def _overlaid(self, answers: list[Reply]) -> list[Reply]:
-        """Return what the line carries, piece by piece, when servos with the same ID answer."""
+        """Return the pieces of data on the line when servos with the same ID answer."""
         if len(answers) < 2:
             return answers
         baud, end, pieces = self._line.baud, 0, []
@@ -265,7 +265,7 @@ class Instructions:
         self._line.send(replies, now)
 
     def _fast_read(self, parts: Sequence[Part], now: float) -> None:
-        """Send one packet from all servos, to which each appends its part and a CRC over everything so far."""
+        """Send one packet from all servos; each appends its part and a CRC over everything so far."""
         size = 1 + sum(length + 4 for _, _, length in parts)
         if not parts or size > MAX_LENGTH:
             return

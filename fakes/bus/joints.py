@@ -1,8 +1,8 @@
-"""Assignment of servos to joints: usually one each, or two if a joint is driven by a pair.
+"""Assignment of servos to joints: usually one per joint, or two if a pair drives it.
 
-Two servos on one joint share its angle; the plant receives the sum of their motor currents. Each of them measures the
-current it commands, plus its share of the difference between the plant's current and the total command. This difference
-is due to the current loop's lag.
+Two servos on one joint share its angle; the plant receives the sum of their motor currents. Each servo measures the
+current it commands plus its share of the difference between the plant's current and the total command, which is due to
+the lag of the current loop.
 """
 
 from collections.abc import Sequence

@@ -19,13 +19,13 @@ _packet = partial(tuple.__new__, Packet)  # half the time of Packet(...)
 
 
 class Receiver:
-    """Finds packets as `hil.drivers.packet.Framer(damaged=True)` does, with a fast path for complete, valid ones."""
+    """Finds packets like `hil.drivers.packet.Framer(damaged=True)`, with a fast path for complete, valid ones."""
 
     def __init__(self) -> None:
         self._framer = Framer(damaged=True)
         self._length = 0
         self._asked: dict[bytes, Packet] = {}
-        """Cache of group reads by their bytes: a host sends the same ones again and again."""
+        """Cache of group reads by their bytes: a host sends the same ones repeatedly."""
 
     def feed(self, data: bytes) -> list[tuple[Packet, int]]:
         """Take bytes as they arrive; return each complete packet and the number of bytes that follow it."""
@@ -43,7 +43,7 @@ class Receiver:
 
     @property
     def pending(self) -> int:
-        """Number of buffered bytes: received, but neither returned as a packet nor dropped as noise."""
+        """Number of received bytes neither returned in a packet nor dropped as noise yet."""
         return self._framer.pending
 
     @property
@@ -56,7 +56,7 @@ class Receiver:
         self._framer.reset()
 
     def _whole(self, data: bytes, at: int, size: int) -> Packet | None:
-        """Return the packet that begins at `at` and set `_length`; None unless it is complete and undamaged."""
+        """Return the packet that begins at `at` and set `_length`; None if it is incomplete or damaged."""
         if size < at + 10:
             return None
         header, packet_id, length, instruction = _FRONT.unpack_from(data, at)

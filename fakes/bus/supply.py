@@ -1,4 +1,4 @@
-"""One supply for all servos: its voltage sags under their currents, and a servo reboots when it is too low."""
+"""One supply for all servos: its voltage sags under load, and servos reboot when it is too low."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -16,7 +16,7 @@ class Supply(Described):
     brownout_v: Annotated[float, Field(ge=0, le=100, description="voltage below which a servo reboots [V]")] = 0.0
 
     def load(self, servos: Sequence[EmulatedServo], current: Sequence[float], now: float) -> None:
-        """Set every servo's supply voltage under these motor currents [A]. now: bus time [s].
+        """Set every servo's supply voltage for these motor currents [A]. now: bus time [s].
 
         A servo draws its motor current times the duty cycle of its bridge from the supply.
         """

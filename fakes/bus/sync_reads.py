@@ -1,8 +1,8 @@
 """Precomputed group reads of the control cycle.
 
-These read Present Current, Velocity and Position of several servos, or registers that hold no measurements, such as
-goals. They return the same bytes as the general path in `hil.fakes.bus.instructions`, in half the time; a fake bus
-spends most of its time here.
+They read Present Current, Velocity and Position of several servos, or registers without measurements, such as goals.
+They return the same bytes as the general path in `hil.fakes.bus.instructions` in half the time; a fake bus spends most
+of its time here.
 """
 
 import functools
@@ -43,7 +43,7 @@ class _Part(NamedTuple):
 
 
 class _Request(NamedTuple):
-    """A request with its servos. parts: empty if it needs the general path."""
+    """A request and its servos. parts: empty if the request needs the general path."""
 
     parts: tuple[_Part, ...]
     address: int
@@ -53,7 +53,7 @@ class _Request(NamedTuple):
 
 
 class GroupReads:
-    """Cache of the requests received, each with its servos. `forget` must be called whenever an ID has changed."""
+    """Cache of received requests and their servos. `forget` must be called whenever an ID has changed."""
 
     def __init__(self, servos: Sequence[EmulatedServo], joints: JointStates) -> None:
         self._servos = tuple(servos)
@@ -99,7 +99,7 @@ class GroupReads:
         return replies
 
     def _told(self, request: _Request, now: float, *, fast: bool = False) -> list[bytes] | None:
-        """Return the registers that each servo answers with; None if the request needs the general path."""
+        """Return the register bytes in each servo's answer; None if the request needs the general path."""
         parts, address, length, is_of_state = request
         if is_of_state:
             positions, velocities, currents = self._joints.joints()
@@ -148,6 +148,6 @@ class GroupReads:
 
 @functools.cache
 def _fast_front(servos: int, length: int) -> bytes:
-    """Beginning of the reply to a fast read of `length` bytes of this many servos: header, ID, LEN, INST."""
+    """Return the beginning of the reply to a fast read of `length` bytes per servo: header, ID, LEN, INST."""
     size = 1 + servos * (length + 4)
     return HEADER + bytes((BROADCAST_ID, size & 0xFF, size >> 8, Instruction.STATUS))

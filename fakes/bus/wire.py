@@ -13,7 +13,7 @@ ROUNDING_S = 1e-9
 
 
 class Arriving(NamedTuple):
-    """Bytes on their way to the host.
+    """Bytes in transit to the host.
 
     first: arrival time of the first byte [s].
     byte_s: time between two bytes [s].
@@ -44,7 +44,7 @@ _arriving = partial(tuple.__new__, Arriving)  # half the time of Arriving(...)
 
 
 class Wire:
-    """Replies in transit, ordered by their arrival at the host, `latency_s` after they were on the wire."""
+    """Replies in transit, ordered by arrival time at the host, which is `latency_s` after transmission."""
 
     def __init__(self, baud: int, latency_s: float) -> None:
         self._set_baud(baud)
@@ -101,7 +101,7 @@ class Wire:
         return end
 
     def echo(self, data: bytes, start: float) -> None:
-        """Echo back to the host the data that it sends from time `start` on."""
+        """Echo the data that the host sends from time `start` on."""
         self._arriving.append(Arriving(data, start + self.byte_s + self._latency_s, self.byte_s))
         self._arriving = deque(sorted(self._arriving, key=lambda segment: segment.first))
 
@@ -142,7 +142,7 @@ class Wire:
 
     @property
     def on_the_way(self) -> int:
-        """Number of bytes that have reached the host or will do so."""
+        """Number of bytes that have reached the host or will reach it."""
         return sum(len(segment.data) for segment in self._arriving)
 
     @property

@@ -1,4 +1,4 @@
-"""The fake arm's physical description: links, drives, and the parameters that an identification should find."""
+"""Physical description of a fake arm: links, drives, and the parameters that identification should find."""
 
 import math
 from typing import Annotated, Self
@@ -70,7 +70,7 @@ class Drive(Described):
     )
     cable_angle: Angle = Field(0.0, description="joint angle at which the cable is slack [rad]")
     ripple: NotNegative = Field(
-        0.0, le=1, description="amplitude of the torque ripple over the angle, as a fraction of the torque"
+        0.0, le=1, description="amplitude of the angle-dependent torque ripple, as a fraction of the torque"
     )
     ripple_cycles: Positive = Field(7.0, description="cycles of torque ripple per turn of the joint")
     cogging: NotNegative = Field(0.0, le=10, description="amplitude of the cogging torque at the output shaft [N m]")
@@ -154,9 +154,9 @@ class Arm(Described):
 def base_parameters(arm: Arm | None, time: float = math.inf) -> dict[str, float]:
     """Return the true base parameters of this arm at `time` [s], with the estimator's names and in its order [SI].
 
-    Empty without an `Arm`, since the parameters of another plant are unknown. Without a time, the drives are warm.
+    Empty if `arm` is None, since the parameters of other plants are unknown. By default, the drives are warm.
 
-    Effects that no base parameter represents are left out: dry friction beyond Coulomb's (Stribeck rise, load),
+    Effects that no base parameter represents are left out: dry friction beyond Coulomb friction (Stribeck rise, load),
     presliding, the current loop's lag, saturation, ripple, cogging, a cable's stiffness, backlash, stops. The `gravity`
     values are those of the tilted plane; an offset includes a cable's torque at angle 0.
     """

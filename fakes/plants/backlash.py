@@ -1,8 +1,8 @@
-"""An arm with gear backlash: each joint consists of a rotor and an output shaft, which touch at the flanks of a gap.
+"""An arm with gear backlash: each joint has a rotor and an output shaft, which are in contact at the ends of a gap.
 
 The rotor (with its inertia times the gear ratio squared) is subject to the motor's torque, all friction and the hard
-stops. The links are attached to the output shafts, as are the servos' encoders. Within the gap no torque is transmitted
-between the two; at a flank the gears act as a spring and a damper that can push but not pull.
+stops. The links are attached to the output shafts, as are the servos' encoders. Within the gap, no torque is
+transmitted between the two; at its ends, the gears act as a spring and a damper that can push but not pull.
 
 The contact is stiff, so the time steps are short: such an arm takes about ten times as long to simulate as one without
 backlash, and longer if its links are very light.
@@ -32,7 +32,7 @@ class GearedArm:
         """Longest time step [s]."""
 
     def _longest_step(self, arm: Arm) -> float:
-        """The longest step [s] with which the stiffest contact between gears and links is integrated stably."""
+        """Return the longest step [s] for which integration is stable at the stiffest contact of gears and links."""
         lightness = self._links.lightness + 1.0 / min(armature(drive) for drive in arm.drives)
         stiffness = max(drive.gear_stiffness for drive in arm.drives)
         damping = max(drive.gear_damping for drive in arm.drives)

@@ -1,4 +1,4 @@
-"""Description of a spatial fake arm: a URDF's links, how the true ones differ from them, and the drives."""
+"""Description of a spatial fake arm: the links of a URDF, how the true links differ, and the drives."""
 
 from pathlib import Path
 from typing import Annotated, Self
@@ -23,7 +23,7 @@ _Place = Annotated[float, Field(ge=-3, le=3)]
 class ChainArm(Described):
     """A serial arm of up to seven joints in space. The servos' bodies are part of the URDF's links."""
 
-    urdf: str = Field(description="URDF file with the links; a relative path starts at the TOML file's folder")
+    urdf: str = Field(description="URDF file with the links; absolute, or relative to the TOML file's folder")
     joints: tuple[str, ...] = Field(
         strict=False,
         min_length=1,
@@ -65,7 +65,7 @@ class ChainArm(Described):
 
     @property
     def description(self) -> ArmDescription:
-        """The arm as its URDF describes it; raises ArmFileError."""
+        """The arm as described by its URDF; raises ArmFileError."""
         return read_arm(Path(self.urdf), self.joints)
 
     @property
@@ -90,7 +90,7 @@ class ChainArm(Described):
 
 
 def _loaded(body: Body, mass: float, at: np.ndarray) -> Body:
-    """A body with a point mass fixed to it."""
+    """Return the body with a point mass fixed to it."""
     if mass == 0.0:
         return body
     total = body.mass + mass

@@ -1,4 +1,4 @@
-"""Compiled equations of motion of a spatial arm, from the masses, centres of mass and inertias of its links.
+"""Compiled equations of motion of a spatial arm from its links' masses, centres of mass and inertias.
 
 Kane's equations: the Jacobians Jv and Jw of each link's centre of mass yield mass matrix and bias forces,
 
@@ -204,8 +204,8 @@ def _run_loop(  # noqa: PLR0912
 ) -> None:
     """Integrate over `remaining` [s] in steps of at most `longest` [s].
 
-    held (3, joints): friction that jams a joint [N m]; damping between it and the hand that grips it [N m s/rad], 0
-    without a hand; and the hand's velocity [rad/s].
+    held (3, joints): friction that jams a joint [N m]; damping between the joint and a hand that grips it [N m s/rad],
+    0 without a hand; and the hand's velocity [rad/s].
     state (4, joints): angles, velocities, previous accelerations, currents; updated in place.
     """
     q, v, a, amps = state[0], state[1], state[2], state[3]

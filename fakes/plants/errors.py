@@ -1,5 +1,5 @@
-"""The error that plants raise."""
+"""The error raised by plants."""
 
 
 class PlantError(ValueError):
-    """A plant cannot be created, or has returned an invalid state. The message names it and says what is required."""
+    """A plant cannot be created, or has returned an invalid state. The message names it and states what is required."""

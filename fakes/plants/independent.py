@@ -10,7 +10,7 @@
     drives = [{ mass = 0.02, rotor_inertia = 8e-8, gear_ratio = 288.4, torque_constant = 0.35, viscous = 0.01 }]
 
 Each joint is described as an arm with one joint. This suffices for programs that communicate with servos and move an
-arm, but not for those that depend on the coupling between joints.
+arm, but not for those that depend on coupling between joints.
 """
 
 from collections.abc import Sequence
@@ -72,5 +72,5 @@ def make_plant(**options: object) -> Independent:
         raise PlantError(describe(error, "plant_options", _Joints)) from error
     for number, arm in enumerate(joints, start=1):
         if len(arm.links) != 1:
-            raise PlantError(f"plant_options: joints[{number}] has {len(arm.links)} links: each must have one")
+            raise PlantError(f"plant_options: joints[{number}] has {len(arm.links)} links: each joint must have one")
     return Independent(joints)

@@ -1,8 +1,8 @@
-"""One joint's drive during a plant's time step: current lag, torque, friction, stops. It runs in every step, so it uses
+"""The drive of one joint during a time step: current lag, torque, friction, stops. It runs in every step, so it uses
 plain floats.
 
 Presliding friction follows Canudas de Wit, Olsson, Astrom and Lischinsky (IEEE Transactions on Automatic Control 40
-(1995) 419): bristles deflect with the joint, and slip more the further they are deflected,
+(1995) 419): bristles deflect with the joint and slip more the further they are deflected,
 
     friction = stiffness deflection + damping deflection'
     deflection' = velocity (1 - stiffness deflection / +-level)
@@ -21,7 +21,7 @@ JAM = 1e6  # N m of dry friction: more than any drive here can overcome
 
 
 class Motor:
-    """The physics of one drive. Its state consists of its current and the deflection of its friction's bristles."""
+    """The physics of one drive. Its state consists of its current and the deflection of its friction bristles."""
 
     __slots__ = (
         "_bent",
@@ -92,7 +92,7 @@ class Motor:
         """Torque constant [N m/A], offset and Coulomb level [N m], Stribeck rise [1], 1 / Stribeck velocity [s/rad]."""
         self.viscous = drive.viscous * viscous
         self.plain = (*self.constants, self.viscous, self._lag)
-        """`constants`, viscous friction [N m s/rad] and current lag [s]: all that matters while the drive is plain."""
+        """`constants`, viscous friction [N m s/rad] and current lag [s]: all that is used while the drive is plain."""
 
     @property
     def is_plain(self) -> bool:
@@ -100,8 +100,7 @@ class Motor:
         return not (self._shaped or self._width or self.bristle_stiffness or self.jammed or self.held_at is not None)
 
     def push(self, step: float, command: float, angle: float, velocity: float) -> tuple[float, float, float, float]:
-        """Return the effect of the drive during a step of `step` [s], given angle and velocity at the middle of the
-        step.
+        """Return the effect of the drive over a step of `step` [s], given angle and velocity at its middle.
 
         command: commanded current [A]. Returns the mean torque without stiction [N m], the level of the dry friction
         that can hold the joint [N m], the slope of the smooth friction at this velocity [N m s/rad], and the current at
@@ -154,9 +153,7 @@ class Motor:
         return end + (self.bristle_torque - end) * exp(-self.bristle_stiffness * abs(velocity) * step / self._level)
 
     def lag(self, step: float) -> tuple[float, float]:
-        """Return the fraction of a current error that remains at the end of a step of `step` [s], and its mean over the
-        step.
-        """
+        """Return the fraction of a current error that remains after `step` [s], and its mean over that time."""
         if self._lag and step != self._step:
             # Exact solution of a first-order lag under a constant command.
             self._step = step

@@ -5,7 +5,7 @@
     plant_options = { model = "arm.xml", joints = ["shoulder", "elbow"], torque_constant = [1.8, 1.8] }
 
 Friction, armature and limits are those of the model's joints; its actuators are not used. The motor torque, current
-times torque constant, is applied directly to the joint. The servo's joint angle is the joint angle of the model.
+times torque constant, is applied directly to the joint. Joint angles are those of the model.
 """
 
 from collections.abc import Sequence
@@ -91,7 +91,7 @@ class MujocoPlant:
 def make_plant(
     model: str, joints: Sequence[str], torque_constant: Sequence[float], current_lag: float = 0.0
 ) -> MujocoPlant:
-    """Create the plant.
+    """Create the plant from a MuJoCo model.
 
     model: path of the MJCF file, or its text.
     joints: names of hinge joints in the order of the servos.

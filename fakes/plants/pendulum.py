@@ -1,4 +1,4 @@
-"""One link and one joint: the plant of `hil.fakes.plants.two_link` without its second link."""
+"""An arm with one link and one joint: the plant of `hil.fakes.plants.two_link` without its second link."""
 
 from collections.abc import Sequence
 from math import ceil, copysign, cos
@@ -59,7 +59,7 @@ class Pendulum:
                 self._step(step - taken, command, False)
 
     def _step(self, step: float, command: float, cut: bool) -> float:
-        """Take one step, or with `cut` only the part up to a change of sign of the velocity; return its length [s]."""
+        """Take one step, or with `cut` only the part up to a sign change of the velocity; return its length [s]."""
         half = 0.5 * step
         v = self._v
         middle_v = v + half * self._a if v else 0.0

@@ -1,4 +1,4 @@
-"""Plants, the mechanisms that the fake servos drive: their interface, and how to load one.
+"""Plants, i.e. the mechanisms driven by the fake servos: interface and loading.
 
 A custom plant is any object with the members of `Plant`, created by a function that takes the description's
 `plant_options` as keyword arguments:
@@ -22,7 +22,7 @@ from hil.fakes.plants.two_link import TwoLink
 
 
 class Plant(Protocol):
-    """A mechanism with one motor per joint, advanced lazily by the bus in the bus's own time.
+    """A mechanism with one motor per joint, advanced by the bus only as needed, in the bus's own time.
 
     Angles and velocities are those of the servos' output shafts: joint 1 is measured from the horizontal, joint 2
     relative to link 1 (two-link arm). `current` is the actual motor current, after the current loop's lag.
@@ -96,7 +96,7 @@ _leave = {"code": False}
 
 
 def allow_code(allowed: bool = True) -> None:
-    """Permit descriptions to call any importable function for the rest of this process; by default they may not.
+    """Permit descriptions to call any importable function for the rest of this process; off by default.
 
     Opening a file whose `plant` names a function runs that function with the file's arguments.
     """
@@ -104,7 +104,7 @@ def allow_code(allowed: bool = True) -> None:
 
 
 def load_plant(name: str, options: Mapping[str, object]) -> Plant:
-    """Create a plant with the factory `module:factory` and these options; raises PlantError.
+    """Create a plant by calling `module:factory` with these options; raises PlantError.
 
     Factories outside `OWN_PLANTS` require `allow_code`.
     """
@@ -169,13 +169,13 @@ class CheckedPlant:
     def jam(self, joint: int, jammed: bool) -> None:
         """Block or release a joint; raises PlantError if the plant does not support this."""
         if not isinstance(self._plant, CanJam):
-            raise PlantError(f'plant "{self._name}" has no jam(joint, jammed): the fault stuck_joint needs it')
+            raise PlantError(f'plant "{self._name}" has no jam(joint, jammed), needed by the fault stuck_joint')
         self._plant.jam(joint, jammed)
 
     def hold(self, joint: int, velocity: float | None) -> None:
         """Grip, move or release a joint; raises PlantError if the plant does not support this."""
         if not isinstance(self._plant, CanBeHeld):
-            raise PlantError(f'plant "{self._name}" has no hold(joint, velocity): moving a joint by hand needs it')
+            raise PlantError(f'plant "{self._name}" has no hold(joint, velocity), needed to move a joint by hand')
         self._plant.hold(joint, velocity)
 
     def check(self) -> None:

@@ -7,17 +7,17 @@ Kinetic energy, where w1 = q1' and w2 = q1' + q2' are the links' angular velocit
     link 2      m2 (l1^2 w1^2 + c2^2 w2^2 + 2 l1 c2 w1 w2 cos(phi2 - phi1)) / 2 + J2 w2^2 / 2
     rotors      n1^2 Jr1 q1'^2 / 2 + n2^2 Jr2 q2'^2 / 2
 
-Lagrange's equations are derived in phi1, phi2, whose generalised forces are tau1 - tau2 and tau2; their sum and the
-second one are the equations in the joint angles. The estimator models the same arm independently, as a regressor in
-base parameters; a test compares the two.
+Lagrange's equations are derived in phi1, phi2, whose generalised forces are tau1 - tau2 and tau2; the equations in the
+joint angles are their sum and the second one. The estimator models the same arm independently, as a regressor in base
+parameters; a test compares the two.
 
 Time integration is symmetric and second-order: drift half a step, kick with the step's mean motor torque and the
 friction at its middle, drift half a step. Dry friction is an impulse on each joint, limited to its level times the step
 and just large enough to bring the joint to rest, so stiction is exact. A step in which a joint's velocity changes sign
 is split there.
 
-In a process that has loaded numba anyway, as hil's own experiments do, the loop is compiled for arms with plain drives.
-Its results are the same to the last bit. Without numba, the loop is not compiled.
+In a process that has loaded numba anyway, as hil's own experiments do, the loop is compiled for arms with plain drives;
+the results are bitwise identical. Otherwise, the loop is interpreted.
 """
 
 import sys
@@ -122,7 +122,7 @@ def _run(  # noqa: PLR0915
     This is one long loop on local floats because a fake arm spends most of its time here: with a function call per step
     it takes 1.5 times as long. A step in which a joint's velocity changes sign is first taken up to that point (`cut`).
 
-    arm: `TwoLink._terms`. drives: `Motor.plain` of both motors. motors: None if both are plain; only this is compiled.
+    arm: `TwoLink._terms`. drives: `Motor.plain` of both motors. motors: None if both are plain, the only compiled case.
     """
     swing, inertia_second, turned_first, turned_second, weight_first, weight_second = arm
     kt_1, offset_1, coulomb_1, rise_1, per_v1, viscous_1, lag_1 = drives[:7]
@@ -211,7 +211,7 @@ def _run(  # noqa: PLR0915
 
 
 def _lag(step: float, seconds: float) -> tuple[float, float]:
-    """Return what `Motor.lag` returns, for a lag of `seconds`."""
+    """Return the same as `Motor.lag` for a lag of `seconds`."""
     if not seconds:
         return 0.0, 0.0
     fallen = -expm1(-step / seconds)
@@ -233,7 +233,7 @@ def _sticking(
     dry: tuple[float, float],
     guess: tuple[float, float],
 ) -> tuple[float, float]:
-    """Return the new velocities [rad/s] when each joint's friction may take any impulse up to `dry` [N m s].
+    """Return the new velocities [rad/s] if each joint's friction can exert any impulse up to `dry` [N m s].
 
     They minimise v'Mv/2 - impulse'v + dry'|v|, which is convex, so solving for one joint at a time converges.
     """
@@ -259,7 +259,7 @@ def _shrunk(impulse: float, limit: float) -> float:
 
 @cache
 def _compiled() -> Callable[..., State]:
-    """Return the compiled loop; from then on, the interpreted one calls compiled functions, too."""
+    """Return the compiled loop; from then on, the interpreted loop also calls compiled functions."""
     import numba
 
     inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]

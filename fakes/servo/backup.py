@@ -1,6 +1,6 @@
 """Factory Reset and Control Table Backup: their effect on a control table.
 
-Source: ROBOTIS e-Manual, protocol2. It is uncertain what exactly a backup contains. Here, it contains every writable
+Source: ROBOTIS e-Manual, protocol2. The exact contents of a backup are uncertain; here, it contains every writable
 register except ID, Baud Rate, Torque Enable, Bus Watchdog and the goals.
 """
 
@@ -69,5 +69,5 @@ class Backup:
         memory.follow_indirect_addresses()
 
     def mark(self, memory: Memory) -> None:
-        """Set the register Backup Ready according to whether there is a copy."""
+        """Set the register Backup Ready to whether there is a copy."""
         memory.set("Backup Ready", int(self._values is not None))

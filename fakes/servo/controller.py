@@ -39,14 +39,14 @@ _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 
 
 def obeyed_current(memory: Memory) -> int:
-    """Goal Current as the drive applies it [ticks]: goals written before Current Limit was lowered are limited too."""
+    """Return Goal Current as applied [ticks]: also limited if it was written before Current Limit was lowered."""
     goal, limit = memory.get("Goal Current"), memory.get("Current Limit")
     return max(-limit, min(limit, goal))
 
 
 @dataclass(frozen=True, slots=True)
 class Goals:
-    """The registers that the controller uses, in their own units."""
+    """The registers used by the controller, in their own units."""
 
     mode: int
     pwm: int
@@ -110,7 +110,7 @@ class Controller:
         self._goal_before = None
 
     def shift(self, ticks: int) -> None:
-        """Shift the setpoint of position control, and its goal, by as much as Present Position was shifted."""
+        """Shift the setpoint and goal of position control by the same amount as Present Position."""
         self.trajectory.position += ticks
         if self._goal_before is not None:
             self._goal_before += ticks
@@ -187,7 +187,7 @@ class Controller:
         return self._limited(proportional, goals.position_i / 65_536 * error, limit)
 
     def _limited(self, proportional: float, integrated: float, limit: float) -> float:
-        """Return the sum, limited; the integral is frozen while the limit is active (anti-windup)."""
+        """Return the limited sum; the integral is frozen while the limit is active (anti-windup)."""
         wanted = proportional + self._integral + integrated
         if abs(wanted) <= limit or wanted * integrated < 0.0:
             self._integral += integrated

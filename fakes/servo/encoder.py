@@ -1,6 +1,6 @@
-"""Encoder errors: noise, and periodic errors over a turn.
+"""Encoder errors: noise, and errors that are periodic over a turn.
 
-A magnetic encoder whose magnet is off the shaft's axis has an error with a period of one turn; a tilted magnet, or
+In a magnetic encoder, a magnet off the shaft's axis causes an error with a period of one turn; a tilted magnet, or
 channels that differ in amplitude or are not in quadrature, cause one with a period of half a turn.
 """
 
@@ -38,7 +38,7 @@ class Encoder(Described):
         return not (self.once_ticks or self.twice_ticks)
 
     def error(self, ticks: float) -> float:
-        """Return the periodic error at the angle at which a perfect encoder would read `ticks` [ticks]."""
+        """Return the periodic error [ticks] at the angle where a perfect encoder would read `ticks`."""
         angle = ticks * _TURN_PER_TICK
         return self.once_ticks * math.sin(angle + self.once_phase) + self.twice_ticks * math.sin(
             2.0 * angle + self.twice_phase

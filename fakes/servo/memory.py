@@ -1,4 +1,4 @@
-"""The bytes of one control table: reading and writing ranges of it, also through indirect addresses."""
+"""The bytes of one control table, read and written in ranges, also through indirect addresses."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ from hil.fakes.servo.registers import EmulatedModel, Register
 
 
 class Memory:
-    """Registers as bytes. `hil.fakes.servo.servo` decides what may be written when, and with what consequences."""
+    """Registers as bytes. `hil.fakes.servo.servo` decides which writes are permitted and what they cause."""
 
     def __init__(self, model: EmulatedModel) -> None:
         self.registers = model.registers
@@ -16,7 +16,7 @@ class Memory:
         self._readable: set[tuple[int, int]] = set()
         self._blocks = model.indirect
         self._points: dict[int, int] = {}
-        """Address that each indirect data byte refers to, by the byte's own address."""
+        """Target address of each indirect data byte, by the byte's own address."""
 
     def __contains__(self, name: str) -> bool:
         return name in self.registers
@@ -44,7 +44,7 @@ class Memory:
         self.data[register.address : end] = value.to_bytes(register.size, "little", signed=register.signed)
 
     def read(self, address: int, length: int) -> bytes | None:
-        """Return the bytes of an address range; None unless it begins and ends within registers."""
+        """Return the bytes of an address range; None if it begins or ends outside any register."""
         if (address, length) not in self._readable:
             if not (length > 0 and address in self._defined and address + length - 1 in self._defined):
                 return None
@@ -71,7 +71,7 @@ class Memory:
                     self._points[first_data + index] = target
 
     def split(self, address: int, data: bytes) -> tuple[list[tuple[Register, int]], int]:
-        """Return the registers and values covered by a write, and an error number if it violates their boundaries."""
+        """Return the registers and values in a write, and an error number if it violates register boundaries."""
         if not (self._points and self.is_indirect(address, len(data))):
             return self._split_stretch(address, data)
         writes: list[tuple[Register, int]] = []

@@ -6,7 +6,7 @@ some revisions: the range of Min Voltage Limit, given there as 110 to 300 with a
 as on the sister models. Protocol Type only accepts 2, because a fake servo does not support any other. Drive Mode
 accepts bit 3 (Torque On by Goal Update), which is on the page of the XL430-W250 but missing from older revisions of the
 others. Velocity Limit of the XH430-W210 is that of the XD430-T210, whose control table is identical according to the
-manual; the oldest page of the XH430-W210 prints 360.
+manual; the oldest page of the XH430-W210 states 360.
 
 Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
 tens of percent, which is enough to make a position move look right. The XC330s' stall currents are uncertain: their
@@ -19,12 +19,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 Blocks = tuple[tuple[int, int, int], ...]
-"""Blocks of indirect addressing: address of the first address register and first data register, and their number."""
+"""Blocks of indirect addressing: addresses of the first address and first data registers, and number of each."""
 
 
 @dataclass(frozen=True, slots=True)
 class RegisterFacts:
-    """Properties of a register that its control table does not contain. `limits` None: the full range of its bytes."""
+    """Properties of a register missing from control tables. `limits` is None for the full range of its bytes."""
 
     initial: int = 0
     limits: tuple[int, int] | None = None
@@ -32,9 +32,7 @@ class RegisterFacts:
 
 
 class Motor(NamedTuple):
-    """A motor's figures as published for the nominal voltage [V]: stall current [A], no-load speed of the output
-    shaft [rev/min].
-    """
+    """Published motor data: nominal voltage [V], stall current [A], no-load speed of the output shaft [rev/min]."""
 
     voltage_v: float
     stall_a: float
@@ -53,7 +51,7 @@ class Motor(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ModelFacts:
-    """Properties in which models differ.
+    """Properties that differ between models.
 
     motor: its motor at the nominal voltage.
     differs: registers whose facts differ from those of the X series.
@@ -70,7 +68,7 @@ class ModelFacts:
     """Whether Present Current is the supply current instead of the motor current (330 series)."""
     indirect: Blocks = ((168, 224, 28), (578, 634, 28))
     indirect_of_firmware: tuple[int, Blocks] | None = None
-    """The one firmware version that has these blocks at other addresses, and its blocks."""
+    """The only firmware version with these blocks at other addresses, and its blocks."""
 
 
 _Facts = RegisterFacts
@@ -161,18 +159,18 @@ def _gains(
 
 
 def _x430(motor: Motor, velocity: int, current: int = 1193, p: int = 800) -> ModelFacts:
-    """XM, XH, XD and XW models, also the 540 series. velocity, current: the factory's limits [ticks]."""
+    """Return the facts of an XM, XH, XD or XW model, 540 series included. velocity, current: factory limits [ticks]."""
     differs = {"Velocity Limit": _Facts(velocity, (0, 1023)), "Current Limit": _Facts(current, (0, current))}
     return ModelFacts(motor, differs | _gains(p=p))
 
 
 _FIRMWARE_52 = (52, ((168, 208, 20),))
-"""Indirect data of the 330 series. Its sources contradict each other before firmware 52.
+"""Indirect data of the 330 series. Sources contradict each other for firmware before 52.
 
 dynamixel-sdk 4.1 and ROBOTIS' dynamixel_hardware_interface (pull request 69) have two control tables: one with the data
 at 224, and one named fw52, with the data at 208. The e-Manual (2026-09): "Firmware versions prior to V53 support up to
 20 Indirect Address/Data items [...] for Indirect Data is 208 ~ 227"; from then on, 28 at 224. All agree on 208 for
-firmware 52. Before 52, the fake takes the 224 of ROBOTIS' own programs, or they would read zeros.
+firmware 52. Before 52, the fake uses 224 like ROBOTIS' own programs, which would otherwise read zeros.
 """
 
 
@@ -199,14 +197,14 @@ def _xl330(motor: Motor, velocity: int, gains: Mapping[str, RegisterFacts]) -> M
 
 
 def _xc330(motor: Motor, velocity: int, gains: Mapping[str, RegisterFacts]) -> ModelFacts:
-    """M models for 5 V, T models for 12 V."""
+    """Return the specifications of an XC330 model (M: 5 V, T: 12 V)."""
     if motor.voltage_v < _LEAST_OF_T:
         return _x330(motor, velocity, 2352, {**_volts(31, 35, 70), **gains})
     return _x330(motor, velocity, 910, {**_volts(55, 55, 140), "PWM Slope": _Facts(255, (1, 255)), **gains})
 
 
 def _voltage_driven(motor: Motor, differs: Mapping[str, RegisterFacts]) -> ModelFacts:
-    """Models without a current sensor."""
+    """Return the facts of a model without a current sensor."""
     return ModelFacts(motor, differs, current_unit_a=0.0, operating_modes=frozenset({1, 3, 4, 16}))
 
 
@@ -256,7 +254,7 @@ FACTS: Mapping[str, ModelFacts] = {
         Motor(12.0, 1.4, 70), {**_volts(60, 60, 160), "Velocity Limit": _Facts(306, (0, 1023)), **_gains(p=700)}
     ),
 }
-"""Every X-series model with one motor for 5 to 12 V that has a model number in the SDK."""
+"""All X-series models with a single 5 to 12 V motor and a model number in the SDK."""
 
 _STRENGTH = (0, 1023)
 
@@ -284,4 +282,4 @@ OTHER_SERIES: Mapping[str, Mapping[str, RegisterFacts]] = {
         "Punch": _Facts(32, _STRENGTH),
     }
 }
-"""Registers of models outside the X series, as far as their e-Manual pages describe them."""
+"""Registers of models outside the X series, where their e-Manual pages describe them."""

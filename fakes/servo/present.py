@@ -1,4 +1,4 @@
-"""A servo's measurements of its joint, stored in ticks in its present registers."""
+"""A servo's measurements of its joint, stored in ticks in its "present" registers."""
 
 import math
 from collections.abc import Callable
@@ -13,11 +13,11 @@ from hil.fakes.servo.registers import TICKS_PER_TURN, VELOCITY_UNIT_RPM, Emulate
 
 PRESENT_START = 120
 PRESENT_END = 147
-"""Address after the last of the present registers, which begin at `PRESENT_START`."""
+"""End address (exclusive) of the present registers, which begin at `PRESENT_START`."""
 
 STATE_START = 126
 STATE_END = 136
-"""First address after the block of Present Current, Velocity and Position, which begins at `STATE_START`."""
+"""End address (exclusive) of Present Current, Velocity and Position, which begin at `STATE_START`."""
 
 _TICKS_PER_RAD = TICKS_PER_TURN / math.tau
 _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
@@ -36,7 +36,7 @@ Share = Callable[[float, float], float]
 
 
 class Present:
-    """The encoder, the current sensor and the clock of one servo."""
+    """Encoder, current sensor and clock of one servo."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Present:
         self.position_sign = direction
         """+1 or -1: sign of the servo's position relative to the joint's; Reverse Mode inverts it on every model."""
         self.jump_ticks = 0
-        """Error of the encoder injected by a fault [ticks]."""
+        """Encoder error injected by a fault [ticks]."""
         self._memory = memory
         self._model = model
         self._clock_rate = clock_rate
@@ -70,7 +70,7 @@ class Present:
         self._imperfect = noise is not None or senses_supply
         self._booted_at = 0.0
         self._turn_ticks = 0
-        """Offset that the servo adds to its encoder's count [ticks]; reverse mode mirrors the sum."""
+        """Offset that the servo adds to its encoder count [ticks]; Reverse Mode mirrors the sum."""
         self._shift = 0
         self._reversed = False
         self._moving_threshold = 0
@@ -181,7 +181,7 @@ class Present:
         self._memory.set("Realtime Tick", tick)
 
     def forget_turns(self, position: float) -> None:
-        """Reset Present Position to its value within one turn, before Homing Offset, at a joint angle [rad]."""
+        """Reset Present Position at a joint angle [rad] to its value within one turn, before Homing Offset."""
         self._turn_ticks = 0
         self._shift_changed()
         raw = round(self.ticks(position)) - self._homing_ticks()

@@ -5,8 +5,8 @@ Addresses, sizes and signs come from `hil.drivers.control_table`; area, access, 
 tables leave out, are added here from the e-Manual (pages x/<model>). The address of the 330 series' indirect data
 depends on the firmware: see `ModelFacts.indirect_of_firmware`.
 
-A model outside the X series behaves according to its table in the SDK: its registers hold what is written to them,
-within their size, and its motor does not move.
+A model outside the X series follows its table in the SDK: its registers hold what is written to them, within their
+size, and its motor does not move.
 """
 
 from collections.abc import Iterator, Mapping
@@ -59,7 +59,7 @@ class EmulatedModel:
     current_unit_a: float
     """Current per tick of Goal Current and Present Current [A]; 0 if the model has no current sensor."""
     operating_modes: frozenset[int]
-    """Supported operating modes; empty if the motor is unknown: it then never moves."""
+    """Supported operating modes; empty if the motor is unknown, in which case it never moves."""
     fast_read_firmware: int
     """First firmware that supports Fast Sync Read, Fast Bulk Read and Control Table Backup."""
     nominal_voltage_v: float
@@ -78,7 +78,7 @@ MODEL_NAMES = tuple(FACTS)
 
 
 def all_model_names() -> tuple[str, ...]:
-    """Return every model that a fake servo can be: `MODEL_NAMES` first, then the other models of the SDK's tables."""
+    """Return the models available as fake servos: `MODEL_NAMES`, then the other models in the SDK's tables."""
     return (*MODEL_NAMES, *sorted(name for name in model_names().values() if name not in FACTS))
 
 
@@ -97,7 +97,7 @@ def load_model(name: str, firmware: int = DEFAULT_FIRMWARE) -> EmulatedModel:
 
 @cache
 def _load_model(name: str, indirect: Blocks | None) -> EmulatedModel:
-    """indirect: its blocks of indirect addressing, if they are not the usual ones."""
+    """Return a model; `indirect` replaces its usual blocks of indirect addressing."""
     if name not in model_names().values():
         raise KeyError(name)
     facts = FACTS.get(name)

@@ -3,12 +3,12 @@
 The behaviour follows the ROBOTIS e-Manual (protocol2 and x/<model> pages). Where the manual is silent, the fake chooses
 the behaviour that demands more of a client: see "Conformance" in docs/fake-bus.md, and:
 
-- A write must begin and end on register boundaries. Inside a writable register it is a Data Length error, elsewhere
-  an Access error. A read may begin inside a register; undefined bytes between two registers read as 0. A read
-  that begins or ends at an undefined address is an Access error.
+- A write must begin and end on register boundaries. One that begins or ends inside a writable register causes a Data
+  Length error; other violations cause an Access error. A read may begin inside a register; undefined bytes between two
+  registers read as 0. A read that begins or ends at an undefined address causes an Access error.
 - When the Bus Watchdog trips, Goal Current, Goal PWM and Goal Velocity become 0, Goal Position becomes Present
   Position, and torque stays enabled. While tripped, only 0 may be written to it.
-- At power-up, and after a change of Operating Mode, Goal Current and Goal PWM are at their limits: if a client enables
+- At power-up, and after a change of Operating Mode, Goal Current and Goal PWM equal their limits: if a client enables
   torque in current mode without first writing a goal, full current flows. Goal Velocity is 0.
 
 A model without a current sensor (XL430-W250) has no current mode and reports a Present Load of 0.
@@ -47,7 +47,7 @@ _RESTORE_AT_BOOT = 0x02
 
 
 class EmulatedServo(Powered):
-    """A servo on its own: its registers, the rules for accessing them, and the resulting motor command.
+    """A servo without bus or plant: its registers, the rules for accessing them, and the resulting motor command.
 
     Times are in seconds on the bus's clock. `hil.fakes.description.FakeServo` documents the arguments.
     """
@@ -79,7 +79,7 @@ class EmulatedServo(Powered):
         super().__init__(model, Memory(model), health, supply_v)
         self.firmware = firmware
         self.has_fast_reads = firmware >= model.fast_read_firmware
-        """Whether it supports Fast Sync Read, Fast Bulk Read and Control Table Backup."""
+        """Whether the servo supports Fast Sync Read, Fast Bulk Read and Control Table Backup."""
         self.connected = True
         """False if its bus cable is disconnected: it neither receives nor replies; its motor keeps its last command."""
         self.heard_at = 0.0
@@ -94,7 +94,7 @@ class EmulatedServo(Powered):
         )
         self.controller = Controller()
         self.motor_current_a = 0.0
-        """Current that the motor is commanded to carry, in the joint's direction [A]."""
+        """Commanded motor current, in the joint's direction [A]."""
         self._voltage_limited = voltage_limited
         self._set_baud = baud
         self._registered: bytes | None = None
@@ -129,8 +129,8 @@ class EmulatedServo(Powered):
 
         angle: returns the joint's current position [rad]; it is also called later.
         RAM registers take their initial values, or those of the backup if Startup Configuration says so; the XL320's
-        Torque Limit takes Max Torque. Torque is off, and errors are cleared. The turn count is lost: Present Position
-        starts within one turn (before Homing Offset).
+        Torque Limit is set to Max Torque. Torque is off, and errors are cleared. The turn count is lost: Present
+        Position starts within one turn (before Homing Offset).
         """
         memory = self.memory
         for register in memory.registers.values():
@@ -161,7 +161,7 @@ class EmulatedServo(Powered):
         self.power_up(now, self._angle, boot_s)
 
     def hears(self, now: float, baud: int) -> bool:
-        """Return whether a packet at this baud rate that ends at `now` [s] is understood."""
+        """Return whether the servo receives a packet at this baud rate that ends at `now` [s]."""
         return self.baud == baud and self.connected and now >= self.ready_at
 
     def trip_watchdog(self) -> None:
@@ -235,10 +235,10 @@ class EmulatedServo(Powered):
     def execute(
         self, instruction: int, body: bytes, now: float, moving: bool, *, shadow: bool = False
     ) -> tuple[int, bytes]:
-        """Execute an instruction addressed to this servo; return the error number and the data of the status.
+        """Execute an instruction addressed to this servo; return the error number and data of the status packet.
 
         The error number excludes the Alert bit. shadow: the instruction was addressed to the Secondary ID. Read is not
-        among these instructions: the bus handles it with `read`, after updating the measurements.
+        included: the bus handles it with `read`, after updating the measurements.
         """
         if instruction in (Instruction.WRITE, Instruction.REG_WRITE) and len(body) < 3:
             return StatusError.DATA_LENGTH, b""
@@ -335,7 +335,7 @@ class EmulatedServo(Powered):
         return self.write(body[0] | body[1] << 8, body[2:])
 
     def _clear_turns(self, body: bytes, moving: bool) -> int:
-        """Execute the instruction Clear; Goal Position and the trajectory lose the same turns as Present Position."""
+        """Execute the instruction Clear; remove the same turns from Goal Position, trajectory and Present Position."""
         before = self.present.ticks(self._angle())
         if error := self.present.clear(body, moving, self._angle()):
             return error
@@ -379,12 +379,12 @@ class EmulatedServo(Powered):
         self.controller.start(ticks)
 
     def _derive(self) -> None:
-        """Recompute, after any change, the values that every packet needs."""
+        """Recompute the values that every packet needs; called after any change."""
         memory = self.memory
         self.id = memory.get("ID")
         shadow = memory.get("Secondary(Shadow) ID", _NO_SHADOW_ID)
         self.shadow_id = shadow if shadow < _NO_SHADOW_ID else None
-        """Secondary ID, whose instructions it executes without replying; None if it has none."""
+        """Secondary ID, for which it executes instructions without replying; None if it has none."""
         baud = memory.get("Baud Rate", BAUD_RATES.index(self._set_baud))
         self.baud = BAUD_RATES[baud] if baud < len(BAUD_RATES) else self._set_baud
         self.return_delay_s = 2e-6 * memory.get("Return Delay Time")
@@ -402,7 +402,7 @@ class EmulatedServo(Powered):
         self._current_per_tick = self.present.sign * self.model.current_unit_a
         moves = self._torque and bool(self.model.operating_modes)
         self.needs_ticks = self.health.changes or (moves and (self._mode != CURRENT_MODE or self._voltage_limited))
-        """Whether the passage of time alone changes its state, so that the bus must call `tick`."""
+        """Whether its state changes with time alone, so that the bus must call `tick`."""
 
         if self._driven:
             self.motor_current_a = self.goal_current_ticks * self._current_per_tick

@@ -1,4 +1,4 @@
-"""A servo's trajectory: the trapezoidal profile between its last and its present goal."""
+"""A servo's trajectory: the trapezoidal profile between its previous and present goals."""
 
 from math import copysign, sqrt
 
@@ -15,7 +15,8 @@ ACCELERATION_PER_MS = 214.577 / 60_000 / 0.229
 class Trajectory:
     """A point that travels to a goal within limits of velocity and acceleration, one millisecond per step.
 
-    Units are position ticks and milliseconds. The goal may change at any time; the point then brakes and turns around.
+    Units are position ticks and milliseconds. The goal may change at any time; the point then brakes and, if necessary,
+    reverses.
     """
 
     def __init__(self) -> None:

@@ -27,7 +27,7 @@ _MULTI_TURN_LIMIT_TICKS = 256 * TICKS_PER_TURN
 
 
 def refusal(memory: Memory, model: EmulatedModel, register: Register, value: int, shadow: bool = False) -> int:
-    """Return the error number with which writing this value to this register is refused; 0 if it is permitted.
+    """Return the error number for writing this value to this register; 0 if the write is permitted.
 
     shadow: the write was addressed to the Secondary ID, which cannot write to the EEPROM.
     """

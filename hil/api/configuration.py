@@ -1,4 +1,4 @@
-"""What the public functions accept as a configuration; a module of its own, so that importing it loads few others."""
+"""The types that the public functions accept as a configuration; a separate module that imports few others."""
 
 from os import PathLike
 from pathlib import Path

@@ -86,7 +86,7 @@ def estimate(
 
 
 def are_recordings(paths: Sequence[Path]) -> bool:
-    """Whether these are recordings made with other tools rather than one run folder. Raises ValueError if mixed."""
+    """Whether the paths are recordings from other tools, not one run folder. Raises ValueError if mixed."""
     if not paths:
         raise ValueError("no recording is given: name a run folder, or recordings (CSV, Parquet, MCAP).")
     files = [is_recording(path) for path in paths]
@@ -111,7 +111,7 @@ def _from_files(paths: list[Path], config: Path | None, out: PathLikeStr | None)
 
 
 def _discard(folder: Path) -> None:
-    """Remove a folder without a result. If it has been deleted by now, the error that led here says so."""
+    """Remove a folder without a result. If it is already gone, the original error says so."""
     if not (folder / "result.json").is_file():
         with suppress(FileNotFoundError):
             for path in folder.iterdir():

@@ -31,7 +31,7 @@ __all__ = ["identify", "record"]
 log = logging.getLogger(__name__)
 
 _UNSETTLED = re.compile("TORQUE IS ON|could not be restored")
-"""Where a message says this, the servos' state is to be checked before anything else."""
+"""If an error message matches, the state of the servos must be checked before anything else."""
 
 
 def identify(
@@ -127,7 +127,7 @@ def record(
 
 
 def _earlier(config: Config, shown: Path, path: Path) -> Result:
-    """The result of an earlier run. Raises ConfigError, ResultError, RunFolderError."""
+    """Read the result of an earlier run. Raises ConfigError, ResultError, RunFolderError."""
     if config.is_chain or not config.experiment.pilot:
         why = "this arm is spatial" if config.is_chain else "this file gives peak_torque, so no pilot runs"
         raise ConfigError(

@@ -2,7 +2,7 @@
 
 mesh     vertices of a mesh file
 shapes   capsules that enclose each link
-kept     these capsules as a file next to a copied description
+kept     the capsules, stored in a file next to a copied description
 kernel   compiled distance computations along a motion
 space    the arm and its obstacles
 doubts   warnings about the description of an arm

@@ -42,11 +42,11 @@ def near_by_design(space: Space) -> Iterator[str]:
     """Yield a sentence that lists the pairs of links with parts that need no margin, if there are any."""
     if space.near:
         pairs = ", ".join(f"{first} and {second}" for first, second in space.near)
-        yield f"Parts of these links are near each other by design: they must not touch, but need no margin: {pairs}."
+        yield f"Parts of these links are near each other by design; they must not touch, but need no margin: {pairs}."
 
 
 def _same_direction(config: Config, joint: JointConfig) -> str:
-    """Say that two servos of a joint are described as turning the same way, which is rarely true; "" otherwise."""
+    """Warn that both servos of a joint are configured to turn the same way, which is rarely right; otherwise ""."""
     if len(joint.ids) == 1 or len(set(joint.directions)) > 1:
         return ""
     (first, second), sign = joint.ids, joint.direction
@@ -73,7 +73,7 @@ def _how_to_compare(config: Config) -> str:
 
 
 def _weak(joint: JointConfig) -> str:
-    """Say that a joint's limit allows less torque than the typical friction of its servos; "" if it allows more."""
+    """Warn that a joint's limit allows less torque than the typical friction of its servos; otherwise ""."""
     friction = len(joint.ids) * servo_prior(joint.joint.servo).coulomb.median
     torque = joint.goal_limit * joint.torque_per_goal
     if torque > friction:

@@ -36,7 +36,7 @@ def mesh_corners(name: str, urdf: Path) -> Array:
     """Vertices (points, 3), in the file's units, of a mesh that a URDF names. Raises UnreadMesh."""
     path = find_mesh(name, urdf)
     if path is None:
-        raise UnreadMesh("there is no such file in the URDF's folder or in one above it")
+        raise UnreadMesh("there is no such file in the URDF's folder or any folder above it")
     read = {".stl": _stl, ".obj": _obj}.get(path.suffix.lower())
     if read is None:
         raise UnreadMesh("only STL and OBJ files can be read; convert it")

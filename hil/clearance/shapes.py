@@ -169,7 +169,7 @@ def _pieces(capsule: Capsule) -> list[Capsule]:
 
 
 def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Capsule], list[str]]:
-    """Capsules around everything fixed to one moving link, and why shapes could not be read."""
+    """Capsules around everything fixed to one moving link, and why any shapes could not be read."""
     found, unread = [], []
     for _, rotation, translation, element in here:
         if element is None:
@@ -244,7 +244,7 @@ def _of_shape(shape: ET.Element, arm: ArmDescription) -> list[tuple[Array, float
 
 
 def _of_cylinder(radius: float, length: float) -> tuple[Array, float]:
-    """A flat cylinder is enclosed by a sphere, any other by a capsule with the same axis."""
+    """Enclose a flat cylinder in a sphere, any other in a capsule with the same axis."""
     half = 0.5 * length
     if half < 0.5 * radius:
         return np.zeros((2, 3)), float(np.hypot(radius, half))
@@ -252,7 +252,7 @@ def _of_cylinder(radius: float, length: float) -> tuple[Array, float]:
 
 
 def _of_box(centre: Array, size: Array) -> list[tuple[Array, float]]:
-    """Capsules parallel to the longest edge, side by side along the second-longest."""
+    """Enclose a box in capsules parallel to its longest edge, side by side along the second-longest."""
     third, second, longest = np.argsort(size)
     strips = int(np.clip(np.round(size[second] / max(size[third], _NOTHING)), 1, MOST_STRIPS))
     width = size[second] / strips
@@ -270,7 +270,8 @@ def _of_box(centre: Array, size: Array) -> list[tuple[Array, float]]:
 def _from_joints(arm: ArmDescription, link: int, fixed: list[Array]) -> list[Capsule]:
     """A capsule from the link's joint to the next one.
 
-    The last link's capsule ends at the farthest of the frames fixed to it and twice the distance of its centre of mass.
+    The last link's capsule ends at the farthest frame fixed to it, or at twice the distance of its centre of mass if
+    that is farther.
     """
     if link < len(arm.joints):
         end = arm.joints[link].translation

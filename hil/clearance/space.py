@@ -67,7 +67,7 @@ class Nearest:
 
 @dataclass(frozen=True)
 class Space:
-    """Pairs of capsules that must keep apart, and by how much.
+    """Pairs of capsules that must stay apart, and by how much.
 
     as_built: pairs of links that are not fully checked, because some of their capsules are closer than the margin in
     nearly every pose. near: pairs of links with capsules that are near each other in most poses; these must not touch,
@@ -272,7 +272,7 @@ def _by_design(
 ) -> tuple[NDArray[np.bool_], Array]:
     """Whether the capsules of each pair (pairs,) are closer than the margin in nearly every pose within the limits.
 
-    Also the median distance of pairs that are near each other in most poses (pairs,) [m], infinite for all others.
+    Also returns the median distance of pairs that are near each other in most poses (pairs,) [m]; infinite for others.
     """
     link = arrays[0]
     low, high = np.array([joint.position_limit for joint in config.joints]).T

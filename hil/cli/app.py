@@ -97,12 +97,12 @@ for _name, (_command, _example) in COMMANDS.items():
 
 @cache
 def _built() -> Callable[[], object]:
-    """The commands as Click has them; Typer would build them anew at every call of `main`, in 10 ms."""
+    """Return the Click command; without the cache, Typer would spend 10 ms rebuilding it in every call of `main`."""
     return typer.main.get_command(app)
 
 
 def _one_blas_thread() -> None:
-    """Give BLAS one thread unless the user chose a number; it reads these variables when numpy is first imported.
+    """Limit BLAS to one thread unless the user chose a number; BLAS reads it when numpy is first imported.
 
     hil's matrices are small. On two busy cores, two spinning threads took 91 ms for a singular value decomposition that
     takes one thread 1 ms.

@@ -117,7 +117,7 @@ def pose(
 def setup(
     port: PortOrFile,
     servo_id: Annotated[int, typer.Option("--id", min=0, max=252, help="The servo's current ID.")],
-    baud: Annotated[int, typer.Option("--baud", help="Its current baud rate.")] = 1_000_000,
+    baud: Annotated[int, typer.Option("--baud", help="The servo's current baud rate.")] = 1_000_000,
     new_id: Annotated[int | None, typer.Option("--new-id", min=0, max=252, help="ID to set.")] = None,
     new_baud: Annotated[int | None, typer.Option("--new-baud", help="Baud rate to set.")] = None,
     return_delay_us: Annotated[
@@ -149,7 +149,7 @@ def setup(
         servo = open_servo(opened, servo_id)
         restored = recover(servo, opened.url)
         if written := ", ".join(restored.written):
-            print(f"Restored settings that an earlier run had left changed: {written}.", file=sys.stderr)
+            print(f"Restored settings left behind by an earlier run: {written}.", file=sys.stderr)
         if restored.others:
             print(f"{servo.title}: {restored.others}", file=sys.stderr)
         confirm: Callable[[str], bool] = (lambda _: True) if yes else typer.confirm

@@ -32,7 +32,7 @@ Live = Annotated[
     typer.Option(
         "--live",
         metavar="WHERE",
-        help="Where to show the run: terminal, rerun (its viewer), rerun:FILE.rrd or rerun:URL; see docs/commands.md.",
+        help="Where to show the run: terminal, rerun (viewer), rerun:FILE.rrd or rerun:URL; see docs/commands.md.",
     ),
 ]
 Recordings = Annotated[
@@ -94,7 +94,7 @@ def record(
 
 @contextmanager
 def _watching(config: Path, live: str, json_only: bool) -> "Iterator[OnProgress]":
-    """Show progress on the terminal and, if wanted, in the Rerun viewer."""
+    """Show progress on the terminal and, if requested, in the Rerun viewer."""
     from hil.cli.terminal import Terminal
     from hil.cli.views.rerun_view import rerun_view, wants_rerun
 

@@ -20,7 +20,9 @@ def fake(
     config: Annotated[
         Path, typer.Argument(metavar="ARM", help="TOML file with a [fake] table, or an arm's name (see above).")
     ],
-    pty: Annotated[bool, typer.Option("--pty", help="Serve it on a pseudo-terminal until Ctrl-C or SIGTERM.")] = False,
+    pty: Annotated[
+        bool, typer.Option("--pty", help="Serve the arm on a pseudo-terminal until Ctrl-C or SIGTERM.")
+    ] = False,
     link: Annotated[
         Path | None, typer.Option(metavar="PATH", help="Create this symbolic link to the pseudo-terminal.")
     ] = None,

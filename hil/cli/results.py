@@ -52,7 +52,7 @@ def export(
     ] = None,
     link_length: Annotated[
         float | None,
-        typer.Option(min=1e-3, metavar="METRES", help="Length of link 1; needed for a horizontal arm only."),
+        typer.Option(min=1e-3, metavar="METRES", help="Length of link 1; needed only for a horizontal arm."),
     ] = None,
     samples: Annotated[
         int | None,
@@ -81,7 +81,7 @@ def export(
 
 
 def write_report(run: Path, out: Path | None = None) -> Path:
-    """Write the report of a run, by default into its folder. Return its path."""
+    """Write a run's report, by default to the run folder; return the report's path."""
     from hil.report import page
     from hil.report.recording_page import write_recording_report
     from hil.report.run_data import RunData

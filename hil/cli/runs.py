@@ -12,7 +12,7 @@ from hil import strict_json
 from hil.cli.options import Json, RunPath
 
 _WHOLE = 100.0
-"""Smallest detectable change [%] above which the output gives no figure: the runs reveal nothing about that term."""
+"""Detectable change [%] above which the output gives no figure, because the runs reveal nothing about that term."""
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -39,7 +39,7 @@ def runs(
 
 
 def _print_runs(found: "list[RunSummary]") -> None:
-    """A table; if the terminal is too narrow for it, each run's path on a separate line, so that it can be copied."""
+    """Print a table; if the terminal is too narrow, put each run's path on a separate line so that it can be copied."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -134,7 +134,7 @@ def _print_difference(difference: "Difference") -> None:
 
 
 def _would_show(detectable: "Mapping[str, float]") -> list[str]:
-    """Describe the smallest change of each friction term alone that two such runs would reveal [%, by name], if any."""
+    """Describe the smallest change in each friction term, taken alone, that two such runs would reveal [%, by name]."""
     least = [f"{name} {percent:.2g} %" for name, percent in detectable.items() if percent <= _WHOLE]
     never = [name for name, percent in detectable.items() if percent > _WHOLE]
     lines = []

@@ -8,7 +8,7 @@ import typer
 
 def schema(
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Write it to this file instead of standard output.")
+        Path | None, typer.Option("--out", metavar="FILE", help="Write to this file instead of standard output.")
     ] = None,
 ) -> None:
     """Print the JSON Schema of the TOML file. Editors use it to complete and check a file that begins with `#:schema

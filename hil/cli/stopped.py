@@ -1,7 +1,7 @@
-"""Ctrl-C, SIGTERM and SIGHUP while no arm moves: a message, the next command, and exit code 128 plus the signal's
-number.
+"""Handle Ctrl-C, SIGTERM and SIGHUP while no arm moves: print a message and the next command; exit with 128 plus the
+signal number.
 
-While an arm may move, hil.experiment.stop_request handles them; the exit codes are the same.
+While an arm may move, hil.experiment.stop_request handles these signals; the exit codes are the same.
 """
 
 import signal

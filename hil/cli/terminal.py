@@ -33,13 +33,13 @@ _PHASES = {
 }
 
 _NARROW = 76
-"""Smallest terminal width into which the bar fits [columns]."""
+"""Smallest terminal width that fits the bar [columns]."""
 
 _QUIET_S = 0.7
 """If the arm is at rest and no report has arrived for this time [s], the display says what is being computed."""
 
 _CELLS = 3
-"""A line counts as a row of a table if it has at least this many cells."""
+"""A line counts as a table row if it has at least this many cells."""
 
 
 class Terminal:
@@ -128,7 +128,7 @@ class Terminal:
 
 
 def _bar(console: Console) -> Progress:
-    """The line above the joints, as detailed as the terminal's width allows."""
+    """Return the line above the joints, as detailed as the terminal width allows."""
     if console.width < _NARROW:
         return Progress(
             TextColumn("{task.description}"),

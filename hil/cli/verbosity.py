@@ -1,4 +1,4 @@
-"""Adds -v and -q to every subcommand; they set how much the logger `hil` writes to standard error.
+"""Add -v and -q to every subcommand; they control how much the logger `hil` writes to standard error.
 
 Without either, a command reports its progress and its errors. -v adds log messages and -vv debug messages; -q leaves
 only the result on standard output and errors on standard error.

@@ -117,7 +117,7 @@ def base_up(config: "Config") -> NDArray[np.float64]:
 
 
 def describes_planar(config: "Config") -> bool:
-    """Whether the arm of `[arm] urdf` is a planar one; False if the file cannot be read."""
+    """Whether the arm of `[arm] urdf` is planar; False if the file cannot be read."""
     try:
         return is_planar(described_arm(config), base_gravity(config))
     except ArmFileError:
@@ -176,7 +176,7 @@ def _ignored_slips(config: "Config") -> Iterator[str]:
     holders = {part: joint.link for joint in arm.joints for part in joint.fixed}
     names = (arm.base, *(joint.link for joint in arm.joints), "floor", *(box.name for box in config.clearance.boxes))
     for name in dict.fromkeys(name for pair in config.clearance.ignore for name in pair if name not in names):
-        part = f": it is a part of {holders[name]!r}" if name in holders else ""
+        part = f": it is part of {holders[name]!r}" if name in holders else ""
         yield f"clearance.ignore: {name!r} is not a known name{part}; allowed names are {', '.join(names)}"
 
 

@@ -190,7 +190,7 @@ class RecordingConfig(BaseModel):
         if count > PLANAR and self.arm.urdf is None:
             raise ValueError(
                 f"columns.position: {count} joints need arm.urdf, which gives the geometry, and one [[joints]] table "
-                "each, with its name; without a URDF, an arm has one or two joints"
+                "with its name for each; without a URDF, an arm has one or two joints"
             )
         return self
 

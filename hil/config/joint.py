@@ -48,7 +48,7 @@ class JointConfig(Table):
     @classmethod
     def _of_the_first_servo(cls, ticks: object) -> object:
         if isinstance(ticks, list):
-            raise ValueError("it must be one whole number; for two servos, give the first one's")  # noqa: TRY004  pydantic's
+            raise ValueError("it must be one whole number; for two servos, give the first servo's")  # noqa: TRY004  pydantic's
         return ticks
 
     @field_validator("turns", mode="before")

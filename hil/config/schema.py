@@ -254,7 +254,7 @@ class Config(Table):
         return [(key, value) for key, value in lists.items() if value is not None]
 
     def _check_band(self) -> None:
-        """Each joint needs a multiple of 1 / period within the band; on a spatial arm, its path defines the motion."""
+        """Check that the band contains a multiple of 1 / period for each joint, unless a path defines the motion."""
         experiment, count = self.experiment, len(self.joints)
         if experiment.band is None or self.is_chain:
             return
@@ -264,7 +264,7 @@ class Config(Table):
             found = "no multiple" if lines == 0 else "only 1 multiple" if lines == 1 else f"only {lines} multiples"
             raise ValueError(
                 f"experiment.band = [{low:g}, {high:g}] Hz contains {found} of 1 / period = {1 / experiment.period:g} "
-                f"Hz, but each of [[joints]] needs its own: lengthen period, or widen band"
+                f"Hz, but each joint needs its own: lengthen period, or widen band"
             )
 
     def _check_pilot(self) -> None:
@@ -272,7 +272,7 @@ class Config(Table):
         if self.is_chain:
             return
         if experiment.pilot and self.arm.link_lengths is None:
-            raise ValueError("experiment.pilot = true needs arm.link_lengths [m], one for each of [[joints]]")
+            raise ValueError("experiment.pilot = true needs arm.link_lengths [m], one per joint")
         if experiment.peak_torque is None and self.arm.link_lengths is None:
             raise ValueError(
                 "experiment.peak_torque is missing: set it in N m, or set arm.link_lengths and pilot = true"
@@ -282,9 +282,7 @@ class Config(Table):
 
     @property
     def is_chain(self) -> bool:
-        """Whether the arm is treated as spatial: [arm] urdf is given, and it describes no planar arm or [joint_path] is
-        given too.
-        """
+        """Whether the arm is spatial: [arm] urdf is given, and its arm is not planar or [joint_path] is given."""
         return self.arm.urdf is not None and not (self.joint_path is None and describes_planar(self))
 
     @property
@@ -384,7 +382,7 @@ def _without_lengths(path: Path, values: dict[str, Any]) -> Config:
 
 def _same_length(key: str, values: list[float] | list[list[int]], count: int) -> None:
     if len(values) != count:
-        raise ValueError(f"{key} has {len(values)} entries; it needs {count}, one for each of [[joints]]")
+        raise ValueError(f"{key} has {len(values)} entries; it needs {count}, one for each [[joints]] table")
 
 
 def _all_different(key: str, values: Sequence[int | str]) -> None:
@@ -427,7 +425,7 @@ def port_url(port: str) -> str:
 
 
 def _is_only_fake(path: Path) -> bool:
-    """Whether a TOML file describes nothing but a fake arm, which `hil fake` accepts."""
+    """Whether a TOML file describes only a fake arm, which `hil fake` accepts."""
     try:
         values = load_toml(path)
     except TomlFileError:

@@ -69,7 +69,7 @@ class Body:
 
 
 MOST_LINKS = 500
-"""Largest number of links that a description may have: no arm has so many, and its tree is walked recursively."""
+"""Largest number of links that a description may have: no real arm has so many, and the tree is walked recursively."""
 
 
 def check_size(links: int, path: Path) -> None:

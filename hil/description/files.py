@@ -1,4 +1,4 @@
-"""Reads an arm from a URDF or MJCF file, which are told apart by their root element."""
+"""Reads an arm from a URDF or MJCF file; the root element shows which of the two it is."""
 
 import re
 from collections.abc import Sequence

@@ -213,7 +213,7 @@ class _Tree:
                 )
 
     def _way(self, body: int) -> list[int]:
-        """Bodies on the path from this one to the world, which is not included."""
+        """Bodies on the path from this one to the world, excluding the world."""
         way = []
         while body != WORLD:
             way.append(body)
@@ -286,7 +286,7 @@ class _Tree:
 
 
 def _listed(what: str, names: list[str]) -> str:
-    """The names, with the verb "has" or "have"."""
+    """Return the names followed by "has" or "have"."""
     plural = {"joint": "joints", "body": "bodies"}[what]
     quoted = ", ".join(f'"{name}"' for name in names)
     return f"{what} {quoted} has" if len(names) == 1 else f"{plural} {quoted} have"

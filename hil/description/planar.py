@@ -32,7 +32,7 @@ def is_planar(arm: ArmDescription, gravity: Array) -> bool:
 
 
 def _first_link(arm: ArmDescription, offsets: list[Array]) -> Array:
-    """From joint 1 to joint 2, or to the centre of mass of the only link (3,) [m], in the base's frame."""
+    """Vector from joint 1 to joint 2, or to the centre of mass of the only link (3,) [m], in the base's frame."""
     first = arm.joints[0]
     return offsets[1] if len(offsets) > 1 else np.asarray(first.rotation @ first.body.centre)
 

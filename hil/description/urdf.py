@@ -305,7 +305,7 @@ def _rigid(
 ) -> tuple[Body, list[str], list[str], dict[str, Body]]:
     """Merge a link with everything attached to it.
 
-    Also returned: the names of merged links and of held joints, and the own bodies of the links that these move.
+    Also returns the names of merged links and of held joints, and the individual bodies of links that held joints move.
     """
     body, fixed, held = bodies[link], [], []
     movable: dict[str, Body] = {}
@@ -324,7 +324,7 @@ def _rigid(
 
 
 def _own(link: str, bodies: dict[str, Body], tree: dict[str, _Joint], chosen: set[str]) -> Iterator[tuple[str, Body]]:
-    """Yield a link and all links attached to it by any joint, each with its own body in the first one's frame."""
+    """Yield a link and all links attached to it by any joint, each with its own body in the frame of the first."""
     yield link, bodies[link]
     for joint in tree.values():
         if joint.parent == link and joint.name not in chosen:
@@ -370,9 +370,7 @@ def _axis(element: ET.Element, where: str, path: Path) -> Array:
     axis = np.array([1.0, 0.0, 0.0]) if given is None else _three(given, "xyz", where, path)
     length = float(np.linalg.norm(axis))
     if abs(length - 1.0) > 1e-3:
-        raise ArmFileError(
-            f"{path}: {where}: its axis {axis.tolist()} has length {length:.4g}: it must be 1; normalise it"
-        )
+        raise ArmFileError(f"{path}: {where}: its axis {axis.tolist()} has length {length:.4g}, not 1: normalise it")
     unit: Array = axis / length
     return unit
 

@@ -9,7 +9,7 @@ from typing import Any
 
 
 class _CallableModule(ModuleType):
-    """Makes this package callable, because `hil.dry_run` names both the function and the package."""
+    """Makes this package callable: `hil.dry_run` names both the function and the package."""
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         import hil

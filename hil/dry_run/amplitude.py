@@ -1,4 +1,4 @@
-"""Search, by dry runs, for the largest torque of each joint at which exceeding a limit is sufficiently unlikely."""
+"""Search by dry runs for the largest torque per joint that keeps the risk of exceeding a limit acceptably low."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -28,7 +28,7 @@ class AmplitudeOptions:
     simulated arms show.
     """
     max_rounds: int = 12
-    """Maximum number of iterations of the search, and of reductions after it."""
+    """Maximum number of search iterations, and of subsequent torque reductions."""
     max_polishing_rounds: int = 4
     """Maximum number of final torque increases, one joint at a time."""
     close: float = 0.94
@@ -42,18 +42,19 @@ class AmplitudeOptions:
     max_ratio: float = 2.0
     """Maximum ratio of the torques of two successive iterations."""
     damping: float = 0.85
-    """Each iteration multiplies the torque by a power of the ratio of wanted to reached peaks; this factor then reduces
-    the exponent.
+    """Each iteration scales the torque by a power of the ratio of desired to reached peaks; the exponent is then
+    multiplied by this factor.
     """
     min_exponent: float = 0.4
     least_change: float = 0.005
-    """The search stops if the torque would change by less than this fraction: another iteration is not worth its
+    """The search stops if the torque would change by less than this fraction: another iteration would not be worth its
     simulations.
     """
     polishing_ratio: float = 1.06
     """Factor by which each of the final increases raises a joint's torque."""
     worst_arms: int = 4
-    """After a failed check, the next one starts with the worst arms: as many as may exceed a limit, and this many more.
+    """After a failed check, the next one starts with the worst arms: the number allowed to exceed a limit, plus this
+    many.
     """
     back_off: float = 0.93
     """Factor applied to the torque when the check on all arms has failed."""
@@ -62,7 +63,7 @@ class AmplitudeOptions:
     initial_share: float = 0.125
     """Initial torque, relative to the torque that the current limits allow."""
     initial_safe_share: float = 0.25
-    """Torque, relative to the initial one, that is assumed to be safe until the search finds a larger safe torque."""
+    """Torque assumed to be safe until the search finds a larger safe one, relative to the initial torque."""
 
 
 DEFAULTS = AmplitudeOptions()
@@ -144,7 +145,7 @@ def _search(
     executor: Executor | None,
     options: AmplitudeOptions,
 ) -> Array:
-    """Approach the limits in several rounds, since the joints are coupled; return peak torques (joints,) [N m]."""
+    """Approach the limits iteratively, since the joints are coupled; return peak torques (joints,) [N m]."""
     torque = base.segments[0].peak_torque
     first = base.first_segment() if ensemble.source == "prior" else base
 
@@ -173,7 +174,7 @@ def _search(
 def _polished(
     reached_with: Callable[[Array], Array], torque: Array, reached: Array, most: Array, options: AmplitudeOptions
 ) -> Array:
-    """Raise the torque of the joint that uses the least of its range, in small steps, while all joints stay within
+    """Raise, in small steps, the torque of the joint that uses the least of its range, while all joints stay within
     limits.
 
     reached: fraction of the allowed range that each joint uses with `torque`.
@@ -195,9 +196,7 @@ def _polished(
 
 
 def _reached(config: Config, prediction: Prediction, share: float) -> Array:
-    """Fraction of the allowed range that each joint uses (joints,): the larger of the worst arm's and the predicted
-    one.
-    """
+    """Fraction of its allowed range that each joint uses (joints,): the worst arm's or the predicted one if larger."""
     deviations = NormalDist().inv_cdf(1 - config.safety.limit_chance / (2 * GUARDED))
     foreseen = prediction.share_at(deviations)[:GUARDED].max(axis=0)
     counted = prediction.shares[:, :GUARDED].max(axis=(0, 1))
@@ -205,7 +204,7 @@ def _reached(config: Config, prediction: Prediction, share: float) -> Array:
 
 
 def _too_many(config: Config, plan: Plan, few: Ensemble, share: float, pose: Array | None, count: int) -> bool:
-    """Return whether more of these few arms exceed `share` of a limit than `count` arms may."""
+    """Whether more of the arms in `few` exceed `share` of a limit than is allowed among `count` arms."""
     if not few.size:
         return False
     passed = _passed(predict(config, plan, few, pose=pose), share)

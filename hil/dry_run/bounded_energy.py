@@ -1,4 +1,4 @@
-"""Whether an arm without torque has too little energy to leave its position limits.
+"""Check whether an unpowered arm has too little energy to leave its position limits.
 
 Friction only dissipates energy, so an unpowered arm cannot reach a pose with more potential energy than its total
 energy. If every pose on the boundary of the permitted range has more, the arm stays inside, and its swing need not be
@@ -58,9 +58,7 @@ def _by_name(physics: Physics) -> dict[str, float]:
 
 
 def _only_dissipates(p: dict[str, float], joints: int) -> bool:
-    """Whether no term of the drive stores energy or returns it to the arm; springs and offsets count as potential
-    energy.
-    """
+    """Whether the drives only dissipate energy; springs and offsets count as potential energy."""
     return all(
         p[f"viscous_{k}"] >= abs(p[f"viscous_asymmetry_{k}"])
         and p[f"coulomb_{k}"] >= 0.0
@@ -74,7 +72,7 @@ def _only_dissipates(p: dict[str, float], joints: int) -> bool:
 
 
 def _faces(low: Array, high: Array) -> list[Array]:
-    """Poses (joints, points) on each side of the permitted range."""
+    """Poses (joints, points) on each face of the permitted range."""
     if low.size == 1:
         return [low[:, None], high[:, None]]
     faces = []

@@ -1,7 +1,7 @@
 """Simulated stops of a spatial arm, which is lowered if its servos still accept commands, and falls if they do not.
 
-Stops begin at times spread over the planned path, on arms of the ensemble. For each one, the path home is simulated as
-the stream would command it, and so is the fall without torque, up to the first collision.
+Stops begin at times spread over the planned path, on arms of the ensemble. For each stop, two motions are simulated:
+the path home as the stream would command it, and the unpowered fall up to the first collision.
 """
 
 from collections.abc import Callable
@@ -33,9 +33,9 @@ LAID_DOWN = 0.95
 class Fall:
     """The hardest of the simulated falls.
 
-    moment: time in the path at which it starts [s]. hits: names of what collides; None if nothing does within FALL_S.
-    seconds: duration [s]. height: largest descent [m]. speed: largest speed at its end [m/s]. beyond: largest overshoot
-    of each joint beyond its limits in any fall (joints,) [rad].
+    moment: time in the path at which it starts [s]. hits: names of the colliding parts; None if nothing does within
+    FALL_S. seconds: duration [s]. height: largest descent [m]. speed: largest speed at its end [m/s]. beyond: largest
+    overshoot of each joint beyond its limits in any fall (joints,) [rad].
     """
 
     moment: float
@@ -51,8 +51,7 @@ class LoweringForeseen:
     """Prediction of how a stop lowers the arm.
 
     seconds: longest duration [s]. nearest: smallest clearance. lies: fraction of simulations that end in the rest pose.
-    joint: name of the joint that ends farthest from its rest angle, by `away` [rad]. helps: what to do about that
-    joint.
+    joint: name of the joint that ends farthest from its rest angle, by `away` [rad]. helps: remedy for it.
     """
 
     seconds: float
@@ -154,9 +153,9 @@ def _dropped(space: Space, first: Array, before: Array, last: Array, rate: float
 
 
 def _helps(config: Config, at: int, longest: float, used: float, needed: float) -> str:
-    """Return what to do about a joint that a lowering leaves away from the rest pose.
+    """Suggest a remedy for a joint that a stop does not lower to its rest angle.
 
-    longest: duration of the longest path [s]. used: largest torque, relative to the limit. needed: the largest that
+    longest: duration of the longest path [s]. used: largest torque, relative to the limit. needed: largest torque that
     the simulated arms need to move slowly [N m].
     """
     joint = config.joints[at]

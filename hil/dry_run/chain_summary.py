@@ -1,4 +1,4 @@
-"""Result of a spatial arm's dry run as table, text and JSON."""
+"""Result of a spatial arm's dry run as a table, text and JSON."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -156,7 +156,7 @@ def _table(run: ChainDryRun) -> Table:
 
 
 def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
-    """Explain the result in sentences, the verdict last."""
+    """Explain the result in sentences, ending with the verdict."""
     fall, lowering, why = run.stops.fall, run.stops.lowering, run.why_not(run.config)
     hit = "it hits nothing" if fall.hits is None else f"{fall.hits[0]} hits {fall.hits[1]}"
     when = "within" if fall.hits is None else "after"
@@ -180,6 +180,6 @@ def chain_dry_run_lines(run: ChainDryRun) -> list[str]:
         )
     if run.refused == "" and (doubt := run.doubt(run.config)):
         lines.append(
-            f"hil identify decides using fewer of these arms. With all {run.arms}, the experiment is not safe: {doubt}."
+            f"hil identify bases its decision on fewer arms. With all {run.arms}, the experiment is not safe: {doubt}."
         )
     return [*lines, f"NOT SAFE: {why}." if why else "SAFE. Not tested on hardware."]

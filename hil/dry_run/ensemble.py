@@ -102,7 +102,7 @@ def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int 
 
 
 def result_draws(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> list[dict[str, float]]:
-    """Draw the parameters of `count` arms as in `result_ensemble`, by the estimator's names [SI]."""
+    """Draw the parameters of `count` arms as in `result_ensemble`, keyed by the estimator's names [SI]."""
     names = result.covariance.names
     covariance = result.covariance.array()
     known = result.values
@@ -133,7 +133,7 @@ def nominal(result: Result) -> Physics:
 
 
 def _physical(drawn: dict[str, float], known: dict[str, float]) -> dict[str, float]:
-    """Move a draw into the physically possible range."""
+    """Clip a draw to the physically possible range."""
     for name, value in drawn.items():
         if term_of(name).range in {"positive", "floor"}:
             centre = abs(known[name])

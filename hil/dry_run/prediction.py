@@ -1,9 +1,9 @@
-"""The experiment simulated on an ensemble of arms: predicted peaks compared with each limit.
+"""Simulate the experiment on an ensemble of arms, and compare the predicted peaks with each limit.
 
-Every arm of the ensemble receives exactly the goal currents of the plan, ramps included, for as many periods as
-settling takes. The goals are rounded to the servos' ticks; lag and stabiliser are simulated. Peaks are expressed as
-fractions of the distance from rest to the limit; if any fraction of an arm reaches 1, the guard would have stopped that
-arm.
+Every arm of the ensemble receives exactly the goal currents of the plan, ramps included, for as many periods as it
+takes to settle. The goals are rounded to the servos' ticks; lag and stabiliser are simulated. Peaks are expressed as
+fractions of the distance from rest to the limit; if any of an arm's fractions reaches 1, the guard would have stopped
+that arm.
 """
 
 from collections.abc import Sequence
@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 QUANTITIES = ("lowest position", "highest position", "velocity", "current", "torque", "power")
 UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")
 GUARDED = 3
-"""Number of quantities, counted from the first, at whose limits the guard stops the arm. Current is clamped instead;
-torque and power follow from the other quantities.
+"""Number of leading quantities at whose limits the guard stops the arm. Current is clamped instead; torque and power
+follow from the other quantities.
 """
 
 QUANTILE = 0.99
@@ -85,7 +85,7 @@ class Prediction:
 
     @property
     def limit_chance(self) -> Array:
-        """Probability that a quantity exceeds its limit (quantities, joints), from a normal tail above the median."""
+        """Probability that a quantity exceeds its limit (quantities, joints), with a normal tail above the median."""
         middle, spread = self._middle()
         return np.asarray([[0.5 * erfc(z / sqrt(2)) for z in row] for row in ((1 - middle) / spread).tolist()])
 
@@ -172,7 +172,7 @@ def predict(
 def _peaks(
     arms: ManyArms, commands: Sequence[Commands], rate: float, settling: SettlingRule, executor: Executor | None
 ) -> tuple[Array, NDArray[np.int64]]:
-    """`ManyArms.peaks`, distributed over the executor if there is one; arms are simulated independently."""
+    """Call `ManyArms.peaks`, distributed over the executor if there is one; arms are simulated independently."""
     if executor is None:
         return arms.peaks(commands, rate, settling)
     parts = [arms.part(first, first + _ARMS_A_TASK) for first in range(0, len(arms.physics), _ARMS_A_TASK)]
@@ -182,9 +182,7 @@ def _peaks(
 
 
 def _extreme(peaks: Array) -> Array:
-    """Extreme value of each peak over several multisines: from (multisines, arms, peaks, joints) to (arms, peaks,
-    joints).
-    """
+    """Extremes of each peak over several multisines: (multisines, arms, peaks, joints) to (arms, peaks, joints)."""
     most: Array = peaks.max(axis=0)
     most[:, LOWEST] = peaks[:, :, LOWEST].min(axis=0)
     return most

@@ -1,4 +1,4 @@
-"""What is known about an arm before identification: masses, lengths and friction, each with its spread.
+"""Prior knowledge of an arm before identification: masses, lengths and friction, each with its spread.
 
 `[arm.prior]` gives what the user knows. The rest is estimated from link lengths by the rules of thumb below, which are
 based on only a few arms, and from the servo models (hil.drivers.servo_prior); both have a wide spread.
@@ -47,8 +47,8 @@ class Quantity:
 
 
 def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
-    """Draw base parameters, friction terms, encoder zeros and lag: `count` values (count,) [SI] by the estimator's
-    names.
+    """Draw `count` values (count,) [SI] of each base parameter, friction term, encoder zero and lag, keyed by the
+    estimator's names.
 
     Raises ConfigError if the link lengths are missing.
     """
@@ -73,7 +73,7 @@ def base_draws(config: Config, count: int, seed: int) -> dict[str, Array]:
 
 
 def quantities(config: Config, lengths: Array) -> dict[str, Quantity]:
-    """The quantities to draw, by the names of `[arm.prior]`, plus the Stribeck terms and the lag."""
+    """The quantities to draw, keyed by the names in `[arm.prior]`, plus the Stribeck terms and the lag."""
     given = config.arm.prior or PriorConfig()
     models = [joint.joint.servo for joint in config.joints]
     priors = [servo_prior(model) for model in models]

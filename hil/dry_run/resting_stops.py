@@ -1,5 +1,4 @@
-"""Joints of a spatial arm that lie on their own mechanical stop in the rest pose; the configuration does not say
-which.
+"""Infer which joints of a spatial arm lie on their own mechanical stops in the rest pose.
 
 In the rest pose an arm lies without torque. It is supported by a surface (floor, cradle, another link) or by the
 joints' own stops. Moving the arm can lift it off a surface; a stop holds its joint whatever the angles of the others.
@@ -66,7 +65,7 @@ def planned_paths(plan: Plan) -> list[Array]:
 
 
 def said_of_stops(config: Config, side: Array) -> str:
-    """Say which joints are assumed to lie on their own stops, and what follows if they do not; "" if none are."""
+    """State which joints are assumed to lie on their own stops, and what happens if they do not; "" if none are."""
     found = []
     for joint, each, rest in zip(config.joints, side.tolist(), config.arm.rest_pose, strict=True):
         if each:
@@ -82,7 +81,7 @@ def said_of_stops(config: Config, side: Array) -> str:
 
 
 def _ends(config: Config, rest: Array) -> tuple[Array, Array]:
-    """Distance of the rest pose from the nearer of the configured and the described end, on each side (joints,)."""
+    """Distance of the rest pose from the nearer end of the range, configured or described, on each side (joints,)."""
     limits = np.array([joint.position_limit for joint in config.joints])
     ends = np.abs(limits - rest[:, None])
     for row, joint, at in zip(ends, described_arm(config).joints, rest, strict=True):

@@ -6,10 +6,9 @@ planned   the run is stopped at any moment of the planned motion, because of a s
           port, or a killed program
 passed    the motion differs from the plan (a blocked, reversed or unpowered joint, or an arm other than the one
           described), so the guard stops it at a limit: one joint at its position limit moves outwards at its velocity
-          limit, the other is anywhere within its range
+          limit; the other is anywhere within its range
 
-The simulation includes what a dry run includes: rigid links, friction, current lag, and servos that behave as their
-manual says.
+As in a dry run, rigid links, friction, current lag, and servos that behave as documented are assumed.
 """
 
 import math
@@ -43,7 +42,9 @@ LONGEST_S = 1.5
 _ARMS = 16
 _THREADS = 2
 _AHEAD_S = (-0.1, -0.05, 0.0, 0.05, 0.1, 0.2)
-"""Times over which position is extrapolated by velocity [s], to find the moments that lead to the largest overshoot."""
+"""Times over which position is extrapolated at constant velocity [s], to find the moments that lead to the largest
+overshoot.
+"""
 _EVENLY = 16
 _IMMOVABLE = 1e3  # kg m^2
 _JUDGED_AFTER_S = (0.05, 0.2, 0.5)
@@ -82,8 +83,8 @@ class Stopping:
 class _Start:
     """Initial state of a stop.
 
-    state: as taken by `respond` (5 or 6, joints). goal: torque commanded by the previous goals (joints,) [N m]. jammed:
-    index of a blocked joint, or None.
+    state: as expected by `respond` (5 or 6, joints). goal: torque commanded by the previous goals (joints,) [N m].
+    jammed: index of a blocked joint, or None.
     """
 
     state: Array
@@ -95,7 +96,7 @@ _Piece = tuple[Array, Feedback, int]
 """Commanded torque (joints,) [N m], feedback added to it, and duration in samples."""
 
 _Commands = Callable[[_Start], Iterator[list[_Piece]]]
-"""Yields the commands of a stop from a given start: one list of pieces for each form that the stop may take."""
+"""Yields the commands of a stop from a given start: one list of pieces for each variant of the stop."""
 
 
 def stopping_distance(config: Config, plan: Plan, ensemble: Ensemble, velocity: Array) -> Stopping:
@@ -156,7 +157,7 @@ def _farthest(
 
 
 def _planned_goals(config: Config, plan: Plan) -> Array:
-    """Commanded torque of the whole plan (joints, samples) [N m]; two periods suffice, further ones repeat them."""
+    """Commanded torque of the whole plan (joints, samples) [N m]; two periods suffice, as further ones repeat them."""
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     parts = []
     for segment in plan.segments:
@@ -224,7 +225,7 @@ def _moving(pose: Array, velocity: Array) -> Array:
 
 
 def _handed_on(physics: Physics, pose: Array, joint: int, outward: float, velocity: Array) -> Array:
-    """Velocities after the other joint has jammed: its momentum is transferred to this joint instantly."""
+    """Velocities after the other joint has jammed and transferred its momentum to this joint instantly."""
     p = dict(zip(CONSTANTS, physics.vector.tolist(), strict=True))
     across = p["coupling"] * float(np.cos(pose[1]))
     shared = p["inertia_2"] + across
@@ -242,7 +243,7 @@ def _held(physics: Physics, joint: int) -> Physics:
 
 
 class _Stops:
-    """The kinds of stop as commands over time from an initial state."""
+    """Commands over time from an initial state, for each kind of stop."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -275,7 +276,7 @@ class _Stops:
         return boundary(physics if jammed is None else _held(physics, jammed), self._low, self._high)
 
     def _moved(self, limits: Boundary, scale: Array, state: Array, pieces: list[_Piece]) -> Iterator[Response]:
-        """The motion from `state`, piece by piece, as long as it may still leave the limits."""
+        """Yield the motion from `state`, piece by piece, as long as the arm may still leave its limits."""
         for piece in pieces:
             command, feedback, count = piece
             held = np.repeat((command * scale)[:, None], count, axis=1)

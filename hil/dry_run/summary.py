@@ -70,7 +70,7 @@ class DryRun:
 
 
 def dry_run_json(config: Config, run: DryRun) -> dict[str, Any]:
-    """One JSON object: verdict, largest safe torque, and every predicted quantity of each joint."""
+    """Return the JSON object: verdict, largest safe torque, and every predicted quantity per joint."""
     return {
         "schema": 1,
         "config": str(config.path),
@@ -170,7 +170,7 @@ def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
 
 
 def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
-    """Explain the result in sentences, the verdict last."""
+    """Explain the result in sentences, ending with the verdict."""
     planned, passed = run.stopping.planned, run.stopping.passed
     stopped = np.maximum(planned[Way.BRAKED], planned[Way.CUT])
     lines = [
@@ -202,7 +202,7 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
 
 
 def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> list[str]:
-    """What `hil identify` does with pilot = true: stabiliser, first torque, and what may stop it."""
+    """Describe what `hil identify` does with pilot = true: stabiliser, first torque, and what may stop it."""
     lines = []
     held = first.played.stabiliser
     if held is not None and config.stabiliser is None:
@@ -220,7 +220,7 @@ def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> 
     if largest is None:
         return [
             *lines,
-            "No torque is known yet that is safe for every arm in the whole experiment; the pilot will find it.",
+            "No torque is yet known to be safe for every arm in the whole experiment; the pilot will find one.",
             f"SAFE: {starts}{closer}. The guard would stop and brake {chance} of the simulated arms at these limits, "
             "and the pilot also learns from such stops.",
         ]
@@ -232,12 +232,12 @@ def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> 
 
 
 def _list(values: NDArray[np.float64], digits: int = 2) -> str:
-    """Values with this many decimals, small ones with two significant digits."""
+    """Format values with `digits` decimals, small ones with two significant digits."""
     return ", ".join(f"{value:.{digits}f}" if value > 10.0 ** (1 - digits) else f"{value:.2g}" for value in values)
 
 
 def _percent(chance: float) -> str:
-    """A percentage; "below 0.01 %" in the far tail, which a few hundred arms cannot resolve."""
+    """Format a probability as a percentage; "below 0.01 %" in the far tail, which a few hundred arms cannot resolve."""
     if chance < 1e-8:
         return "0 %"
     return "below 0.01 %" if chance < 1e-4 else percent(chance)

@@ -1,4 +1,4 @@
-"""The speed that the supply allows: near no-load speed, a motor cannot carry the commanded current in either direction.
+"""The speed that the supply allows: near no-load speed, it cannot drive the commanded current in either direction.
 
 If the currents fall short of their goals, no parameters can be identified from the run. The dry run and the pilot
 therefore keep joints below this speed, whatever velocity_limit says. In PWM mode the back-EMF is part of the model, and
@@ -10,7 +10,7 @@ from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 
 _SHARE = 0.85
-"""Fraction of the no-load speed that is used; the rest of the voltage drives the current."""
+"""Usable fraction of the no-load speed; the remaining voltage drives the current."""
 
 
 def within_supply(config: Config) -> Config:
@@ -31,7 +31,7 @@ def slower(config: Config, speed: list[float]) -> Config:
 
 
 def lowered(before: Config, after: Config) -> tuple[str, ...]:
-    """One sentence that names the joints whose velocity_limit was lowered; empty if there is no such joint."""
+    """One sentence that names the joints whose velocity_limit was lowered; empty if there are none."""
     pairs = zip(before.joints, after.joints, strict=True)
     now = [f"{new.name} {new.velocity_limit:g}" for old, new in pairs if old.velocity_limit != new.velocity_limit]
     if not now:

@@ -58,7 +58,7 @@ def _evenness(problem: DesignProblem, wave: Multisine) -> float:
 
 
 def _turned(wave: Multisine) -> list[Multisine]:
-    """The wave in all combinations of the joints' signs, and all of these reversed in time."""
+    """The wave with all combinations of the joints' signs, each also reversed in time."""
     signs = np.array(list(product((1.0, -1.0), repeat=wave.joints)))
     forward = [_signed(wave, sign) for sign in signs]
     return forward + [_reversed(each) for each in forward]

@@ -1,1 +1,1 @@
-"""From a recording to a result: settled or arbitrary motion, physical quantities, comparisons."""
+"""Estimate results from recordings, derive physical quantities, and compare results."""

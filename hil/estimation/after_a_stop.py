@@ -1,4 +1,4 @@
-"""What a stopped run still contains, and the command to continue with."""
+"""What remains of a stopped run, and the command to continue with."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from hil.runs.run_folder import RunFolder
 
 
 def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
-    """Sentences about what is kept of a stopped run; the last one gives the next command.
+    """Sentences on what remains of a stopped run; the last gives the next command.
 
     command: the subcommand that was stopped. shown: the configuration's path as the user wrote it.
     """
@@ -31,9 +31,7 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
 
 
 def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
-    """Sentences about what is kept after the guard or a failed servo stopped a run; the last one gives the next
-    command.
-    """
+    """Sentences on what remains after the guard or a failed servo stopped a run; the last gives the next command."""
     if can_be_estimated(run.path):
         return ["The recording is kept and complete enough for an estimate.", next_step("estimate", run.path)]
     return [f"The recording up to that point is kept in {run.path}.", next_step("check", shown)]
@@ -53,6 +51,6 @@ def can_be_estimated(path: Path) -> bool:
 
 
 def _steps(path: Path) -> list[Path]:
-    """Folders of the runs before the last one, oldest first."""
+    """Folders of the runs that preceded the final one, oldest first."""
     found = [each.parent for each in path.glob("*/samples.npy")]
     return sorted(found, key=lambda folder: (folder / "samples.npy").stat().st_mtime)

@@ -24,7 +24,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class TorqueConstant:
-    """Identified and assumed torque per goal of one joint, in `unit`: N m/A, or N m/V in pwm mode."""
+    """Identified and assumed torque of a joint per unit of goal, in `unit`: N m/A, or N m/V in pwm mode."""
 
     value: float
     std: Spread
@@ -70,8 +70,8 @@ class CalibrationResult:
 class AddedMass:
     """The mass as specified by the user: `distance` and `length` for a planar arm, `at` and `joint` for a spatial one.
 
-    mass [kg], inertia about its own centre [kg m^2]. distance: distance from the last joint [m]; length: length of link
-    1 [m]. at: position in the frame of the link that `joint` moves, by default the last joint [m].
+    mass [kg], inertia about its centre of mass [kg m^2]. distance: distance from the last joint [m]; length: length of
+    link 1 [m]. at: position in the frame of the link that `joint` moves, by default the last joint [m].
     """
 
     mass: float

@@ -1,4 +1,4 @@
-"""From the run folder of a spatial arm to its result: both estimation stages and validation on a held-out path."""
+"""Estimate the result of a spatial arm from its run folder in two stages, and validate it on a held-out path."""
 
 import time
 from contextlib import suppress
@@ -71,8 +71,8 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     currents = settled_current_findings(config, samples)
     truth, extra = true_chain_parameters(config, known), _quantities(estimate, linear, len(estimate.names))
     result = SettledResult(
-        method="settled period, least squares on Fourier lines, then maximum likelihood of each position by "
-        f"one-step-ahead prediction with an observer of {estimate.softness:g} Hz; {model.description}",
+        method="settled period, least squares on Fourier lines, then maximum likelihood of one-step-ahead "
+        f"position predictions with an observer of {estimate.softness:g} Hz; {model.description}",
         config=facts.config,
         joints=len(config.joints),
         parameters=_quantities(estimate, 0, linear),
@@ -121,7 +121,7 @@ def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
 
     A link moved by several joints couples their torques, so inexact torque constants contradict each other. Their
     ratios are therefore parameters if the configuration gives an uncertainty. Each joint has its own lag: servo models
-    differ, and neglecting half a millisecond makes the inertias of light joints wrong by several percent.
+    differ, and neglecting half a millisecond biases the inertias of light joints by several percent.
     """
     wanted = config.model
     scales = known.base.chain.joints > 1 and (wanted.torque_scale or known.prior.scale_precision is not None)
@@ -192,7 +192,7 @@ def _verdict(
     still: list[str],
     disturbances: tuple[str, ...] = (),
 ) -> Verdict:
-    """Decide whether the result can be trusted, name the least well identified base parameter, and give the reasons."""
+    """Decide, with reasons, whether the result can be trusted, and name the least well identified base parameter."""
     count = known.base.count
     certain = estimate.std[:count] / known.prior.std
     weakest = known.base.names[int(np.argmax(certain))]
@@ -263,7 +263,7 @@ def contradicting_torques(config: Config, estimate: ChainEstimate) -> tuple[str,
 
 
 def about_zeros(config: Config, estimate: ChainEstimate) -> str:
-    """State that encoder zeros were not fitted, and which ones the recording contradicts; empty if they were fitted."""
+    """Say that encoder zeros were not fitted, and which ones the recording contradicts; "" if they were fitted."""
     if estimate.model.zeros or estimate.model.joints == 1:
         return ""
     held = "The encoder zeros were taken from the configuration and not identified"
@@ -282,9 +282,7 @@ def about_zeros(config: Config, estimate: ChainEstimate) -> str:
 
 
 def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_prior: tuple[str, ...]) -> str:
-    """Name the base parameters, other than those in `from_prior`, with standard errors larger than the prior's; empty
-    if none.
-    """
+    """Name the base parameters not in `from_prior` whose standard errors exceed the prior's; "" if there are none."""
     found = [name for name in prior.surpassing(names, std) if name not in from_prior]
     if not found:
         return ""
@@ -295,12 +293,12 @@ def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_p
 
 
 def is_explained(estimate: ChainEstimate) -> bool:
-    """Whether the residual is only noise, so that nothing suggests an effect missing from the model."""
+    """Whether the residual is only noise, with no sign of an effect missing from the model."""
     return float(estimate.over_noise.max()) <= EXPLAINED and estimate.systematic <= SYSTEMATIC
 
 
 def _unexplained(config: Config, estimate: ChainEstimate) -> str:
-    """How large the residual is compared with the noise, and what that says about the model."""
+    """Describe the residual relative to the noise, and what it implies for the model."""
     over, joint = float(estimate.over_noise.max()), int(np.argmax(estimate.over_noise))
     noise = float(estimate.noise_steps[joint])
     measured = (
@@ -317,7 +315,7 @@ def _unexplained(config: Config, estimate: ChainEstimate) -> str:
     tried = ""
     if estimate.model.friction != "stribeck_load":
         if config.model.friction == "auto":
-            tried = " Friction that depends on the load was tried and does not explain it."
+            tried = " Load-dependent friction was tried and does not explain it."
         else:
             causes = f'load-dependent friction ([model] friction = "auto" tries that), {causes}'
     if over > EXPLAINED:

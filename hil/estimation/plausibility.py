@@ -19,7 +19,7 @@ FLAT = 0.02  # of the largest commanded torque, below which gravity counts as ab
 def doubts(
     config: Config, estimate: Estimate, largest_torque: float, known: Sequence[Conflict] = ()
 ) -> tuple[str, ...]:
-    """One sentence per contradiction, except for those in `known`, which have sentences of their own.
+    """One sentence per contradiction, except for those in `known`, which have their own sentences.
 
     largest_torque: largest commanded torque [N m].
     """
@@ -67,14 +67,14 @@ def _weight(config: Config, estimate: Estimate, largest_torque: float) -> list[s
                 )
         elif sure and value < 0.0 and not _hangs_upwards(config, joint - 1):
             said.append(
-                f"gravity_{joint} is {value:.3g} N m, negative: zero_ticks is half a turn off, direction is wrong, or "
+                f"gravity_{joint} is negative, {value:.3g} N m: zero_ticks is half a turn off, direction is wrong, or "
                 "a counterweight outweighs the link."
             )
     return said
 
 
 def _hangs_upwards(config: Config, joint: int) -> bool:
-    """Whether a link that rests as described, without being held, must have its centre of mass behind its joint."""
+    """Whether a link points up in its rest pose, unsupported, so that its centre of mass must lie below its joint."""
     angle = float(np.sum(config.arm.rest_pose[: joint + 1]))
     return config.stabiliser is None and np.sin(angle) > _UPRIGHT
 

@@ -16,7 +16,7 @@ QUANTISATION_FLOOR_TICKS = 1 / math.sqrt(12)
 
 @dataclass(frozen=True)
 class Checks:
-    """What the checks of an estimate found."""
+    """Findings of the checks of an estimate."""
 
     validation: Validation
     verdict: Verdict

@@ -1,4 +1,4 @@
-"""From a run folder to its result: settled period, both estimation stages, and validation on a held-out multisine."""
+"""Estimate a result from a run's settled period in two stages, and validate it on a held-out multisine."""
 
 import logging
 import time
@@ -54,8 +54,7 @@ log = logging.getLogger(__name__)
 def estimate_run(run: RunFolder, executor: Executor | None = None) -> SettledResult:
     """Estimate from the recording in `run`, write its result.json and return the result.
 
-    executor: used to start in advance the fits that `friction = "auto"` may need.
-    Raises HilError, EstimationError.
+    executor: starts in advance the fits that `friction = "auto"` may need. Raises HilError, EstimationError.
     """
     config, facts = run.load_config(), run.load_facts()
     if config.is_chain:
@@ -143,7 +142,7 @@ def _held_out(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> tup
 
 
 def _torque_instead(other: SettledPeriod | None, estimate: Estimate, drift: Drift | None) -> TorqueChange | None:
-    """The constant torque in the held-out period that explains it better than a change of friction; None if none."""
+    """The constant torque that explains the held-out period better than a change of friction; None if there is none."""
     if other is None or drift is None:
         return None
     # A torque that friction cannot explain makes the change of friction uncertain, so that none is seen.
@@ -155,7 +154,7 @@ def _torque_instead(other: SettledPeriod | None, estimate: Estimate, drift: Drif
 
 def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift | None, is_corrected: bool) -> PlayedPeriod:
     """Predict the held-out period with the friction at that time. is_corrected: correct it for friction that changes
-    within the period, as the fitted one was.
+    within the period, as was done for the fitted period.
     """
     if drift is None:
         return PlayedPeriod(other.rate, other.torque, other.position, predict_period(estimate, other))
@@ -165,14 +164,14 @@ def _predicted(estimate: Estimate, other: SettledPeriod, drift: Drift | None, is
 
 
 def _as_fitted(estimate: Estimate, other: SettledPeriod | None, drift: Drift | None) -> PlayedPeriod | None:
-    """The held-out period predicted with the friction of the fitted period; None if it did not change."""
+    """The held-out period predicted with the friction of the fitted period; None if friction did not change."""
     if other is None or drift is None or not drift.is_seen:
         return None
     return PlayedPeriod(other.rate, other.torque, other.position, predict_period(estimate, other))
 
 
 def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDArray[np.float64]:
-    """Add the variance due to what the back-EMF model neglects."""
+    """Add the variance due to effects that the back-EMF model neglects."""
     wider = covariance.copy()
     for name, std in neglected(Physics.of(estimate.parameters)).items():
         place = estimate.names.index(name)

@@ -83,22 +83,22 @@ def settled_period(config: Config, facts: RunFacts, samples: NDArray[np.void], r
 def _passes(position: NDArray[np.float64], first: int, on_time: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
     """Second halves of the settled periods `on_time` (periods, joints, samples), and of the period before.
 
-    In its first half, the period before may still hold a transient.
+    The first half of the period before may still contain a transient.
     """
     half = on_time.shape[2] // 2
     return position[first - 1, :, half:], *on_time[:, :, half:]
 
 
 def _mean_of_periods(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean over the periods that have the sample: (periods, joints, samples) to (joints, samples); NaN if none has."""
+    """Mean of (periods, joints, samples) over the periods, without missing values; NaN if all are missing."""
     count = np.isfinite(position).sum(axis=0)
     mean: NDArray[np.float64] = np.where(count > 0, np.nansum(position, axis=0) / np.maximum(count, 1), np.nan)
     return mean
 
 
 def _state_at(samples: NDArray[np.void], row: int, rate: float) -> NDArray[np.float64] | None:
-    """Angles and velocities (2, joints) [rad, rad/s] at `row`, from a cubic through the readings nearby; None if too
-    many are missing.
+    """Angles and velocities (2, joints) [rad, rad/s] at `row`, from a cubic fitted to nearby readings; None if too many
+    are missing.
     """
     half = max(_FEWEST_AROUND, round(_AROUND_S * rate))
     near = slice(max(0, row - half), row + half + 1)
@@ -149,7 +149,7 @@ def scatter(position: NDArray[np.float64]) -> NDArray[np.float64] | None:
 
 
 def _first_settled(position: NDArray[np.float64], within: float) -> int | None:
-    """Index of the first period that matches the one before it, by the same criterion as the stream; None if there is
+    """Index of the first period that matches the one before it, by the criterion used while streaming; None if there is
     none.
     """
     for period in range(1, len(position)):

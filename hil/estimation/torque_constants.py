@@ -1,4 +1,4 @@
-"""Sentences about the uncertainty that the torque constants cause in a result, for terminal and report."""
+"""Sentences on the uncertainty that the torque constants add to a result, for the terminal and the report."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -97,7 +97,7 @@ def contradictions(
 
     joints: names. extra: terms of a result that include the ratios, if there are any. ratio_std: relative standard
     deviation of the ratio of the torque constants, by parameter, where given; otherwise the spread among servos of one
-    model. known: contradictions that have sentences of their own.
+    model. known: contradictions that have their own sentences.
     """
     said = {each.name for each in known}
     found = []
@@ -119,7 +119,7 @@ def contradictions(
 def ratios_said(
     joints: Sequence[str], extra: Mapping[str, Quantity], source: Source, without: Sequence[str]
 ) -> tuple[str, ...]:
-    """A sentence on the ratios of the torques; () if one of the sentences `without` already gives them."""
+    """A sentence on the ratios of the torques; () if the sentences in `without` give them."""
     ratios = [(joint, ratio) for joint, _, ratio in _ratios(joints, extra)]
     if not ratios or without:
         return ()
@@ -152,4 +152,4 @@ def by_voltage_said(joints: Sequence[JointConfig]) -> str:
     """A sentence on what viscous friction includes for voltage-driven joints; empty for others."""
     if all(joint.drive_mode is not Mode.PWM for joint in joints):
         return ""
-    return "Driven by voltage: the viscous friction includes the motor's back-EMF."
+    return "The viscous friction of voltage-driven joints includes the motor's back-EMF."

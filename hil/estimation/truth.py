@@ -1,4 +1,4 @@
-"""The true parameters of a fake arm, as built and scaled to the torque constants that a result assumes.
+"""The true parameters of a fake arm, as built and as scaled to the torque constants that a result assumes.
 
 Motion and current determine the parameters only up to the torque constants: a result assumes the file's constants,
 which need not be those of the fake arm's motors.
@@ -68,7 +68,9 @@ class Truth:
     note: str
 
     def standard_errors(self, name: str, found: Quantity) -> float | None:
-        """The error of an estimate in units of its standard error; None if there is no truth or no standard error."""
+        """The error of an estimate in units of its standard error; None if the true value or the standard error is
+        missing.
+        """
         if name not in self.values or not 0.0 < found.std < math.inf:
             return None
         return (found.value - self.values[name]) / found.std
@@ -131,7 +133,7 @@ def _torque_ratios(config: Config) -> list[float]:
 
 
 def _factor(name: str, ratios: Sequence[float], has_ratios: bool, joints: int) -> float | None:
-    """What the true value is multiplied by; None if the joints that determine it have different ratios."""
+    """Factor to apply to the true value; None if the joints that determine it have different ratios."""
     if name in TILT or (kind_of(name) in TERMS and not term_of(name).of_torque):
         return 1.0
     if has_ratios:

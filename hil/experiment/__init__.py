@@ -1,1 +1,1 @@
-"""The experiment on the bus: stream, guard, stop."""
+"""Run an experiment on the bus: stream, guard, stop."""

@@ -19,7 +19,7 @@ nonlinearity, and twist of the joint between the servos.
 
 
 def opposed(joint: Joint) -> str:
-    """Return a question to the user: do the joint's two servos work against each other? "" if it has one servo."""
+    """Return the question of whether the joint's two servos work against each other; "" if it has only one servo."""
     if not joint.seconds:
         return ""
     signs = [joint.direction, *(second.direction for second in joint.seconds)]
@@ -27,14 +27,14 @@ def opposed(joint: Joint) -> str:
 
 
 def causes_of_standstill(joint: Joint) -> str:
-    """Say why a joint may stand still although it should move."""
+    """Say why a joint that should move may stand still."""
     if asked := opposed(joint):
         return f"Something is blocking it, its encoder is frozen, or {asked}"
     return "Something is blocking it, or its encoder is frozen."
 
 
 class Apart:
-    """Compares the other servos of each joint with its first one."""
+    """Compares each joint's other servos with its first servo."""
 
     def __init__(self) -> None:
         self._first: dict[tuple[int, int], float] = {}

@@ -35,8 +35,8 @@ WIDENED = 1.5
 
 LYING_RAD = 0.08
 _FRICTIONS = 8.0
-"""Smallest torque to which the alarm thresholds are relative, in multiples of the mean dry friction: friction that is
-twice as large as the mean must not raise an alarm.
+"""Lower bound on the torque from which the alarm thresholds follow, in multiples of the mean dry friction. It keeps
+friction of up to twice the mean from raising an alarm.
 """
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
@@ -112,7 +112,7 @@ class ChainWatch:
         return self._observer.observe(position, velocity, torque, seconds, is_free, support)
 
     def _support(self, is_away: NDArray[np.bool_], velocity: Array, torque: Array) -> Array:
-        """The direction in which a stop may prevent motion of each joint (joints,): 1, -1, or 0.
+        """Direction in which a stop may block each joint (joints,): 1, -1, or 0.
 
         is_away: whether each joint is away from its rest angle. torque: commanded (joints,) [N m].
         """

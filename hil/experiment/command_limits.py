@@ -35,7 +35,7 @@ class CommandLimits:
         return clamped
 
     def holding(self, goals: Sequence[float]) -> None:
-        """Set the goals that the servos have now [A or V], from which `clamp` continues."""
+        """Set the goals now in effect [A or V], from which `clamp` continues."""
         self._former = list(goals)
 
     def _limited(self, goal: float, former: float, limit: float, name: str) -> float:

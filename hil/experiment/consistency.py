@@ -5,30 +5,30 @@ velocity must equal the change in position. The difference,
 
     apart = position - integral of velocity,
 
-is tracked with three fading memories (leaky integrators): a short one, which reveals a sudden fault at once, a long
-one, which reveals a gradual one, and a slow one for a creep. Rounding of positions and encoder noise do not accumulate
-in this difference. The contributions of a healthy servo are known:
+is tracked with three fading memories (leaky integrators): a short one, which reveals a sudden fault at once; a long
+one, which reveals a gradual fault; and a slow one, which reveals creep. Rounding of positions and encoder noise do not
+accumulate in this difference. The contributions of a healthy servo are known:
 
 - a velocity that lags by tau, because the servo filters it: tau times the velocity, minus its mean over the memory. Any
   lag up to `LAG_S` is accepted;
 - a velocity with a scale error: that fraction of the distance covered within the memory, at most `SCALE`;
-- a velocity that is rounded towards zero, or always downwards (which of these a servo does is unknown). In the slow
-  memory: one step of the register for as long as the joint has moved in one direction longer than in the other, or a
-  bias of up to half a step for as long as it has moved, as far as the motion so far leaves it open
-  (`hil.experiment.velocity.bias`). While the register shows zero, motion below one step does not count;
-- the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where
-  a fraction `CURVED` of the change of velocity times the interval remains. Where the velocity jumps they do not: in the
-  slow memory, which contains many jumps, their sum is a random walk.
+- a velocity that is rounded towards zero, or always downwards (which of the two a servo does is unknown). In the slow
+  memory, this adds one register step times the excess of time in one direction over the other, or a bias of up to half
+  a step times the time in motion, unless the motion so far rules it out (`hil.experiment.velocity.bias`). While the
+  register shows zero, motion below one step does not count;
+- the motion between two samples: the trapezoidal rule's errors cancel over a smooth motion, except at its ends, where a
+  fraction `CURVED` of the change of velocity times the interval remains. They do not cancel where the velocity jumps:
+  in the slow memory, which contains many jumps, their sum is a random walk.
 
-A reading that jumps back and forth, as with a stuck bit, cancels in those memories. Therefore each single interval is
-also compared with the encoder's noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
+Readings that jump back and forth, as with a stuck bit, cancel in these memories. Therefore each single interval is also
+compared with the encoder noise so far: `STEPS` jumps within `STEPS_S` count as a fault.
 
 If a healthy servo reports exactly the same velocity for some time, the joint really moved at that velocity, except
 perhaps during the last `LAG_S`. The distance covered before that must therefore equal velocity times time; otherwise,
 the reported velocity is frozen. This detects a velocity that freezes near its peak sooner than the memories do, in
 which a lag could explain the difference.
 
-Lag and scale error are properties of a servo and do not change. A lag that does is a fault
+Lag and scale error are properties of a servo and do not change. A lag that changes is a fault
 (`hil.experiment.velocity.lag`). Once the motion has shown them, up to twice the estimated values are accepted, plus
 `MORE_LAG_S` and `MORE_SCALE` and twice their standard deviations.
 
@@ -67,8 +67,8 @@ STDS = 2.0
 """Number of standard deviations by which the estimates of lag and scale error may be wrong."""
 
 BIAS_LAG_S, BIAS_SCALE, BIAS_LAG_SHARE = 0.002, 0.005, 0.1
-"""Errors of these estimates, beside their standard deviations, that a creep has to exceed [s, 1]. The last is relative
-to the lag, times the range of velocities, since a filter is not a pure delay.
+"""Further errors assumed for these estimates, besides their standard deviations, when creep is judged [s, 1]. The last
+is relative to the lag times the range of velocities, since a filter is not a pure delay.
 """
 
 _LAG_SHARE = 0.25
@@ -84,16 +84,16 @@ STEPS, STEPS_S = 4, 0.5
 
 BLOCK_S = 0.0099
 """Shortest interval between two stored values of the distance covered under an unchanged velocity [s]. The latest three
-values reach back by `LAG_S`.
+values span `LAG_S`.
 """
 
 SLOW_RAD_S, RESOLUTION_RAD_S = 0.3, 0.025
-"""Below the first velocity, readings may stay the same while a joint sticks and slips. Second value: resolution of the
-readings [rad/s].
+"""Velocity below which readings may stay the same while a joint sticks and slips, and resolution of the readings
+[rad/s].
 """
 
 LONGEST_GAP_S = 0.06
-"""If two exchanges are farther apart than this [s], the velocity in between is unknown. An interval at 20 Hz is
+"""If two exchanges are farther apart than this [s], the velocity in between is unknown. The interval at 20 Hz is
 shorter.
 """
 
@@ -104,9 +104,9 @@ samples per period, the fastest that is used, needs 0.27.
 """
 
 ROUGH_TIMES = 2.0
-"""Allowance of the slow memory for a velocity that jumps between samples, as when teeth change sides: multiple of the
-root of the sum of squares of `CURVED` times the difference between successive changes, times the interval. A jump
-anywhere within an interval causes an error whose RMS is 0.29 of it, times the interval, and counts twice.
+"""Allowance of the slow memory for a velocity that jumps between samples, as when gear teeth change sides: a multiple
+of the root sum of squares of `CURVED` times the difference between successive changes, times the interval. A jump
+anywhere within an interval causes an RMS error of 0.29 times the jump times the interval, and counts twice.
 """
 
 CURVED_AT_FIRST = 0.3
@@ -160,14 +160,14 @@ MEMORY = np.dtype(
 )
 """State of the check of one joint.
 
-position, velocity, turn: latest ones, and the latest change of velocity [rad, rad/s]; the position is NaN before the
+position, velocity, turn: latest values, and latest change of velocity [rad, rad/s]; the position is NaN before the
 first one and after a long gap. seconds, moved, difference, unknown, most_curved: sums (for the last one, the maximum)
-since the long memory was last updated. seen: that difference without motion that the velocity's register cannot show.
-headed: time of motion in the positive minus that in the negative direction since then [s]. rough: sum of squares of
-what jumps of the velocity may add in each interval since then [rad^2]. heading, roughness: the same two, in the slow
-memory. moving: time of motion in it [s]. learnt: information from which lag and scale error were learnt [rad^2/s]. lag,
-scale: their largest accepted values [s, 1]. Then the range of the bias, and the sums from which lag and scale error are
-estimated.
+since the long memory was last updated. seen: `difference` without motion that the velocity register cannot show.
+headed: time of motion in the positive minus that in the negative direction since then [s]. rough: sum of squares of the
+errors that velocity jumps may cause in each interval since then [rad^2]. heading, roughness: the same two in the slow
+memory. moving: time in motion there [s]. learnt: information from which lag and scale error were estimated [rad^2/s].
+lag, scale: their largest accepted values [s, 1]. The remaining fields hold the range of the bias and the sums from
+which lag and scale error are estimated.
 """
 
 
@@ -181,7 +181,7 @@ def begin(memory: Any) -> None:
 def look(memory: Any, position: float, velocity: float, seconds: float, unsure: float) -> bool:
     """Process the latest sample, `seconds` after the previous one. Returns whether it is inconsistent.
 
-    unsure: excess duration of its exchange [s], by which the measurement time is uncertain.
+    unsure: excess duration of its exchange [s], the uncertainty of the measurement time.
     """
     former, before = memory.position, memory.velocity
     memory.position, memory.velocity = position, velocity
@@ -238,7 +238,7 @@ def look(memory: Any, position: float, velocity: float, seconds: float, unsure: 
 
 
 def lost(memory: Any) -> None:
-    """Restart with the next reply, because too many replies are missing."""
+    """Restart the check at the next reply, because too many replies are missing."""
     memory.position = np.nan
 
 
@@ -277,7 +277,7 @@ def check_standstill(name: str, states: Iterable[State], joint: int, still: floa
 
 
 def _looks_long(memory: Any, velocity: float) -> bool:
-    """Add the intervals since the last call to the long memories; return whether one shows a disagreement."""
+    """Add the intervals since the last call to the long memories; return whether either shows a disagreement."""
     long, slow, seconds = memory.long, memory.slow, memory.seconds
     moved, difference, unknown = memory.moved, memory.difference, memory.unknown
     _add(long, LONG_S, moved, difference, velocity, seconds, memory.most_curved, unknown)
@@ -303,7 +303,7 @@ def _looks_long(memory: Any, velocity: float) -> bool:
 
 
 def _creeps(memory: Any, velocity: float, unsure: float) -> bool:
-    """Whether the position creeps, given what is known of the velocity's errors.
+    """Whether the position creeps, given the known velocity errors.
 
     unsure: allowance for rounding and jumps [rad].
     """
@@ -321,7 +321,7 @@ def _forget_sums(memory: Any) -> None:
 
 
 def _learn(memory: Any) -> None:
-    """Accept a multiple of the lag and the scale error estimated so far, and no longer any that a servo might have."""
+    """Accept a multiple of the lag and scale error estimated so far instead of the largest that any servo may have."""
     lags = memory.lags
     memory.learnt = lags.information
     memory.lag = min(LAG_S, 2.0 * max(lags.lag, 0.0) + MORE_LAG_S + STDS * lags.lag_std)
@@ -359,7 +359,7 @@ def _is_frozen(same: Any, moved: float, velocity: float, seconds: float, unknown
 
 
 def _has_jumped(steps: Any, step: float, seconds: float) -> bool:
-    """Process the difference over one interval, less what the motion explains [rad]; return whether it is wrong."""
+    """Process the difference over one interval, minus what the motion explains [rad]; return whether it is faulty."""
     if seconds <= 0.0:
         return False
     steps.since += seconds
@@ -392,8 +392,8 @@ def _add(
 ) -> None:
     """Add one interval of `seconds`, at the end of which the joint has `velocity`.
 
-    moved, difference: change of position, and the same minus the integral of velocity [rad]. curved, unknown: their
-    uncertainty [rad], the second of which accumulates.
+    moved, difference: change of position, and the same minus the integral of velocity [rad]. curved, unknown:
+    uncertainties of these [rad]; only the second accumulates.
     """
     kept = 1.0 - seconds / time_constant if seconds < time_constant else 0.0
     new = 1.0 - kept
@@ -410,7 +410,7 @@ def _add(
 def _is_wrong(fading: Any, apart: float, unsure: float, velocity: float, lag: float, scale: float) -> bool:
     """Whether position and velocity disagree.
 
-    apart: their difference in this memory, without a known bias [rad]. unsure: tolerance of this memory [rad]. lag,
+    apart: their difference in this memory, minus any known bias [rad]. unsure: tolerance of this memory [rad]. lag,
     scale: largest accepted lag [s] and scale error.
     """
     allowed, of_lag = _explained(fading, unsure, velocity, lag, scale)
@@ -420,7 +420,7 @@ def _is_wrong(fading: Any, apart: float, unsure: float, velocity: float, lag: fl
 
 
 def _explained(fading: Any, unsure: float, velocity: float, lag: float, scale: float) -> tuple[float, float]:
-    """Difference that is accepted in either direction, and that which the largest lag adds [rad]."""
+    """Return the difference accepted in either direction, and what the largest lag adds [rad]."""
     allowed = unsure + scale * abs(fading.far) + fading.curved + fading.unknown + _LAG_SHARE * lag * fading.span
     return allowed, lag * (velocity - fading.mean)
 

@@ -23,8 +23,8 @@ class Deadlines:
     """Counts missed deadlines of the samples. Every method may raise SafetyStop.
 
     heard_instead: returns a message about what arrived instead of replies, with advice; "" if nothing did. any_share:
-    whether any fraction of the deadlines may be missed. This is so while an arm is lowered, when only the time without
-    a command matters.
+    whether any fraction of the deadlines may be missed. While an arm is lowered, only the time without a command
+    matters.
     """
 
     def __init__(self, config: Config, heard_instead: Callable[[], str] = str, *, any_share: bool = False) -> None:
@@ -65,7 +65,7 @@ class Deadlines:
         )
 
     def met(self) -> None:
-        """Record a sample taken on time. A single stall is tolerated; a large share of missed deadlines is not."""
+        """Record a sample taken on time. A single stall is tolerated; missing too many deadlines is not."""
         self._in_a_row = 0
         if self._often <= 0.0:
             self.any_missed = False
@@ -79,7 +79,9 @@ class Deadlines:
 
     def _why_often(self) -> str:
         if 2 * self._waited > self._counted:
-            heard = self._heard_instead() or "Check the cables, the supply and what else may be sending on the bus."
+            heard = (
+                self._heard_instead() or "Check the cables, the supply and whether anything else is sending on the bus."
+            )
             return f", most of them while waiting for replies that were lost or damaged. {heard}"
         return (
             f": the replies arrive too late for {1 / self._interval:g} Hz. `hil check` measures what this bus can do: "
@@ -96,7 +98,7 @@ class Deadlines:
             )
 
     def _acted(self, seconds: float) -> str:
-        """What the servos' watchdogs did during the gap."""
+        """Say what the servos' watchdogs did during the gap."""
         if seconds < self._watchdog:
             return ""
         return f" The servos' watchdogs act after {1e3 * self._watchdog:.0f} ms, so the arm had no current by then."

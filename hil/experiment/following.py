@@ -1,4 +1,4 @@
-"""Check that a motor carries the commanded current, by the current (or voltage) reported in each reply.
+"""Check that a motor carries the commanded current, using the current (or voltage) reported in each reply.
 
 A servo may lose its torque in the middle of a run because it rebooted, its watchdog stopped it, or another program
 switched it off. Its current is then zero, whatever is commanded. How much current is missing depends on the plan, not
@@ -61,8 +61,8 @@ differs_for, differs: duration [s] and number of samples of a deviation.
 def begin(memory: Any, joint: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
     """Set the constants of `memory`, a zero-filled record.
 
-    planned: the joint's largest goal [A, or V under PWM]. follow_share, follow_time: the settings of these names in
-    [safety].
+    planned: the joint's largest goal [A, or V under PWM]. follow_share, follow_time: the [safety] settings of the same
+    names.
     """
     tick = abs(joint.joint.drive_unit(12.0))
     sigma = max(SIGMA_SHARE * planned, SIGMA_TICKS * tick)

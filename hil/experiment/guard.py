@@ -1,6 +1,6 @@
 """Checks every sample and stops the arm when a limit is exceeded or a reply is inconsistent.
 
-The checks take a few us per sample. Those of every joint form one compiled loop (`joint_checks`), which also applies
+The checks take a few us per sample. The per-joint checks form one compiled loop (`joint_checks`), which also applies
 `following` (does the motor carry the commanded current), `consistency` (do position and velocity agree) and `work`
 (does the motor turn as commanded). Other modules check the status registers (`status_check`) and the time without
 commands or replies (`deadlines` and `silence`); `command_limits` clamps what is sent.
@@ -34,7 +34,7 @@ from hil.plan.recent_motion import RecentMotion
 __all__ = ["MOST_OUTSIDE_RAD", "Guard"]
 
 JUMP_FACTOR = 1.5
-"""Ratio of the distance that a joint may appear to move between two samples to the one that its velocity limit allows.
+"""Ratio of the distance that a joint may appear to move between two samples to the distance its velocity limit allows.
 """
 
 EARLY_MOTION_RAD = 0.05
@@ -46,7 +46,7 @@ limit.
 """
 
 _LACKS_S, _EXPLAINED = 0.1, 0.5
-"""The supply explains a lack of torque if, within the last `_LACKS_S` [s], it caused at least this share of it."""
+"""The supply explains missing torque if, within the last `_LACKS_S` [s], it caused at least this fraction of it."""
 
 _ERRORS_IN_A_ROW = 3
 """If this many consecutive replies of a servo contain both values and an error number, the arm is stopped: the servo
@@ -73,8 +73,8 @@ class Guard:
     recent: the exchanges so far, if another guard has checked them.
 
     lowers_since: for an arm that is being lowered, the time of the last exchange that all servos answered [s]. Replies
-    may then be missing longer, temperatures, voltages and alerts are accepted as long as the servos have their torque,
-    and no advice about the experiment's torque is given.
+    may then be missing for longer; temperatures, voltages and alerts are accepted as long as the servos have their
+    torque, and no advice about the experiment's torque is given.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Guard:
         self.clamp = commands.clamp
         """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""
         self.holding = commands.holding
-        """Set the goals that the servos have now [A or V], from which `clamp` continues."""
+        """Set the goals now in effect [A or V], from which `clamp` continues."""
         planned = planned or _planned(config)
         interval = 1.0 / rate if interval is None else interval
         self.recent = RecentMotion(config, interval) if recent is None else recent
@@ -121,7 +121,7 @@ class Guard:
         self._silence = Silence(config, interval, patience, lowers_since)
         self._patience = patience or float("inf")
         self._late_after = self._patience + LATE_WAKE_UP_S
-        """Duration of an exchange that shows that this computer is busy [s]."""
+        """Duration above which an exchange shows that this computer is busy [s]."""
         self._heard_instead = heard_instead
         self._deadlines = Deadlines(config, heard_instead, any_share=is_lowering)
         self._longest_gap = safety.watchdog
@@ -144,7 +144,7 @@ class Guard:
         self._silence.woke_up(now, late)
 
     def others_answer(self) -> None:
-        """Record that some of the servos that are not heard do answer: a silent one hides their replies."""
+        """Record that some servos that are not heard do answer: a silent one hides their replies."""
         self._silence.others_answer = True
 
     def late(self, seconds: float = 0.0) -> None:
@@ -191,7 +191,7 @@ class Guard:
         return self._status.is_in_doubt
 
     def _look_one_by_one(self, state: State, unsure: float) -> None:
-        """Check an exchange in which replies are missing or report an error, or that follows such an exchange."""
+        """Check an exchange with missing replies or with errors in replies, or one that follows such an exchange."""
         now, missing, error = state.time_before_write, state.missing, state.error
         self._silence.ask(now)
         # While the arm is lowered, an exchange may be awaited for a good part of the time that is allowed.
@@ -212,7 +212,7 @@ class Guard:
         self._was_irregular = self._silence.any_missed or any(self._errors)
 
     def _count_errors(self, index: int, error: int) -> None:
-        """Count the errors that a servo reports in a row together with its values; too many are a stop."""
+        """Count consecutive replies in which a servo reports an error with its values; stop the arm after too many."""
         self._errors[index] = self._errors[index] + 1 if error else 0
         if self._errors[index] >= _ERRORS_IN_A_ROW:
             self._stop(
@@ -230,7 +230,7 @@ class Guard:
             index,
             Cause.GOALS_LOST,
             f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. Goals are being "
-            "lost on the way, or the servo refuses them: check its cable and limits.",
+            "lost in transit, or the servo refuses them: check its cable and limits.",
         )
 
     def _stop_for(self, fault: int, state: State) -> NoReturn:
@@ -269,7 +269,7 @@ class Guard:
                 )
 
     def _still_swings(self) -> str:
-        """What to do where the arm has not come to rest."""
+        """Return advice for an arm that has not come to rest."""
         if not self._left_by_a_run:
             return "If it is still swinging, as an arm with little friction does, wait until it is at rest."
         longer = f"raise safety.rest_time ({self._safety.rest_time:g} s)"
@@ -316,7 +316,7 @@ class Guard:
         # A servo that is silent also hides those that would answer after it; torque off shows which ones do.
         shared = f"{NONE_HEARD}; requests or replies are lost: check the adapter, the cables and the supply"
         if self._silence.is_busy:
-            return f"{shared}, and whether other programs keep this computer busy: this program had just been late."
+            return f"{shared}, and whether other programs keep this computer busy: this program was running late."
         return f"{shared}."
 
     def _jumped(self, index: int, _: State) -> NoReturn:
@@ -381,7 +381,7 @@ class Guard:
                 index,
                 Cause.GOALS_CHANGED,
                 f"{said} at {velocity:.2f} rad/s: {self._supply[index]:.1f} V would drive the commanded current at "
-                "that speed, according to the published figures. Its goals are being changed on the way or by another "
+                "that speed, according to the published figures. Its goals are being altered in transit or by another "
                 "program, its supply sags, "
                 "or its current sensor is wrong: check these. If all are in order, its motor is weaker than published: "
                 f"lower velocity_limit to {BELOW_VOLTAGE * abs(velocity):.2g} rad/s.",
@@ -406,7 +406,7 @@ class Guard:
         )
 
     def look_at_supply(self, index: int, lacking: float, recent: Sequence[State]) -> None:
-        """Raise SafetyStop if the measured current shows that the supply causes a joint's lack of torque [N m]."""
+        """Raise SafetyStop if the measured current shows that the supply explains a joint's missing torque [N m]."""
         model = self._models[index]
         if model is None or not self._joints[index]["is_followed"] or self._status.other_goal(index) is not None:
             return
@@ -427,7 +427,7 @@ class Guard:
         if held is not None and abs(carried - held) < abs(carried - commanded):
             return (
                 f"Its goal register reads {held:.3f} {unit}, which matches what it carries: another program is "
-                "commanding it, or goals are being changed or lost on the way."
+                "commanding it, or goals are being altered or lost in transit."
             )
         along = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
         allowed = self._joints[index]["following"]["allowed"]
@@ -436,7 +436,7 @@ class Guard:
         weak = "it cannot deliver this much at its speed and supply voltage (safety.follow_share)."
         if along > HARDLY_ANY * abs(commanded):
             return (
-                f"Its goals are being changed on the way or by another program, its current sensor is wrong, or {weak}"
+                f"Its goals are being altered in transit or by another program, its current sensor is wrong, or {weak}"
             )
         return f"Its torque is off, it was rebooted, its watchdog acted, or {weak}"
 
@@ -508,7 +508,7 @@ class Guard:
 
 
 def _joint_records(config: Config, planned: Sequence[float], left_by_a_run: bool) -> np.ndarray:
-    """What `joint_checks` needs to know about each joint."""
+    """Return the joints' records for `joint_checks`."""
     joints = np.zeros(len(config.joints), JOINT)
     safety = config.safety
     for record, joint, peak in zip(joints, config.joints, planned, strict=True):
@@ -523,7 +523,7 @@ def _joint_records(config: Config, planned: Sequence[float], left_by_a_run: bool
 
 
 def _measures_supply(joint: JointConfig) -> bool:
-    """Whether the reported current is the supply's instead of the motor's; then only motion and status are checked."""
+    """Whether the servo reports the supply current, not the motor current; then only motion and status are checked."""
     return joint.drive_mode is Mode.CURRENT and joint.joint.servo.senses_supply
 
 

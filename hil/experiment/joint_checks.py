@@ -1,4 +1,4 @@
-"""The checks made on every joint in every exchange, as one compiled loop: there is little time between two samples.
+"""Checks of every joint in every exchange, in one compiled loop because there is little time between samples.
 
 They are, in this order: a jump of the position, the limits of position and velocity, whether the motor carries the
 commanded current (`following`), whether position and velocity agree (`consistency`), and whether the motor turns as
@@ -53,11 +53,11 @@ JOINT = np.dtype(
 """One joint: limits, latest state, what the latest check found, and the state that each check keeps.
 
 low, high: position limits [rad]. fastest: velocity limit [rad/s]. farthest: fastest change of a reported position
-[rad/s]. may_start_outside, is_followed, is_worked: whether the joint may be found outside its limits at first, and
-whether `following` and `work` are checked. position, seen_at: latest position [rad], NaN before the first one, and its
-time [s]. found_outside: position outside the limits at which it was first seen [rad], NaN if it was inside. moved,
-seconds, most: change of the position [rad], the time that it represents [s], and the largest possible one [rad]. found:
-duration of a deviation from the goal [s], or work taken out of the arm [J].
+[rad/s]. may_start_outside, is_followed, is_worked: whether the joint may start outside its limits, and whether
+`following` and `work` are checked. position, seen_at: latest position [rad], NaN before the first one, and its time
+[s]. found_outside: first position seen, if outside the limits [rad], otherwise NaN. moved, seconds, most: change of
+position [rad], the time that it represents [s], and the largest possible change [rad]. found: duration of a deviation
+from the goal [s], or work taken out of the arm [J].
 """
 
 
@@ -91,7 +91,7 @@ class JointChecks:
         return self._check(self.joints, self._sample, 0, self._count, before, after, self.interval, unsure, 0)
 
     def look_at(self, joint: int, state: State, unsure: float, missed: int) -> int:
-        """Check one joint whose last `missed` replies were missing. The result is as for `look`."""
+        """Check one joint whose last `missed` replies were missing. Returns the same as `look`."""
         before, after, goal, current, velocity, position, _, _, _, _, _ = state
         self._pack(self._bytes, 0, *position, *velocity, *goal, *current)
         only = joint, joint + 1

@@ -61,7 +61,7 @@ _LAG_S = 0.012
 _VAGUE_S = 0.004
 """Excess duration of an exchange above which the time of its measurement counts as unknown [s]."""
 JOLT_S, JOLT_BACK_S = 0.01, 0.15
-"""Time within which a slipping joint's velocity changes, and within which it returns [s]."""
+"""Times within which a slipping joint's velocity changes and returns [s]."""
 
 JOLT_RAD_S, JOLT_TIMES = 1.2, 5.0
 """Smallest change of velocity in `JOLT_S` that counts as a jolt [rad/s], and its smallest ratio to the RMS of ordinary
@@ -86,12 +86,12 @@ JOLT = np.dtype(
     [(name, "f8") for name in ("square", "age", "squared", "since", "change", "begun")]
     + [("count", "i8"), ("oldest", "i8"), ("reversed", "i8")]
 )
-"""Statistics of a joint's changes of velocity; zero-filled at first, but for `begun`, which is minus infinity.
+"""Statistics of a joint's changes of velocity; initially zero, except `begun`, which is minus infinity.
 
-square: mean square of ordinary ones [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may still
-turn out to belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s]. begun: its time
-[s]. count, oldest: number of earlier velocities stored, and the row of the oldest. reversed: whether the joint turned
-round in the first change of a possible jolt.
+square: mean square of ordinary changes [rad^2/s^2], over age [s]. squared, since: sum of squares times time that may
+still turn out to belong to a jolt, and its duration [s]. change: first change of a possible jolt [rad/s]. begun: time
+of that change [s]. count, oldest: number of earlier velocities stored, and the row of the oldest. reversed: whether the
+joint reversed in the first change of a possible jolt.
 """
 
 
@@ -102,8 +102,8 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
     No motor can do this on any arm: it would have to accelerate and brake much harder than ever before. The check
     therefore needs no knowledge of the arm. Changes of velocity over `JOLT_S` are compared with ordinary ones.
 
-    Where the joint turns round in both changes, the teeth of a gear with backlash have changed sides at two successive
-    reversals: the motor crosses the gap much faster than it drives the arm, which is not a jolt.
+    If the joint reverses in both changes, the teeth of a gear with backlash have changed sides twice in succession: the
+    motor crosses the gap much faster than it drives the arm. This is not a jolt.
 
     joints: records of the type JOLT. former: the latest velocities (samples within `JOLT_S`, joints) [rad/s]. least:
     smallest change that counts as a jolt [rad/s].
@@ -147,12 +147,13 @@ _jolting = numba.njit(nogil=True, error_model="numpy")(_jolting)
 _TIMES = np.dtype(
     [(name, "f8") for name in ("seen_at", "shortest", "seconds", "vague", "longest_gap", "follows", "least")]
 )
-"""What depends on the times of the samples.
+"""Quantities that depend on the times of the samples.
 
 seen_at, seconds: time of the latest sample, and since the one before [s]; seconds is infinite if the motion in between
-is not judged. shortest: duration of the shortest exchange [s]. vague: by how much longer an exchange may take [s], and
-longest_gap: the largest `seconds` over which changes of velocity are judged [s]. follows: share of a step of the torque
-that the motor has followed by the next sample. least: smallest change of velocity that counts as a jolt [rad/s].
+is not judged. shortest: duration of the shortest exchange [s]. vague: largest excess over it at which the time of a
+measurement counts as known [s]. longest_gap: largest `seconds` over which changes of velocity are judged [s]. follows:
+fraction of a torque step that the motor has followed by the next sample. least: smallest change of velocity that counts
+as a jolt [rad/s].
 """
 
 _DRIVE = np.dtype([(name, "f8") for name in ("constant", "goal", "felt")])
@@ -218,7 +219,7 @@ class ModelWatch:
 
     planned: largest goal of each joint [A, or V under PWM]. arms: prior knowledge of the arm; by default, from the
     configuration. interval: time between two exchanges [s]; by default, that between two samples. explain: raises
-    SafetyStop if the latest samples show why a moving joint lacks a torque [N m].
+    SafetyStop if the latest samples show why a moving joint lacks torque [N m].
     """
 
     def __init__(
@@ -247,7 +248,7 @@ class ModelWatch:
         self._long = max(interval, _VAGUE_S)
         back = max(1, round(JOLT_S / interval))
         self._jolt_s = back * interval
-        """Time over which a change of velocity is taken [s]."""
+        """Time over which a change of velocity is measured [s]."""
         self._jolts = np.zeros(len(largest), JOLT)
         self._jolts["begun"] = -np.inf
         self._times = np.zeros(1, _TIMES)
@@ -277,7 +278,7 @@ class ModelWatch:
         self._recent.append(state)
 
     def _judge(self, jolted: int, unlike: int, state: State) -> None:
-        """Decide on the joint that jolted and the one whose motion is inconsistent; both from 1, 0 if there is none."""
+        """Judge the joint that jolted and the one whose motion is inconsistent (numbered from 1; 0 for none)."""
         if jolted:
             self._check_displacement(jolted - 1, state)
         self._recent.append(state)
@@ -292,7 +293,7 @@ class ModelWatch:
         self._raise(unlike - 1, state)
 
     def _check_displacement(self, joint: int, state: State) -> None:
-        """Raise SafetyStop for a jolt that moved the joint farther than backlash, in which its teeth change sides."""
+        """Raise SafetyStop for a jolt that moved the joint farther than gear backlash allows."""
         jolt = self._jolts[joint]
         began = float(jolt["begun"]) - self._jolt_s
         before = next((each for each in reversed(self._recent) if each.time_before_write < began + 1e-3), None)
@@ -368,7 +369,8 @@ def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[di
 def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Array]:
     """Mean and covariance if only the planned torque and the servos' dry friction are known.
 
-    Friction decides whether a joint that stands still is held: without a bound on it, any torque might be too small.
+    Friction decides whether a stationary joint is being held: without a bound on friction, any torque might be too
+    small.
     """
     guesses = [servo_prior(joint.joint.servo).coulomb for joint in config.joints]
     mean = {f"coulomb_{number}": guess.median for number, guess in enumerate(guesses, 1)}

@@ -1,4 +1,4 @@
-"""When the exchanges of a stream are due: the samples, the exchanges between them, and the read-backs before each."""
+"""Timing of a stream's exchanges: samples, exchanges between samples, and the read-backs before each."""
 
 from collections.abc import Iterator, Sequence
 from math import inf
@@ -44,7 +44,7 @@ class Pace:
         """When the latest goals were sent [s]; None before the first ones."""
 
     def wait(self) -> Tick:
-        """Wait until the next sample is due. If a read-back is due, it takes place just before."""
+        """Wait until the next sample is due. If a read-back is due, it takes place just before the sample."""
         former = self._deadline
         if former is not None and self._exchange.read_back_at <= former + self.interval:
             read_back(self._bus, self._guard, former + self.interval)
@@ -64,7 +64,7 @@ class Pace:
     def between(self, goal: Sequence[float]) -> Iterator[State]:
         """Exchange the same goals until the next sample is due; yield each state.
 
-        An exchange that might delay the next sample is left out: the adapter may be slow, or a servo silent.
+        An exchange that might delay the next sample is skipped: the adapter may be slow, or a servo silent.
         """
         if self._deadline is None:
             return

@@ -1,8 +1,8 @@
 """Comparison of successive periods sample by sample, which avoids a burst of work at the end of a period.
 
 The measure of difference is that of `hil.estimator.data.periodicity.settling_difference`, accumulated during the
-period, so that only a few divisions remain at its end. The previous period is kept in one buffer, which the latest one
-overwrites.
+period, so that only a few divisions remain at its end. A single buffer holds the previous period; the latest one
+overwrites it.
 
 The same torque must cause the same motion. From the third period on, each sample is therefore compared with the same
 sample of the previous period. If they differ by more than `TIMES` times the RMS difference between the two previous
@@ -29,8 +29,8 @@ FLOOR_RAD = 0.05
 
 LASTING_S = 0.03
 UNJUDGED_S, _MOST_UNJUDGED = 0.2, 0.25
-"""Time at the end of a period that does not affect the tolerance in the next one [s], and the largest fraction of a
-period that this may be.
+"""Time at the end of a period that does not affect the tolerance in the next one [s], and its largest fraction of a
+period.
 """
 
 _FEWEST = 2  # samples, however low the rate
@@ -52,13 +52,13 @@ _SUMS = np.dtype(
 
 lowest, highest: range of its positions [rad]. first: first position compared, which is subtracted from the others to
 avoid cancellation. sum, sum_of_squares, seen: sum, sum of squares and number of the others. squared, pairs: sum of
-squares and number of changes from the period before. early_squared, early_pairs: the same for the first half of the
+squares and number of changes from the previous period. early_squared, early_pairs: the same for the first half of the
 period. sure_squared, sure_pairs: the same for the second half without its end.
 """
 
 
 class Repetition:
-    """Compares the positions of a period of up to `samples` samples with the previous period's.
+    """Compares the positions in a period of up to `samples` samples with those in the previous period.
 
     interval: time between samples [s].
     """
@@ -79,7 +79,7 @@ class Repetition:
     def begin(self, samples: int, *, anew: bool = False) -> None:
         """Start a new period of `samples` samples. anew: whether its torque differs from the previous period's.
 
-        The buffer is not cleared, which would take too long between two samples.
+        The buffer is not cleared: that would take too long between two samples.
         """
         self._anew = anew
         self._half = samples // 2
@@ -117,12 +117,12 @@ class Repetition:
 
 
 def _rms_change(sums: Any) -> float:
-    """RMS difference from the period before, except at the end [rad]; infinite if there was none to compare with."""
+    """RMS difference from the previous period, except at the end [rad]; infinite if there was none."""
     return sqrt(sums["sure_squared"] / sums["sure_pairs"]) if sums["sure_pairs"] else inf
 
 
 def _relative(sums: Any) -> float:
-    """RMS difference from the period before, relative to the RMS of the motion."""
+    """RMS difference from the previous period, relative to the RMS of the motion."""
     if not sums["pairs"]:
         return inf
     mean = sums["sum"] / sums["seen"]

@@ -1,6 +1,4 @@
-"""The experiment on the bus: open, check, switch torque on, stream, and switch torque off, however the experiment
-ends.
-"""
+"""Run the experiment on the bus: open, check, switch torque on, stream, and always switch torque off."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -42,13 +40,13 @@ _LAST_SAMPLES = 100
 """Number of samples attached to an exception."""
 
 _MOST_UNSEEN = 20
-"""Number of progress reports that may be queued for the observer; about one second."""
+"""Number of progress reports that may be queued for the observer (about one second)."""
 
 _REPEAT_S = 0.05
-"""Time after which torque off is sent again to a servo that does not answer [s]."""
+"""Time after which the torque-off command is sent again to a servo that does not answer [s]."""
 
 _PATIENCE_S = 0.2
-"""Time for which the end of a run waits for the observer [s]."""
+"""Time that a finished run waits for the observer [s]."""
 
 
 def run_experiment(
@@ -59,7 +57,7 @@ def run_experiment(
     plan: Plan | None = None,
     arms: Ensemble | ChainArms | None = None,
 ) -> str:
-    """Run the configured experiment and record it in `run`. Returns a sentence about the final torque state.
+    """Run the configured experiment and record it in `run`. Returns a sentence on the final torque state.
 
     Args:
         config: configuration of the arm.
@@ -70,8 +68,7 @@ def run_experiment(
         arms: prior knowledge of the arm; by default, from the configuration.
 
     Raises:
-        HilError, DriverError: if torque was switched on, the exception carries a note that says whether it is off
-            again.
+        HilError, DriverError: if torque was switched on, a note on the exception says whether it is off again.
     """
     is_given, plan = plan is not None, plan_of(config) if plan is None else plan
     if config.is_chain and not config.is_fake:
@@ -114,7 +111,7 @@ def run_experiment(
 
 @contextmanager
 def _with_torque(torque: str) -> Iterator[None]:
-    """Append the torque state to an error raised while the recording is closed, or to a stop request during cut-off."""
+    """Append the torque state to an error in closing the recording, or to a stop request made while torque is cut."""
     try:
         yield
     except (RunFolderError, StopRequested) as error:
@@ -138,7 +135,7 @@ def _play(
     lay: where the servos were when the arm's pose was checked.
 
     Returns sentences about settings that another program changed during the run, and about an arm that does not stay in
-    its rest pose without torque; "" if there are none.
+    its rest pose without torque; "" if neither happened.
     """
     stream = Stream(bus, plan, config, recorder, stop, watch, note, arms)
     settings: Settings = {}
@@ -184,7 +181,7 @@ def _play(
 
 
 def _moved_without_torque(config: Config, bus: ServoBus, recorder: Recorder) -> str:
-    """What the arm has done since the last sample, after which its torque was cut; "" if nothing is known."""
+    """Say how the arm has moved since the last sample, after which its torque was cut; "" if nothing is known."""
     samples = recorder.samples
     if not len(samples) or bus.torque_off_report is None:
         return ""
@@ -192,9 +189,9 @@ def _moved_without_torque(config: Config, bus: ServoBus, recorder: Recorder) -> 
 
 
 def _try_again(bus: ServoBus, note: Note) -> None:
-    """Cut the torque of servos that did not answer, again and again for the time that a servo takes to boot.
+    """Keep cutting the torque of servos that did not answer, for as long as a servo takes to boot.
 
-    Their watchdogs have acted by now, if they were still armed, so that packets cannot delay them any more.
+    Their watchdogs have acted by now, if they were still armed, so packets can no longer delay them.
     """
     clock = bus.port.clock
     end = clock.now() + REBOOT_S
@@ -208,7 +205,7 @@ def _try_again(bus: ServoBus, note: Note) -> None:
 
 
 def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
-    """If no servo was heard, return which ones answered when torque was cut: a silent servo hides those after it."""
+    """If no servo was heard, say which ones answered when torque was cut: a silent servo hides those after it."""
     report = bus.torque_off_report
     if not isinstance(stop, SafetyStop) or stop.cause is not Cause.MISSING or report is None:
         return ""
@@ -224,7 +221,7 @@ def _who_was_silent(bus: ServoBus, stop: BaseException | None) -> str:
 
 
 def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> None:
-    """Ask the servos for the cause of an alert; only once torque is off, because a silent servo delays the answer."""
+    """Ask the servos for the cause of an alert, but only once torque is off: a silent servo delays the answer."""
     stop = error if isinstance(error, SafetyStop) else error.__context__
     if state is None or not isinstance(stop, SafetyStop) or stop.cause is not Cause.ALERT:
         return
@@ -237,7 +234,7 @@ def _explain_alert(bus: ServoBus, state: State | None, error: BaseException) -> 
 
 
 def _check_unchanged(bus: ServoBus) -> Settings:
-    """Check that the servos' settings are still those with which the arm's pose was checked; return them."""
+    """Check that the servos' settings have not changed since the arm's pose was checked; return them."""
     before = {each: value for each, value in settings_at_start().items() if each[1] not in WRITTEN}
     now = settings_now(bus)
     if changed := changed_settings(before, now):
@@ -246,9 +243,9 @@ def _check_unchanged(bus: ServoBus) -> Settings:
 
 
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, modes_seen_ago: float) -> None:
-    """Name settings that another program changed; read only once torque is off, because reading takes time.
+    """Name settings that another program changed. They are read only once torque is off, because reading takes time.
 
-    A change that can explain a stop is named before it; all others, including one that may have come later, after it.
+    A change that can explain a stop is named before it; all others, including any that may have come later, after it.
     """
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return
@@ -277,7 +274,7 @@ def _watched(clock: Clock, watch: Watch) -> Iterator[Watch]:
 
 
 def _wait_for_rest(config: Config, bus: ServoBus) -> Lies:
-    """Wait until an arm that swings has come to rest; return where it lies then.
+    """Wait until a swinging arm has come to rest; return where it then lies.
 
     Raises ExperimentError if it has moved far since the start, or a spatial arm does not come to rest; BusShared if
     another program switches torque on.
@@ -305,7 +302,8 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
     if wire > 1 / rate:
         raise WrongSetting(
             f"experiment.rate = {rate:g}: the longest exchange takes {wire * 1e3:.2f} ms of wire time alone at "
-            f"{bus.port.baud} baud: {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud rate with `hil setup`."
+            f"{bus.port.baud} baud, which allows {1 / wire:.0f} Hz at most. Lower the rate, or raise the baud rate "
+            "with `hil setup`."
         )
     slowest = bus.port.latency + wire
     if slowest <= 1 / rate:
@@ -326,7 +324,7 @@ def _check_rate(config: Config, bus: ServoBus) -> None:
 
 
 def _check_pose(config: Config, bus: ServoBus) -> None:
-    """Check that the arm is in its rest pose; otherwise zero_ticks, direction or the arm itself is not as described.
+    """Check that the arm is in its rest pose; if it is not, zero_ticks, direction or the arm is not as described.
 
     After a run that passed this check, friction may hold the arm at up to twice the tolerance.
     """
@@ -344,13 +342,13 @@ def _check_pose(config: Config, bus: ServoBus) -> None:
 
 
 def _positions(config: Config, bus: ServoBus) -> list[float]:
-    """Each joint's angle [rad]; of the possible turns, one within the position limits if there is one."""
+    """Return each joint's angle [rad], shifted by whole turns to lie within the position limits if possible."""
     read = zip(bus.read_positions(), config.joints, strict=True)
     return [within_limits(position, joint.position_limit) for position, joint in read]
 
 
 def _from_where_it_lies(config: Config, plan: Plan, bus: ServoBus, run: RunFolder, note: Note) -> tuple[Config, Plan]:
-    """Plan the motion of a spatial arm anew if it does not lie exactly in its rest pose; save that for an estimate."""
+    """Plan a spatial arm's motion again if the arm is not exactly in its rest pose; save the change for an estimate."""
     lies = from_where_it_lies(config, bus.read_positions())
     if lies is config:
         return config, plan

@@ -1,4 +1,4 @@
-"""The servos' own current and PWM limits: read, compared with the configuration, lowered, and read back.
+"""Read the servos' own current and PWM limits, compare them with the configuration, lower them, and read them back.
 
 A servo with a lowered Current Limit refuses larger goals, even if this program fails. The session restores the limit.
 """

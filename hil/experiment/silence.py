@@ -1,13 +1,13 @@
-"""How long servos have been silent, counting only the time during which this program was listening to them.
+"""How long servos have been silent, counting only the time during which this program was listening.
 
-A stalled computer cannot receive replies, so their absence reveals nothing about the servos. Such time is limited in
-the same way as missed deadlines (`hil.experiment.deadlines`). Only the time in which this program waited for a reply
-that did not come counts as silence.
+A stalled computer cannot receive replies, so their absence reveals nothing about the servos. Such time is limited like
+missed deadlines (`hil.experiment.deadlines`). Only the time in which this program waited for a reply that did not come
+counts as silence.
 
-A busy computer also delays what it has received: the kernel passes on the bytes of a serial port in a separate thread.
-Like any other program, this thread has to wait for a core, for 4 to 10 ms at a time. So while this program itself wakes
-up late, silence of all servos may be due to the computer, and is also limited in the same way as missed deadlines. If
-some servos are heard and one is not, that servo is silent.
+A busy computer also delays received bytes: the kernel passes on the bytes of a serial port in a separate thread, which
+waits for a core like any other program, for 4 to 10 ms at a time. So while this program itself wakes up late, silence
+of all servos may be due to the computer, and is also limited like missed deadlines. If some servos are heard and one is
+not, that servo is silent.
 """
 
 from math import inf
@@ -23,7 +23,7 @@ from hil.plan.silence import (
 )
 
 LATE_WAKE_UP_S = 1e-3
-"""Lateness of this program that indicates a busy computer [s]; on an idle one, it stays below a third of this."""
+"""Lateness of this program that indicates a busy computer [s]; on an idle one, it is less than a third of this."""
 
 BUSY_S = 2.0
 """How long a computer counts as busy after this program was late [s]."""
@@ -56,7 +56,8 @@ class Silence:
         self.any_missed = False
         """Whether any joint has missed the latest reply."""
         self.others_answer = False
-        """Whether servos whose replies are missing are known to answer, i.e. a silent one hides them."""
+        """Whether servos whose replies are missing are known to answer, their replies being hidden by a silent servo.
+        """
 
     @property
     def is_busy(self) -> bool:
@@ -83,7 +84,7 @@ class Silence:
         self.any_missed = any(self.counts)
 
     def all_heard(self, now: float) -> None:
-        """Record an exchange, begun at `now` [s], in which all joints replied, as they did in the previous one."""
+        """Record an exchange, begun at `now` [s], to which all joints replied, as they did to the previous one."""
         self._asked_at = self._all_heard_at = now
 
     def missed(
@@ -118,7 +119,7 @@ class Silence:
         return None
 
     def _delayed(self, seconds: float) -> str:
-        """How much of a silence was this computer's fault [s]; during a lowering, only if it is known to be busy."""
+        """Say how much of a silence this computer caused [s]; during lowering, only if it is known to be busy."""
         is_told = seconds >= LATE_WAKE_UP_S and (self.is_busy or not self._already)
         return f", {_ms(seconds)} of it because this computer was busy" if is_told else ""
 

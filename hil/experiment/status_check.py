@@ -31,7 +31,7 @@ _GOALS_MISSED = 2
 """Number of consecutive mismatches before goals count as lost, because a single packet may be lost."""
 
 _REMEMBERED = 256
-"""Number of latest goals that are kept."""
+"""Number of latest goals kept."""
 
 _HELD_BEFORE = 4
 """If writes are lost, a servo may also hold one of this many goals that were sent before the latest matching status."""
@@ -133,18 +133,18 @@ class StatusCheck:
         if self._is_foreign[joint] or is_repeated:
             return Cause.GOALS_LOST, (
                 f"does not hold the goals of this program: {held}, and it holds goals that this program never sent. "
-                "Either another program or controller is commanding it: stop that program, or unplug that controller. "
-                "Or goals are being corrupted on the bus: check the adapter and the cable."
+                "Either another program or controller is commanding it (stop or unplug that one), or goals are being "
+                "corrupted on the bus (check the adapter and the cable)."
             )
         return Cause.GOALS_LOST, (
-            f"does not accept goals: {held}, and it missed an earlier one too. Goals are being lost on the way, or the "
+            f"does not accept goals: {held}, and it missed an earlier one too. Goals are being lost in transit, or the "
             "servo refuses them: check its cable and limits."
         )
 
     def _never_sent(self, joint: int, held: float) -> bool:
-        """Whether none of the goals sent since a status last agreed, to any joint, explains the one that is held.
+        """Whether the goal that is held differs from every goal sent to any joint since a status last matched.
 
-        The halves of a goal for two servos may be of different age, so nothing is known about their sum.
+        The halves of a two-servo joint's goal may differ in age, so nothing is known about their sum.
         """
         if not self._goals or not self._has_one_servo[joint]:
             return False
@@ -155,7 +155,7 @@ class StatusCheck:
         return all(abs(held - goal) >= self._half_tick[joint] for goals in latest for goal in goals)
 
     def look_at_clock(self, joint: int, tick: float, now: float) -> tuple[Cause, str] | None:
-        """Detect old replies and reboots by the servo's clock; return the fault's cause and text, or None.
+        """Detect old replies and reboots from the servo's clock; return the fault's cause and text, or None.
 
         tick: the servo's clock [s]. now: the computer's clock before the request [s]. Because a request may be late, a
         servo's clock may be ahead of its expected value, but it is never behind unless the reply is old. The expected
@@ -189,7 +189,7 @@ class StatusCheck:
         return None
 
     def _is_anothers(self, joint: int, offset: float, now: float) -> bool:
-        """Whether this difference of clocks (servo minus computer) is that of another joint's servo."""
+        """Whether this clock difference (servo minus computer) is that of another joint's servo."""
         return any(
             readings >= _LEARNT_READINGS
             and abs(_wrapped(offset - behind)) <= _CLOCK_TOLERANCE_S + _CLOCK_DRIFT * (now - seen_at)
@@ -199,5 +199,5 @@ class StatusCheck:
 
 
 def _wrapped(seconds: float) -> float:
-    """A difference of two clocks, wrapped to plus or minus half of the period after which a servo's clock wraps."""
+    """Wrap a difference of two clocks to plus or minus half of the period of a servo's clock."""
     return (seconds + 0.5 * _WRAP_S) % _WRAP_S - 0.5 * _WRAP_S

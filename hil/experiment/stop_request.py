@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP as requests that are handled between two samples and never lost.
+"""Treat Ctrl-C, SIGTERM and SIGHUP as requests that are handled between two samples and never lost.
 
 An exception raised by a signal handler could interrupt the code that cuts torque. Therefore, while a servo may have
 torque, the handlers only record the request, and the stream checks for it between two samples. The first signal brakes
@@ -25,7 +25,7 @@ class StopRequest:
     """Context manager that catches the signals; `check` raises StopRequested after a signal.
 
     A block inside another one in the same thread shares the outer one's request. Only the main thread receives signals;
-    in any other thread there is never a request.
+    other threads never see a request.
     """
 
     _outermost: ClassVar["StopRequest | None"] = None
@@ -59,7 +59,7 @@ class StopRequest:
 
     @contextmanager
     def only_noted(self) -> Iterator[None]:
-        """While the block runs and servos may have torque, signals are recorded but raise no exception."""
+        """Record signals without raising an exception while the block runs and servos may have torque."""
         self.check()
         self._armed += 1
         try:

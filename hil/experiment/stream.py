@@ -51,7 +51,7 @@ _BY_OTHER_GOALS = {
     *(Cause.NOT_FOLLOWING, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.GOALS_CHANGED, Cause.UNEXPECTED),
     *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
 }
-"""Causes of a stop that goals sent by another program may explain."""
+"""Causes of a stop that may be due to goals sent by another program."""
 
 _BRAKING_WATCHDOG_S = 0.04
 """Timeout of the Bus Watchdog while the arm is braked [s]. It is shorter than during the experiment, which must allow
@@ -60,7 +60,7 @@ for late commands: if the cable is unplugged during braking, the current must no
 
 
 class Progress(NamedTuple):
-    """Progress for the user: samples taken, the number expected, phase, role of the multisine, and the latest state."""
+    """Progress for the user: number of samples taken and expected, phase, role of the multisine, and latest state."""
 
     taken: int
     expected: int
@@ -140,7 +140,7 @@ class Stream:
         """Time from the latest correct read-back of the operating modes to a stop by the guard [s]."""
 
     def begins_at(self, positions: Sequence[float]) -> None:
-        """Process the joints' angles just before torque is switched on [rad]: the first sample must agree with them."""
+        """Set the joints' angles just before torque is switched on [rad]; the first sample must agree with them."""
         self._guard.rests_at(positions)
 
     @property
@@ -197,11 +197,11 @@ class Stream:
             )
 
     def _false_velocity(self, state: State, window: int) -> str:
-        """Which joint reports a velocity although its position has not changed in the last `window` samples.
+        """Name a joint that reports a velocity although its position has not changed in the last `window` samples.
 
         The last sample alone does not prove this: at a low rate, a joint may have begun to move right before it.
-        Therefore the sample before it must report a velocity too, or earlier ones velocities that would add up to
-        several encoder steps.
+        Therefore the sample before it must report a velocity too, or earlier samples must report velocities that would
+        add up to several encoder steps.
         """
         moved = np.ptp(self._recorder.samples["position"][-window:], axis=0)
         speed = np.abs(self._recorder.samples["velocity"][-window:])
@@ -225,8 +225,8 @@ class Stream:
             self._play(segment.period_current, Phase.WARM_UP)
 
     def _play_periods(self, segment: Segment) -> None:
-        """Run periods until one matches its predecessor; it is the first settled one. Then run the other periods to
-        record.
+        """Play periods until one matches its predecessor and so has settled; then play the other periods to be
+        recorded.
         """
         samples = len(segment.period_current)
         repetition = self._repetition
@@ -257,7 +257,7 @@ class Stream:
         )
 
     def _advice(self, differences: Sequence[float], samples: int) -> str:
-        """What to do about periods of `samples` samples that differ from each other by `differences`."""
+        """Return advice on periods of `samples` samples whose successive differences are `differences`."""
         decay = decay_of(differences, self._plan.settle_within)
         if decay is None:
             return "Check for backlash, a dragging cable or a slipping joint, or raise max_settling_periods."
@@ -276,12 +276,12 @@ class Stream:
         )
 
     def _correlation(self, samples: int) -> float:
-        """Correlation of the latest period's change with the one before; each period has `samples` samples."""
+        """Correlation of the latest period's change with the previous change; each period has `samples` samples."""
         latest = self._recorder.samples["position"][-3 * samples :]
         return correlation_of_changes(latest.reshape(3, samples, -1).transpose(0, 2, 1))
 
     def _check_motion(self, moved: Sequence[float]) -> None:
-        """Detect a joint held by friction or an obstacle after a period, before more time is wasted."""
+        """Detect, after a period, a joint held by friction or an obstacle, before more time is wasted."""
         for joint, way in zip(self._bus.joints, moved, strict=True):
             if way <= _LEAST_MOTION_STEPS * abs(joint.position_unit):
                 against = f" Or {opposed(joint)}" if joint.seconds else ""
@@ -291,7 +291,7 @@ class Stream:
                 )
 
     def _play_period(self, segment: Segment, period: int) -> None:
-        """Play one period and compare each sample with the one in the period before."""
+        """Play one period and compare each sample with that of the previous period."""
         repetition = self._repetition
         repetition.begin(len(segment.period_current), anew=period == 0)
         for index, row in enumerate(segment.period_current):

@@ -1,7 +1,7 @@
-"""Work of the motors: a motor that only takes energy out of the arm turns against its command.
+"""Check the work of the motors: a motor that only takes energy out of the arm turns against its command.
 
-Work is checked only without a stabiliser. An arm without one starts at a stable rest pose and cannot return more work
-than was put in. A motor that continually takes work out of it therefore turns the wrong way.
+Work is checked only without a stabiliser. Without one, the arm starts at a stable rest pose and cannot return more work
+than was put in. A motor that keeps taking work out of it therefore turns the wrong way.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
 that it keeps for a joint is a record of the type `MEMORY`.
@@ -42,7 +42,7 @@ def look(joints: Any, joint: int, goal: float, moved: float) -> float:
     """Add the work done by the previous goal; return the work taken out of the arm [J] if it is too much, otherwise -1.
 
     joints: records of all joints, with this memory in their field `work`. goal: the new goal [A or V]. moved:
-    displacement since the previous sample [rad], 0 if it is unknown what the servo did in between.
+    displacement since the previous sample [rad]; 0 if the goals in between are unknown.
     """
     memory = joints[joint].work
     held, memory.held = memory.held, goal

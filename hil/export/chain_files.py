@@ -135,7 +135,7 @@ def export_chain_mjcf(source: Source, model: ChainArmModel, path: Path) -> list[
 
 
 def _held(found: ChainLinks) -> list[str]:
-    """What a file leaves out if the joints outside the arm are not in it."""
+    """What a file omits if it does not contain the joints outside the arm."""
     if not found.arm.held:
         return []
     with_links = [joint.link for joint in found.arm.joints if joint.movable]
@@ -165,7 +165,7 @@ def _describe(root: ET.Element, model: ChainArmModel, found: ChainLinks, left: l
     """Add comments at the top of the file: its origin, and what was identified or kept."""
     words = [
         f"Inertias, damping and friction identified by hil {__version__}; everything else is from {found.path.name}.",
-        "Link inertias: of all dynamically equivalent ones, those closest to that file's. Only the following "
+        "Link inertias: the dynamically equivalent ones closest to that file's. Only the following "
         "combinations were identified:",
         *(f"{model.groups[name]} = {model.values[name]!r} +- {model.stds[name]:.1e}" for name in model.groups),
         *(f"Not representable in this format: {sentence}" for sentence in left),

@@ -1,5 +1,5 @@
-"""Links for the export of an identified spatial arm: of all physically possible links with the identified dynamics,
-those closest to the URDF.
+"""Links for the export of an identified spatial arm: among all physically possible links with the identified
+dynamics, those closest to the URDF.
 """
 
 from collections.abc import Mapping
@@ -71,7 +71,7 @@ def chain_links(source: Source, model: ChainArmModel) -> ChainLinks:
 
 
 def without_movable(joint: ArmJoint, body: Body) -> tuple[Body, float]:
-    """Separate a link from what its held joints move, such as a gripper's fingers, so that these keep their inertia.
+    """Separate a link from the parts that its held joints move, such as gripper fingers, which keep their inertia.
 
     If their described masses leave no physically possible body for the link itself, all of them keep the same fraction
     of their masses. This fraction is halved until a body is possible; if none is, it is 0. Returns the link's body and
@@ -107,7 +107,7 @@ def _same_word(one: str, other: str) -> bool:
 
 
 def _rotor(model: ChainArmModel, number: int) -> float:
-    """A joint's rotor inertia [kg m^2]: as identified or, if only a sum containing it is, typical of its servos.
+    """A joint's rotor inertia [kg m^2]: as identified or, if only a sum containing it was, typical of its servos.
 
     If this guess is far too small, the link has to be far too heavy to compensate.
     """

@@ -1,6 +1,6 @@
 """Foxglove's messages for a moving arm, as JSON: `foxglove.FrameTransforms` and `foxglove.SceneUpdate`.
 
-Field names are those of Foxglove's public schemas; a schema written here names only the fields that are used.
+Field names are those of Foxglove's public schemas; the schemas written here list only the fields used.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ _EMPTY = ("arrows", "lines", "triangles", "texts", "models")
 
 
 def stamp_of(nanoseconds: int) -> dict[str, int]:
-    """The time since 1970 as Foxglove writes it."""
+    """Convert a time since 1970 [ns] to a Foxglove time stamp."""
     return {"sec": nanoseconds // 1_000_000_000, "nsec": nanoseconds % 1_000_000_000}
 
 
@@ -96,7 +96,7 @@ def scene_schema() -> dict[str, Any]:
 
 
 def _cylinder(rod: Rod) -> dict[str, Any]:
-    """A cylinder whose axis is its own z axis."""
+    """The rod as a cylinder along the z axis of its own frame."""
     along = rod.ends[1] - rod.ends[0]
     length = float(np.linalg.norm(along))
     turn, _ = Rotation.align_vectors(along[None] / length, np.array([[0.0, 0.0, 1.0]]))

@@ -11,14 +11,13 @@ _SAID_ELSEWHERE = ("inertia", "coupling", "gravity", "viscous", "coulomb", "torq
 
 
 def left_out(model: ArmModel, carried: tuple[str, ...] = ()) -> list[str]:
-    """One sentence per model parameter that the format cannot represent, except those in `carried`, which it can."""
+    """One sentence per model parameter that the format cannot represent; `carried` names terms that it can."""
     elsewhere = (*_SAID_ELSEWHERE, *carried)
     return [_sentence(name, value) for name, value in model.values.items() if kind_of(name) not in elsewhere]
 
 
 def chain_left_out(model: ChainArmModel, carried: tuple[str, ...] = ()) -> list[str]:
-    """One sentence per parameter of a spatial arm that the format cannot represent, except those in `carried`, which it
-    can.
+    """One sentence per parameter of a spatial arm that the format cannot represent; `carried` names terms that it can.
 
     The links in the file represent all base parameters.
     """

@@ -90,7 +90,7 @@ def _spatial(config: Config) -> MovingScene:
 
 
 def _planar(config: Config) -> MovingScene:
-    """Angles are measured from the horizontal x axis; with gravity, the plane is upright."""
+    """Scene of a planar arm: angles are measured from the horizontal x axis; with gravity, the plane is vertical."""
     lengths = [float(length) for length in config.arm.link_lengths or (1.0,) * len(config.joints)]
     upright = rotation_of(0.5 * np.pi, 0.0, 0.0) if config.arm.gravity else np.eye(3)
     frames = [Frame(BASE, WORLD, upright, np.zeros(3), np.zeros(3), None)]

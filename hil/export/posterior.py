@@ -3,7 +3,7 @@
 The parameters are drawn from a normal distribution with their covariance. One factor common to all torques is also
 drawn, because the torque constant is known far less accurately than anything else. The motion reveals the ratios of the
 joints' constants, so a single factor remains, as uncertain as the best-known joint's constant. The torque per goal [A
-or V] is scaled with it, so that the drawn arms move alike under the same goals, within the accuracy of the recording.
+or V] is scaled with it, so that all drawn arms respond equally to the same goals, within the accuracy of the recording.
 The draws are matched so that their mean and covariance are exactly those of the posterior.
 """
 
@@ -156,7 +156,7 @@ def _matched(rng: np.random.Generator, samples: int, count: int) -> Array:
 def _physical(
     source: Source, names: tuple[str, ...], mean: Array, covariance: Array, values: Array, rng: np.random.Generator
 ) -> tuple[Array, int]:
-    """Redraw every draw that has negative inertia or friction or no physical masses; return the draws and how many were
+    """Redraw every arm that has negative inertia or friction or no physical masses; return the draws and how many were
     replaced.
     """
     root, redrawn = _root(covariance), 0

@@ -38,9 +38,9 @@ class Source:
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recording, whether or not it has been estimated.
+    """A recording, with or without an estimate.
 
-    joints: names of the joints. result: what was estimated from the recording, None if nothing was.
+    joints: names of the joints. result: the estimate from the recording; None if there is none.
     """
 
     run: Path

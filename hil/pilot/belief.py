@@ -3,8 +3,8 @@
 Each recorded motion is assimilated by an ensemble smoother with multiple data assimilation (Emerick and Reynolds,
 Computers and Geosciences 55 (2013) 3). Every arm of the ensemble is given the real arm's commands, and is then updated
 towards the measured motion by regressing parameters on motion over the ensemble. This needs no derivatives, no initial
-guess and no motion that separates all parameters: what a motion does not determine keeps the prior's spread. A joint
-that did not move is informative too: arms that would have moved are shifted towards more friction.
+guess and no motion that separates all parameters: parameters that a motion does not determine keep the prior's spread.
+A joint that did not move is informative too: arms that would have moved are shifted towards more friction.
 """
 
 from dataclasses import dataclass, replace
@@ -38,16 +38,16 @@ _ERROR = 0.08
 """Assumed model error of a simulated displacement, relative to that displacement."""
 _LEAST_ERROR_STEPS = 1.5
 MOVED_STEPS = 26
-"""Smallest range of motion of a joint that counts as having moved [encoder steps]."""
+"""Smallest range of motion for which a joint counts as having moved [encoder steps]."""
 _STILL = 0.02  # rad, allowed range of a simulated joint whose real counterpart stood still
 _MOST_RAISES, _RAISE = 12, (0.05, 0.25)
-"""If a simulated joint moves although the real one stood still, the logarithm of its friction is increased: at most
-this many times, each time by a random amount from this range.
+"""If a simulated joint moves although the real one stood still, the logarithm of its friction is increased, at most
+this many times, by a random amount from this range.
 """
 
 _INFLATIONS = (12.0, 6.0, 4.0, 2.0)
 """Factors by which successive updates multiply the variance of the measurement errors. Their reciprocals add up to 1,
-so that the data count once.
+so that each measurement counts once.
 """
 _LONGEST_MOVE = 1.0  # largest change of a parameter per update, in e-folds or prior standard deviations
 _HOPELESS = 3.0  # multiple of the median misfit above which an arm is replaced

@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
-    """Return `torque` (joints,) [N m], in which joints that stood `still` get `ratio` times their `former` torque.
+    """Return `torque` (joints,) [N m] with joints that stood `still` raised to `ratio` times their `former` torque.
 
     most: upper limit for those joints: the largest torque that the current limits allow (joints,) [N m].
     """

@@ -140,8 +140,8 @@ class ChainBelief:
     def _arms(self, linear: Array) -> ChainArms:
         """Arms with these parameters, in units of the commanded torque.
 
-        A linear update may make a light joint lighter than any arm can be. Such arms are moved towards the mean, and
-        discarded if that does not help.
+        A linear update may make a light joint implausibly light. Such arms are moved towards the mean, and discarded if
+        that does not help.
         """
         base, drive = self.arms.base, self.arms.drive.copy()
         n = drive.shape[2]

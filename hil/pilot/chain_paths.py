@@ -41,7 +41,7 @@ class Reserve:
     clearance: float = 0.01
 
     def larger(self, shortage: float) -> "Reserve":
-        """Return a larger reserve. shortage: by how much the predicted clearance was too small [m], otherwise 0."""
+        """Return a larger reserve. shortage: shortfall of the predicted clearance [m], otherwise 0."""
         position = min(MORE * self.position, MOST_POSITION)
         return Reserve(position, self.speed / MORE, self.torque / MORE, self.clearance + shortage)
 

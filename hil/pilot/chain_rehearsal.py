@@ -27,7 +27,7 @@ def rehearse(
 ) -> ChainDryRun:
     """Simulate the configured path, or the pilot's first step as `hil identify` would choose it.
 
-    `SafeShares` decides whether a pilot is safe, as in `hil identify`; further arms only add to the peaks that are
+    `SafeShares` decides whether a pilot is safe, as in `hil identify`; further arms only affect the peaks that are
     shown. tell, designing: called with the progress of each simulation, and of each path's design. Raises ConfigError,
     NoSafeTorque; with `servos`, DriverError.
     """

@@ -35,7 +35,7 @@ from hil.setup.session.servo_session import Say, servo_session
 MOST_STEPS = 6
 AFTER_LIMIT = 0.7
 RAISED = 1.3
-"""Another step precedes the full run if the amplitude that is safe now is at least this multiple of the last run's."""
+"""If the amplitude that is safe now is at least this multiple of the last run's, another step precedes the full run."""
 
 MOST_RAISE = 2.5
 """Largest ratio of the amplitudes of successive runs."""
@@ -219,7 +219,7 @@ def identify_chain_in_steps(
 def _full(search: ChainSearch) -> str:
     """Play the full run; repeat it with a smaller amplitude if it exceeds a limit or never settles.
 
-    If the last one fails only in its second path, which serves to validate the result, the first is enough.
+    If the last run fails only in its second path, which only serves for validation, the first path suffices.
     """
     tries = 3
     for number in range(1, tries + 1):
@@ -231,7 +231,7 @@ def _full(search: ChainSearch) -> str:
             return search.torque
         if number == tries:
             if isinstance(error, NotSettled | DidNotMove) and can_be_estimated(search.run.path):
-                search.say("The first path had already been recorded; the estimate uses it without a second path.")
+                search.say("The first path had already been recorded; the estimate uses only that path.")
                 return search.torque
             raise error
         search.learn(config, search.run)

@@ -1,6 +1,6 @@
 """The largest share of the designed paths' amplitude that is safe for every spatial arm of the current belief.
 
-`hil identify` and `hil dry-run` both decide in this way, on the same arms, so that they agree.
+`hil identify` and `hil dry-run` both use this search, on the same arms, so that they agree.
 """
 
 from collections.abc import Callable
@@ -27,12 +27,12 @@ from hil.setup.session.servo_session import Say
 Array = NDArray[np.float64]
 
 SEARCH_ARMS, ARMS = 24, 72
-"""Numbers of arms that are simulated in the search for a safe share of the amplitude, and for its confirmation."""
+"""Numbers of arms simulated in the search for a safe share of the amplitude, and to confirm it."""
 
 PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
 SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4, 0.28, 0.18)
 SMALL = 0.5
-"""If the safe share is below this fraction of the wanted one, other paths with more reserve are designed."""
+"""If the safe share is below this fraction of the desired one, other paths with more reserve are designed."""
 
 REDESIGNS = 2
 
@@ -47,17 +47,17 @@ processor time with six joints.
 """
 
 STOPPED_SHARE = 0.5
-"""Computing time for the simulation of a stop, relative to that for one arm on a path and its transitions."""
+"""Computing time of a simulated stop, relative to that of one arm on a path and its transitions."""
 
 RAISED_RATE = 1.6
-"""The first higher rate that is tried in order to advise the user, relative to the configured rate."""
+"""First higher rate tried in the search for one to recommend, relative to the configured rate."""
 
 ROOM = 1.2
-"""Advised extension of a limit, relative to the amount by which the simulated arms exceed the limit."""
+"""Recommended extension of a limit, relative to the amount by which the simulated arms exceed the limit."""
 
 SATURATED = 0.98
 LEAST_SPREAD_SHARE = 0.1
-"""A smaller [arm.prior] spread is advised only if it is at least this fraction of the configured one."""
+"""A smaller [arm.prior] spread is recommended only if it is at least this fraction of the configured one."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class SafeShares:
         return ""
 
     def _other_seed(self) -> float | None:
-        """Design paths from another seed; return the ratio of their amplitude to the former, None if there are none."""
+        """Design paths from another seed; return the ratio of new to old amplitude, None if there are none."""
         experiment = self.given.experiment
         other = experiment.model_copy(update={"seed": experiment.seed + _NEXT_SEED})
         given, former = self.given.model_copy(update={"experiment": other}), self.paths
@@ -189,7 +189,7 @@ class SafeShares:
         return times
 
     def _safe_of_these(self, config: Config, shares: tuple[float, ...], most: float) -> tuple[Found | None, str]:
-        """Find a safe share of the paths of one seed, or say why there is none."""
+        """Find a safe share for the paths of one seed, or explain why there is none."""
         most = min(most, self.cap) if self.cap < 1.0 else most
         found, why, shortage = self._largest(config, _up_to(most, shares))
         reserve = self.paths.reserve
@@ -212,9 +212,9 @@ class SafeShares:
         return found, why
 
     def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
-        """The first safe share of the paths, why a larger one is not, and how much clearance that one lacks [m].
+        """Return the first safe share of the paths, why a larger share is unsafe, and the clearance that one lacks [m].
 
-        If neither the first share nor, on few arms, the last one is safe, those between them are not tried.
+        If neither the first share nor the last one, tried on few arms, is safe, the shares between are not tried.
         """
         self._path += 1
         found, why, shortage = self._found(config, shares[0], f"amplitude 1 of at most {len(shares)}")
@@ -234,7 +234,7 @@ class SafeShares:
         return found, why, shortage
 
     def _found(self, config: Config, share: float, which: str) -> tuple[Found | None, str, float]:
-        """This share if it is safe, else why it is not, and how much clearance it lacks [m]."""
+        """Return this share if it is safe, else why it is not, and how much clearance it lacks [m]."""
         shortage = 0.0
         for count in (SEARCH_ARMS, ARMS):
             found, why, lacking = self._unsafe(config, share, count, which)
@@ -246,7 +246,7 @@ class SafeShares:
         return (None if why else found), why, shortage
 
     def _unsafe(self, config: Config, share: float, count: int, which: str) -> tuple[Found | None, str, float]:
-        """Simulate a share on some arms: the prediction, why it is not safe, how much clearance is lacking [m]."""
+        """Simulate a share on some arms; return the prediction, why it is not safe, and its lack of clearance [m]."""
         if self.trying is not None:
             most = (1 + OTHER_SEEDS) * (1 + REDESIGNS)
             self.trying(f"path {self._path} of at most {most}, {which}")
@@ -261,7 +261,7 @@ class SafeShares:
         return Found(share, plan, foreseen), why, -float(foreseen.rooms.min())
 
     def _worth(self, paths: Paths, found: Found) -> float:
-        """Worst relative standard error of the base parameters after the found share of a path."""
+        """Worst relative standard error of the base parameters with the found share of a path."""
         return paths.designer.worth(paths.designer.scaled(paths.identify, found.share))[0]
 
     def _unsafe_stop(self, config: Config, plan: Plan) -> str:
@@ -290,7 +290,7 @@ def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
-    """Return the changes by which a user may make a path safe that was rejected as `unsafe`."""
+    """Suggest changes that may make a path safe that was rejected as `unsafe`."""
     if not foreseen.is_clear:
         helps = "A rest_pose farther from obstacles, or less restrictive [clearance] settings (floor, boxes, margin)"
         return f"{helps}, if the arm allows it, can help. {_better_known(config)}"
@@ -298,7 +298,7 @@ def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
 
 
 def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
-    """Return what to change, and by how much, if a joint exceeds a limit on some of the simulated arms.
+    """Suggest what to change, and by how much, if a joint exceeds a limit on some of the simulated arms.
 
     stiffness: each joint's stabiliser stiffness at this rate, relative to that at a high rate (joints,).
     """
@@ -335,7 +335,9 @@ def limit_remedy(config: Config, peaks: Prediction, stiffness: Array) -> str:
 
 
 def _too_soft(peaks: Prediction) -> float:
-    """Factor by which a stiffer stabiliser would keep all joints within their limits, infinite if none would."""
+    """Factor by which the stabiliser must be stiffened to keep all joints within their limits; infinite if none
+    suffices.
+    """
     middle, reached = (peaks.median[:GUARDED], peaks.quantile[:GUARDED])
     room, way = (np.abs(each - middle) for each in (peaks.limits[:GUARDED], reached))
     is_typical = (peaks.limits[:GUARDED] - middle) * (reached - middle) < 0.0

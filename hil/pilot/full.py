@@ -52,9 +52,9 @@ def identify_in_steps(
 def _full(search: Search, config: Config, found: Amplitude) -> Played:
     """Play the full run; repeat it with less torque if it exceeded a limit, and with other waves if it did not settle.
 
-    Friction may hold an arm in a different place in every period, however long it moves: each repetition accepts a
-    larger difference. The fit does not need the periods to be equal, and the verdict says how well they are predicted.
-    A period unlike the one before counts as not settled too; if it happens again and again, something is wrong with the
+    Friction may stop an arm in a different place in every period, however long it moves, so each repetition tolerates a
+    larger difference. The fit does not need equal periods, and the verdict says how well they are predicted. A period
+    that differs from the one before also counts as not settled; if this keeps happening, something is wrong with the
     arm.
     """
     run, say, options = search.run, search.player.say, search.options
@@ -85,8 +85,8 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
 def _after_unsettled(search: Search, found: Amplitude, error: ExperimentError) -> Array:
     """Largest torque (joints,) [N m] of the run after one that ended with `error` without exceeding a limit.
 
-    A large motion with little friction may never settle, and less torque helps. Where torque hardly exceeds dry
-    friction it is friction that stops the joint in a different place each time, and less torque would hold it there.
+    With little friction, a large motion may never settle; less torque helps. If torque hardly exceeds dry friction,
+    however, friction stops the joint in a different place each time, and less torque would not move it at all.
     """
     middle, options = search.belief.middle, search.options
     if isinstance(error, DidNotMove):

@@ -39,7 +39,7 @@ def wandering(config: Config, belief: Belief) -> NDArray[np.bool_]:
 
 
 def falls_over(config: Config, belief: Belief) -> bool:
-    """Whether gravity drives the median arm away from its rest pose, to which only a person can bring it back."""
+    """Whether gravity drives the median arm away from its rest pose, so that only a person can bring it back."""
     lowest = float(np.linalg.eigvalsh(gravity_stiffness(config, belief.middle)).min())
     return bool(config.arm.gravity) and lowest <= 0.0
 

@@ -38,7 +38,7 @@ _LINES_FOR_DETECTION = 4
 
 @dataclass
 class Search:
-    """Search state: runs so far and the current belief; both are updated from run to run."""
+    """Search state: runs so far and the current belief; both are updated after each run."""
 
     config: Config
     run: RunFolder
@@ -53,7 +53,7 @@ class Search:
     """Largest range of motion of each joint so far (joints,) [rad]."""
 
     springs: NDArray[np.bool_] | None = None
-    """Whether each joint was held in the last run with a stabiliser (joints,); None if there was none."""
+    """Which joints had a spring in the last run with a stabiliser (joints,); None if there was none."""
     options: PilotOptions = DEFAULTS
     from_earlier: bool = False
     """Whether the belief comes from the result of an earlier run, and no run so far has contradicted it."""
@@ -135,7 +135,7 @@ class Search:
         self.calm = np.where(self.fast, np.minimum(calmer, self.calm), self.calm)
 
     def _stay_within_supply(self, played: Played) -> None:
-        """Keep joints from speeds at which their supply cannot drive the commanded current."""
+        """Keep joints below speeds at which their supply cannot drive the commanded current."""
         if played.delivered is None:
             return
         former, self.config = self.config, slower(self.config, played.delivered.tolist())
@@ -209,7 +209,7 @@ class Search:
             self.player.say(" ".join(self._of_still(still)))
 
     def _of_still(self, still: NDArray[np.bool_]) -> Iterator[str]:
-        """Sentences on joints that have not moved."""
+        """Sentences about joints that have not moved."""
         if self.fast.any():
             yield (
                 f"{_and(_names(self.config, self.fast))} exceeded the velocity limit before moving by {MOVED_STEPS} "
@@ -224,7 +224,7 @@ class Search:
         """Configuration and amplitude of a pilot.
 
         A joint that has not moved yet gets moderately more torque than before. If that is too much for some plausible
-        arms, its position limits are brought close to where it is (hil.pilot.breakaway).
+        arms, its position limits are narrowed around its current position (hil.pilot.breakaway).
         """
         options = self.options
         share = options.pilot_shares[min(number, len(options.pilot_shares) - 1)]
@@ -277,11 +277,11 @@ class Search:
         return config, self._roomiest(config, found)
 
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
-        """Return `found` or, if it leaves much of the range unused, the best amplitude among other waves if that leaves
-        less.
+        """Return `found` or, if it leaves much of the range unused, the best amplitude with other waves if that uses
+        more.
 
-        Slightly more torque may tip some of the arms over: with other waves that happens at larger amplitudes, or to
-        the other side.
+        Slightly more torque may tip some of the arms over; with other waves, this happens at larger amplitudes or
+        towards the other side.
         """
         options = self.options
         limited = (found.peak_torque >= options.at_limit * most_torque(config)).all() or self.cap is not None
@@ -394,9 +394,7 @@ def _from_anywhere(config: Config) -> Config:
 
 
 def _within_limits(config: Config, pose: Array, inside: float) -> Array:
-    """Move a pose beyond a limit, where a stopped run may leave the arm, onto the limit: the next run begins by moving
-    inwards.
-    """
+    """Clip a pose that a stopped run left beyond the limits to within them: the next run begins by moving inwards."""
     low, high = np.array([joint.position_limit for joint in config.joints]).T
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     return np.asarray(np.clip(pose, middle - inside * half, middle + inside * half))

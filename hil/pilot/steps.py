@@ -154,8 +154,8 @@ class Player:
 
 
 def tells_of_the_arm(error: ExperimentError) -> bool:
-    """Whether the error is informative about the arm, so that another run may follow: limit, no motion, no steady
-    motion, a period that differs from the one before.
+    """Whether the error is informative about the arm, so that another run may follow: limit exceeded, no motion, no
+    steady motion, or a period that differs from the one before.
 
     Errors caused by another program, or by goals that were altered before they reached the servos, are not informative:
     a further run with less torque or speed would only hide their cause.
@@ -166,7 +166,7 @@ def tells_of_the_arm(error: ExperimentError) -> bool:
 
 
 def _stood_still(config: Config, folder: RunFolder, error: ExperimentError) -> bool:
-    """Whether the only unexpected thing was a joint that did not move at all: friction is larger than assumed."""
+    """Whether the only anomaly was a joint that did not move at all, because friction is larger than assumed."""
     if not isinstance(error, SafetyStop) or error.cause is not Cause.UNEXPECTED or error.overruled:
         return False
     position = load_samples(folder.samples_path, len(config.joints))["position"]

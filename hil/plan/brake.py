@@ -1,11 +1,11 @@
 """The first part of a stop, if possible: braking, with a current opposing each joint's velocity.
 
-Braking lasts for a bounded time and stays within the current limits. It stops at once when a reply is missing, a servo
-raises an alert, a deadline is missed, a second signal arrives, or a joint accelerates according to its velocity or its
-positions, as it does if its motor turns the wrong way. Torque is cut afterwards in any case.
+Braking lasts for a bounded time and stays within the current limits. It ends at once when a reply is missing, a servo
+raises an alert, a deadline is missed, a second signal arrives, or a joint's velocity or positions show that it speeds
+up, as it does if its motor turns the wrong way. Torque is cut afterwards in any case.
 
 A joint is braked against its reported velocity only as far as the change of its position confirms it
-(`hil.plan.recent_motion`), so that no current acts in the direction in which its position moves.
+(`hil.plan.recent_motion`), so that no current acts in the direction of its actual motion.
 """
 
 from hil.config.schema import Config
@@ -67,7 +67,7 @@ def braking_gains(config: Config, interval: float | None = None) -> list[float]:
 class Brake:
     """Computes goal currents that oppose the joints' velocities.
 
-    recent: the exchanges before the stop. Without any, a joint is braked only from its second state on.
+    recent: the exchanges before the stop. Without these, a joint is braked only from its second state on.
     """
 
     def __init__(self, config: Config, interval: float | None = None, recent: RecentMotion | None = None) -> None:

@@ -59,7 +59,7 @@ def known_chain(config: Config) -> KnownChain:
 def torque_constant_stds(config: Config) -> Array:
     """Relative standard deviation of each joint's torque constant (joints,); all 0 if the configuration gives none.
 
-    If it gives only some of them, the usual value is used for the others.
+    If it gives only some of them, the typical value is used for the others.
     """
     given = any(joint.torque_per_goal_std for joint in config.joints)
     return np.array([joint.torque_spread if given else 0.0 for joint in config.joints])

@@ -62,7 +62,7 @@ class NoHeadroom(ConfigError):
 
 
 def plan_of(config: Config) -> Plan:
-    """Make the plan of this configuration's arm. Raises ConfigError."""
+    """Make the plan for the configured arm. Raises ConfigError."""
     return make_chain_plan(config) if config.is_chain else make_plan(config)
 
 
@@ -189,7 +189,7 @@ def _designed(known: KnownChain, config: Config, role: str, seed: int) -> Path:
 
 
 def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
-    """Check that the path leaves the motors headroom for errors of the description."""
+    """Check that the path leaves the motors headroom for errors in the description."""
     peaks, limits = np.abs(thought.of(path)).max(axis=1), torque_limits(config)
     for joint, peak, most in zip(config.joints, peaks.tolist(), limits.tolist(), strict=True):
         if peak > TORQUE_SHARE * most:
@@ -201,7 +201,7 @@ def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
 
 
 def _ways(config: Config, path: Path) -> tuple[Path, Path]:
-    """Transitions from the rest pose into the moving path and back; no joint leaves the range between the two."""
+    """Transitions from the rest pose into the moving path and back; each joint stays between the two."""
     count = max(2, round(config.experiment.ramp * config.experiment.rate))
     samples = path.position.shape[1]
     before, after = np.arange(-count, 0) % samples, np.arange(count) % samples

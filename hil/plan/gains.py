@@ -1,4 +1,4 @@
-"""Largest stiffness and damping with which a joint can be held at a sample rate without oscillating."""
+"""Largest stiffness and damping that can hold a joint at a given sample rate without oscillation."""
 
 import numpy as np
 from numpy.typing import NDArray

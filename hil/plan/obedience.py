@@ -1,11 +1,11 @@
 """Detection of reversed motors while an arm is lowered: such a motor speeds its joint up instead of braking it.
 
-As long as the torque does not change, a reversed motor and something that pushes the joint look alike: the arm moves as
-if an additional torque acted on the joint. So the goal of such a joint is removed for a moment, while the others are
-held. Unexplained torque that comes from the joint's own motor falls in proportion to its goal; torque from a push does
-not. The former falls along with the motor's own torque, through the same filter. What falls earlier or later has
-another cause, such as a push that has just ended, and the joint is tested again. The test is short: in that time a limp
-joint gains less speed from gravity than a reversed motor would give it.
+While the torque is constant, a reversed motor cannot be distinguished from an external push: either way, the arm moves
+as if an additional torque acted on the joint. The goal of such a joint is therefore removed briefly, while the others
+are held. Unexplained torque that comes from the joint's own motor then falls in proportion to the motor's torque,
+through the same filter; torque from a push does not. A fall that comes earlier or later has another cause, such as a
+push that has just ended, and the joint is tested again. The test is so short that an unpowered joint gains less speed
+from gravity than a reversed motor would give it.
 """
 
 from collections.abc import Sequence
@@ -25,28 +25,28 @@ ENOUGH = 0.45
 LONGEST_TEST_S = 0.06
 
 TURNED, PUSHED = 1.1, 0.7
-"""By how much the unexplained torque must fall, relative to the joint's own torque, when its goal is removed: 2 for a
-reversed motor, less right after the reversal, 1 for a motor without torque, 0 for a push. Between the two limits, the
-joint is tested again.
+"""Drop of the unexplained torque, relative to that of the joint's own torque, when its goal is removed: 2 for a
+reversed motor, less right after the reversal, 1 for a motor without torque, 0 for a push. The motor counts as reversed
+above the first limit, the joint as pushed up to the second; in between, it is tested again.
 """
 
 MOST_TURNED = 3.0
-"""Ratio of the two falls above which the unexplained torque was not that of the joint's motor alone."""
+"""Ratio of the two drops above which the unexplained torque did not come from the joint's motor alone."""
 
 UNEVEN = 0.3
-"""Deviation from a fall in proportion to the joint's own torque, relative to the whole fall, above which the
+"""Deviation from a drop in proportion to the joint's own torque, relative to the whole drop, above which the
 unexplained torque has another cause.
 """
 
 MOST_UNEVEN = 3
-"""Number of consecutive tests in which the unexplained torque falls unevenly, after which it is attributed to the motor
+"""After this many consecutive tests in which the unexplained torque falls unevenly, it is attributed to the motor
 nevertheless.
 """
 
 MOVES_RAD_S = 0.1
 DOUBT_S = 0.1
-"""How long after an inconclusive test a joint that speeds up is blamed without another one [s]: its motor may have
-become reversed right before that test.
+"""Time after an inconclusive test during which a joint that speeds up counts as reversed without another test [s]: its
+motor may have become reversed right before that test.
 """
 
 PAUSE_S, PUSHED_PAUSE_S = 0.01, 0.25
@@ -70,9 +70,9 @@ class Residual(NamedTuple):
 
 @dataclass
 class _Test:
-    """A test of a joint, whose goal is removed for a moment.
+    """A test of a joint, during which its goal is removed.
 
-    since: its beginning [s]. drives: whether the unexplained torque made the joint faster.
+    since: its beginning [s]. drives: whether the unexplained torque accelerated the joint.
     """
 
     since: float
@@ -82,12 +82,12 @@ class _Test:
     seen: list[tuple[float, float]] = field(default_factory=list)
 
     def share(self, lacking: float, torque: float) -> float:
-        """By how much the unexplained torque has fallen, relative to the joint's own."""
+        """Drop of the unexplained torque, relative to that of the joint's own torque."""
         assert self.lacking is not None
         return (self.lacking - lacking) / (self.torque - torque) if torque != self.torque else 0.0
 
     def is_uneven(self, lacking: float, torque: float) -> bool:
-        """Whether the unexplained torque has not fallen along with the joint's own."""
+        """Whether the unexplained torque has not dropped in proportion to the joint's own."""
         assert self.lacking is not None
         share, most = self.share(lacking, torque), UNEVEN * abs(self.lacking - lacking)
         return share > MOST_TURNED or any(
@@ -110,13 +110,13 @@ class Obedience:
         return self._tests[joint] is not None
 
     def is_pushed(self, joint: int) -> bool:
-        """Whether a test has shown that something pushes or has pushed this joint."""
+        """Whether a test has shown that something pushes or pushed this joint."""
         return self._pushed[joint]
 
     def question(self, joint: int, now: float) -> bool:
         """Begin a test of a joint that speeds up although its torque opposes the motion. now: time [s].
 
-        Returns False if one has just been inconclusive, in which case its motor is to blame.
+        Returns False if a test has just been inconclusive, in which case the motor is to blame.
         """
         if now < self._doubted_until[joint]:
             return False
@@ -169,5 +169,5 @@ class Obedience:
 
 
 def _drives(lacking: float, velocity: float) -> bool:
-    """Whether the unexplained torque, -lacking, makes the joint faster."""
+    """Whether the unexplained torque, -lacking, accelerates the joint."""
     return -lacking * velocity > 0.0 and abs(velocity) > MOVES_RAD_S

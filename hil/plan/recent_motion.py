@@ -1,5 +1,4 @@
-"""How fast each joint can be turning, judged from the change of its position: no brake may rely on a reported velocity
-alone.
+"""Range of velocities that each joint's change of position allows: no brake may rely on a reported velocity alone.
 
 A servo can report a false velocity in an intact reply. A brake that trusted it would drive the joint. Therefore the
 velocity to brake against is the reported one, confined to the range that the change of position allows over two spans
@@ -31,7 +30,7 @@ _STEPS = 2.0
 """Uncertainty of a change of position, in encoder steps."""
 
 _MORE = 1.25
-"""Tolerance for a velocity that increases within the span, as a factor on the mean velocity."""
+"""Tolerance for a velocity that increases within the span, as a multiple of the mean velocity."""
 
 CONTRADICTS = 2.0
 """A velocity contradicts the position if it is beyond this multiple of the range that the position allows: at constant
@@ -91,8 +90,8 @@ class RecentMotion:
         return found
 
     def contradicts(self, joint: int, velocity: float) -> bool:
-        """Whether a velocity cannot be the joint's: either no known change of its position allows it, or no change is
-        known and no servo turns that fast.
+        """Whether a velocity is impossible for the joint: no known change of its position allows it, or none is known
+        and no servo turns that fast.
         """
         travels = self.travels(joint)
         if not travels:
@@ -135,7 +134,7 @@ class RecentMotion:
 
 
 def _since(known: list[State], last: State, span: float) -> State:
-    """The latest state that is at least `span` [s] older than the last one, or the oldest."""
+    """The latest state that is at least `span` [s] older than the last one, or the oldest if there is none."""
     now = last.time_before_write
     return next((state for state in reversed(known) if now - state.time_before_write >= span), known[0])
 

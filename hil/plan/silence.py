@@ -19,8 +19,8 @@ along the path that it was following. Torque must be off 100 ms after the last r
 """
 
 BRIDGED_ALONE_S = 0.028
-"""The same for servos that do not reply while another does [s]. Such a servo may have changed its ID: then only its Bus
-Watchdog, which counts from the last packet on the bus for any servo, can stop it.
+"""How long servos may fail to reply while an arm is lowered and another servo replies [s]. Such a servo may have
+changed its ID: then only its Bus Watchdog, which counts from the last packet on the bus for any servo, can stop it.
 """
 
 

@@ -80,7 +80,7 @@ class Stabiliser:
 
 
 def too_slow(config: Config) -> str:
-    """Why the rate is too low for the stabiliser, and what to do; "" if it is not.
+    """Explain why the rate is too low for the stabiliser, and what to do; "" if it is high enough.
 
     A spring that acts `delay` late drives the motion like a negative damper of stiffness times `delay`. The joint
     oscillates unless the configured damping and the servo's typical viscous friction together outweigh it.

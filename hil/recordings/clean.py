@@ -98,7 +98,7 @@ def _unrepeated(source: str, rows: Rows) -> Rows:
             f"{share}: they are too coarse. Write them with more digits, or, if the samples are equally spaced, set "
             "columns.rate (samples per second) in place of columns.time."
         )
-    return rows.kept(~again, f"{source}: {count} rows with the same time as the row before were left out.")
+    return rows.kept(~again, f"{source}: {count} rows with the same time as the previous row were left out.")
 
 
 def _ordered(source: str, rows: Rows) -> Rows:

@@ -126,14 +126,14 @@ def _torque(table: Table, columns: Columns, joint: int, notes: list[str]) -> Val
 def _quantity(
     table: Table, name: str, kind: str, given: str | None, ticks: float = 0.0, notes: list[str] | None = None
 ) -> Values:
-    """A column in SI units; notes: receives a sentence if it was corrected."""
+    """Return a column in SI units; append a sentence to `notes` if it was corrected."""
     full, values, stated = table.find(name)
     unit = _unit(table, full, kind, stated, given)
     values, code = without_codes(values)
     if code is not None and notes is not None:
         notes.append(
             f"{table.source}: column {full!r} contains {code:g}, which is far from all its other values: these samples "
-            "are taken as missing."
+            "are treated as missing."
         )
     bits = wrapped(values, (32,) if kind == "position" else (16, 32))
     if bits is not None and notes is not None:

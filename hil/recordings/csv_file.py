@@ -65,7 +65,7 @@ def _text(path: Path) -> str:
 
 
 def _delimiter(lines: list[str]) -> str | None:
-    """Find the delimiter that splits each of the first lines into the same number of fields, the largest one.
+    """Find the delimiter that splits the first lines into the most fields.
 
     Returns None for white space.
     """

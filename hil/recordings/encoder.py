@@ -30,7 +30,7 @@ def encoder_step(position: Values) -> float | None:
 
 
 def _refined(away: Values, step: float) -> float | None:
-    """Refine a step by regression on integers, from near readings to far ones; None if they are not whole steps."""
+    """Refine a step by regression on integers, from near readings to far ones; None if not all are whole steps."""
     reach = 20.0 * step
     while True:
         near = away <= reach

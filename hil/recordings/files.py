@@ -36,5 +36,5 @@ def read_tables(path: Path) -> list[Table]:
         return read_mcap(path)
     raise CsvError(
         f"{path}: {kind} files are not supported. Recordings are CSV ({', '.join(TEXTS)}), Parquet or MCAP files, "
-        "LeRobot datasets or ROS 2 bags: convert the file to CSV, Parquet or MCAP. A run is given by its folder."
+        "LeRobot datasets or ROS 2 bags: convert the file to CSV, Parquet or MCAP. For a run, give its folder."
     )

@@ -136,7 +136,7 @@ def _spaced(name: str) -> str:
 
 
 def _stem(name: str) -> str:
-    """The part of a column's name that is common to all joints: without the joint's number, or its name after a dot."""
+    """The part of a column's name that all joints share: the name without the joint's number, or up to the dot."""
     numbered = re.sub(r"\d+", "#", name)
     if numbered != name:
         return numbered

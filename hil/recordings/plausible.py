@@ -16,7 +16,7 @@ from hil.errors import CsvError
 Values = NDArray[np.float64]
 
 MOST_RANGE_RAD = 4 * math.pi
-"""Widest range of a joint that goes back and forth [rad]."""
+"""Widest plausible range of a joint that moves back and forth [rad]."""
 
 TIMES_NO_LOAD = 5.0
 """Highest plausible speed, relative to the no-load speed of the fastest servo."""
@@ -25,7 +25,7 @@ _ONE_WAY = 0.7
 """A joint counts as rotating continuously if at least this fraction of its path is in one direction."""
 
 _OVER_S, _USUAL = 0.02, 0.9
-"""Time over which speeds are measured, so that noise hardly matters [s], and the quantile of them that is checked."""
+"""Time over which speeds are averaged to suppress noise [s], and the quantile of the speeds that is checked."""
 
 
 def refuse_degrees(source: str, names: Sequence[str], time: Values, position: Values) -> None:
@@ -49,15 +49,14 @@ def refuse_degrees(source: str, names: Sequence[str], time: Values, position: Va
             continue
         raise CsvError(
             f"{source}: column {name!r} goes from {low:.4g} to {high:.4g} rad: {what}. Is it in degrees? Then correct "
-            "the "
-            'unit in the column\'s header; if the header has none, set position_unit = "deg" in [columns] of --config '
-            'ARM.toml (in Python: config="ARM.toml"). If it is in rad, set position_unit = "rad" there. Check the '
-            "unit of time, too."
+            'the unit in the column\'s header; if the header has none, set position_unit = "deg" in [columns] of '
+            '--config ARM.toml (in Python: config="ARM.toml"). If it is in rad, set position_unit = "rad" there. Check '
+            "the unit of time, too."
         )
 
 
 def _speed(time: Values, position: Values) -> float:
-    """The speed that a joint seldom exceeds [rad/s]; 0 if the recording is too short to tell."""
+    """Speed that a joint seldom exceeds [rad/s]; 0 if the recording is too short to tell."""
     step = np.diff(time)
     usual = float(np.median(step)) if step.size else 0.0
     lag = max(1, round(_OVER_S / usual)) if usual > 0.0 else 0

@@ -20,7 +20,7 @@ class Table:
 
     columns: values (rows,) by name, NaN where a value is missing and infinite where it is not a number. units: units
     stated in the file, by column. first_row: number of the first row, for messages (a CSV file's header is
-    line 1). texts: of columns with such values, the first one as written in the file.
+    line 1). texts: the first such value of each column, as written in the file.
     """
 
     source: str

@@ -43,7 +43,7 @@ class Rate:
 def rates(table: Table, time: Values, position: Values) -> tuple[Rate, ...]:
     """Compare the velocity columns with `position` (joints, rows) [rad] at `time` (rows,) [s].
 
-    () unless there is one column for each joint, and each follows that joint.
+    Returns () unless there is one such column per joint, and each follows its joint.
     """
     columns = _columns(table)
     if len(columns) != len(position):

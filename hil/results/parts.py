@@ -67,7 +67,7 @@ class Covariance:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit:
-    """Quality of a fit; residual_rms_ticks: measured minus simulated position in encoder steps RMS, per joint."""
+    """Quality of a fit. residual_rms_ticks: RMS of measured minus simulated position, per joint [encoder steps]."""
 
     residual_rms_ticks: PerJoint
 
@@ -263,7 +263,7 @@ class RunTiming(Timing, StreamTiming):
 
 @dataclass(frozen=True)
 class ArmFacts:
-    """Facts needed to use the model: gravity in the plane of the arm [m/s^2], rest pose [rad], joints."""
+    """Data needed to use the model: gravity in the plane of the arm [m/s^2], rest pose [rad], joints."""
 
     gravity: float
     rest_pose: PerJoint
@@ -272,12 +272,13 @@ class ArmFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class ChainFacts:
-    """Facts from the URDF of a spatial arm, which define its base parameters.
+    """Data from a spatial arm's URDF that define its base parameters.
 
     urdf: file name, relative to the configuration. rotation, translation [m]: pose of each joint's frame in the
-    previous link's frame. axis: joint axis in its own frame. gravity: gravity in the base frame [m/s^2]. groups: linear
-    combination that each base parameter represents. from_prior: parameters that the recording barely constrains, taken
-    from the URDF. held: joints of the URDF that are treated as fixed. doubts: warnings about implausible inertias.
+    previous link's frame. axis: joint axis in the joint's frame. gravity: gravity in the base frame [m/s^2]. groups:
+    linear combination that each base parameter represents. from_prior: parameters that the recording barely constrains,
+    taken from the URDF. held: joints of the URDF that are treated as fixed. doubts: warnings about implausible
+    inertias.
     """
 
     urdf: str
@@ -323,7 +324,7 @@ class StabiliserShare:
         return tuple(rms / max(whole, 1e-12) for rms, whole in zip(self.rms, self.commanded_rms, strict=True))
 
     def said(self, names: Sequence[str]) -> str:
-        """One sentence about the stabiliser's share, with these joint names."""
+        """A sentence on the stabiliser's share of the torque, with these joint names."""
         each = ", ".join(
             f"{name} {rms:.3f} of {whole:.3f} N m RMS ({100 * part:.0f} %, peak {peak:.3f})"
             for name, rms, whole, part, peak in zip(
@@ -335,7 +336,7 @@ class StabiliserShare:
 
 @dataclass(frozen=True)
 class PlayedStep:
-    """One run with a pilot, on the way to full amplitude: its predicted and measured peaks.
+    """One step of a pilot on the way to full amplitude, with its predicted and measured peaks.
 
     The rows of predicted and measured peaks are the quantities of hil.dry_run.prediction.QUANTITIES, the columns are
     the joints. peak_torque: peak torque per joint [N m]. ended: why the run ended early; None if it did not.

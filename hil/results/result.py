@@ -11,13 +11,13 @@ verdict      whether to trust the result, the weakest parameter, and the reasons
 warnings     problems of the recording, as sentences
 model_choice with friction = "auto": the models tried, the one chosen, its gain and cost
 timing       how well the stream kept its deadlines, and the duration of the estimation
-arm          facts needed to use the model: gravity, rest pose, and, for each joint, name, servo, mode, limits, torque
+arm          data needed to use the model: gravity, rest pose, and, for each joint, name, servo, mode, limits, torque
              per goal [N m/A, or N m/V in pwm mode]
 chain        only for a spatial arm: its geometry, and the combination that each base parameter represents
 truth        only on a fake arm: the base parameters it was built with, for the true torque constants of its motors
 truth_scaled `truth` scaled to the torque constants in the file, like `parameters`; only if those of the motors differ
 physical     masses, centres and inertias, if [known] gives any quantity
-stabiliser   its share of the torque, if there was one
+stabiliser   with a stabiliser: its share of the torque
 steps        with a pilot: predicted and measured peaks of each step
 zeros, recordings, notes   only for recordings made elsewhere; notes: what was guessed, corrected or averaged
 """
@@ -109,7 +109,7 @@ class Result:
 
     @property
     def _residual(self) -> str:
-        """The residual in encoder steps; without them, in mrad."""
+        """The residual in encoder steps, or in mrad if their size is unknown."""
         if steps := ", ".join(f"{value:.3f}" for value in self.fit.residual_rms_ticks):
             return f"residual {steps} encoder steps RMS"
         angles = getattr(self.fit, "residual_rms_rad", ())

@@ -1,4 +1,4 @@
-"""Work that may block, done by a separate thread: files, terminals, callbacks.
+"""Run work that may block in a separate thread: files, terminals, callbacks.
 
 While servos have torque, the control loop must not wait for a disk or a terminal: a terminal stopped with Ctrl-S or a
 file on a disconnected network drive can block a write indefinitely, and Python handles no signal in the meantime.

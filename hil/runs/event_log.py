@@ -10,7 +10,7 @@ from hil.runs.run_folder import RunFolder
 
 MOST_WAITING = 1000
 PATIENCE_S = 0.5
-"""Longest time that a run waits at its end, with torque off, for its events to be written [s]."""
+"""Longest time that a finished run waits, with torque off, for its events to be written [s]."""
 
 LATE_NAME = "events-late.jsonl"
 
@@ -43,7 +43,7 @@ class EventLog:
 
     @property
     def failure(self) -> Exception | None:
-        """Why events could not be written, or None."""
+        """Exception that kept events from being written, or None."""
         return self._written.failure
 
 

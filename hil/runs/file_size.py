@@ -39,7 +39,7 @@ def check_archive(path: Path) -> None:
 
 
 def check_array(path: Path) -> None:
-    """Raise RunFolderError if an .npy declares more data than the file has. Also raises OSError, ValueError."""
+    """Raise RunFolderError if an .npy declares more data than the file contains. Also raises OSError, ValueError."""
     with path.open("rb") as file:
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

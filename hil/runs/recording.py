@@ -150,7 +150,7 @@ class Recorder:
         self.count = count + 1
 
     def close(self) -> None:
-        """Truncate the file to the recorded rows; may be called again.
+        """Truncate the file to the recorded rows; may be called repeatedly.
 
         Raises RunFolderError if the file was removed or renamed in the meantime; its rows are then saved in a new file,
         together with the configuration and the other files that were there when the recording began.
@@ -183,7 +183,7 @@ class Recorder:
         )
 
     def _touch(self, first: int) -> None:
-        """Map the pages of a chunk of rows for writing: a page's first write can take the kernel 0.4 ms."""
+        """Map the pages of a chunk of rows for writing in advance: the first write to a page can take 0.4 ms."""
         size = self._row.size
         chunk = self._bytes[first * size : (first + self._rows_a_chunk) * size]
         if not chunk.nbytes:

@@ -1,4 +1,4 @@
-"""The folder of an estimate from recordings of other tools: what was read, exactly as it was used, and its result.
+"""The folder of an estimate from other tools' recordings: the data exactly as used, and the result.
 
 config.toml      the configuration: a copy of the one given, with [columns] as they were interpreted
 run.json         the files with their SHA-256, versions and machine, notes
@@ -42,7 +42,7 @@ class RecordingFile:
 class RecordingRecord:
     """The contents of run.json.
 
-    config: path of the configuration, empty without one. started: ISO 8601. notes: sentences.
+    config: path of the configuration; empty if there is none. started: ISO 8601. notes: sentences.
     """
 
     config: str
@@ -72,7 +72,7 @@ class Predicted:
 
 
 def describe(config: str, files: Sequence[Path], notes: Sequence[str]) -> RecordingRecord:
-    """Return the contents of run.json for an estimate that is made now."""
+    """Return the contents of run.json for an estimate made now."""
     return RecordingRecord(
         config,
         datetime.now().astimezone().isoformat(timespec="seconds"),
@@ -115,7 +115,7 @@ def save(path: Path, record: RecordingRecord, config: str, recordings: Sequence[
 
 
 def load_record(path: Path) -> RecordingRecord:
-    """run.json of a folder; raises RunFolderError."""
+    """Load run.json of a folder; raises RunFolderError."""
     file = path / "run.json"
     try:
         return from_json(RecordingRecord, json.loads(file.read_text(encoding="utf-8")))
@@ -124,7 +124,7 @@ def load_record(path: Path) -> RecordingRecord:
 
 
 def load_recordings(path: Path) -> tuple[Predicted, ...]:
-    """The recordings of a folder; raises RunFolderError."""
+    """Load the recordings of a folder; raises RunFolderError."""
     try:
         check_archive(path / ARRAYS)
         with np.load(path / ARRAYS, allow_pickle=False) as kept:

@@ -51,7 +51,7 @@ _PACKAGES = ("numpy", "scipy", "numba", "pyserial", "dynamixel-sdk")
 
 
 def taken(path: Path) -> RunFolderError:
-    """Return the error for a folder that is not empty; it names a folder that is free."""
+    """Return the error for a folder that is not empty; it suggests an unused one."""
     free = next(found for number in count(2) if not (found := path.with_name(f"{path.name}-{number}")).exists())
     return RunFolderError(
         f"Run folder {path} is not empty; choose another (--out, or out= in Python), for example {free}, or remove it."
@@ -166,7 +166,7 @@ class RunFolder:
             raise RunFolderError(only_steps(path, steps))
         for needed in (run.config_path, run.run_path, run.samples_path):
             if needed.is_symlink() and not needed.exists():
-                raise RunFolderError(f"{needed} is a link that leads nowhere.")
+                raise RunFolderError(f"{needed} is a broken link.")
             if not needed.is_file():
                 raise RunFolderError(
                     f"{path} is not a run folder: it has no {needed.name}. To list existing runs: {command('runs')}"
@@ -178,7 +178,7 @@ class RunFolder:
         return self.path / "config.toml"
 
     def own_files(self) -> frozenset[str]:
-        """Names of the files that make up the run: what a run or an estimate writes, and its arm's descriptions."""
+        """Names of the files that make up the run: those that a run or an estimate writes, and its arm descriptions."""
         own = _OF_A_START | {"result.json", "lateness.json", "recordings.npz"}
         with suppress(RunFolderError, ConfigError):
             own |= {urdf.name for urdf in _urdfs(self.load_config())}

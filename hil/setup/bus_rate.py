@@ -1,8 +1,8 @@
 """The sample rate that a bus can sustain, measured with torque off for every exchange mode.
 
-The sustainable rate depends on servos, cables and adapter. A computer that other programs keep busy delays single
-exchanges. An experiment tolerates this (`hil.experiment.deadlines`), so such outliers are reported, but do not limit
-the rate.
+The sustainable rate depends on servos, cables and adapter. A computer that other programs keep busy delays individual
+exchanges. An experiment tolerates this (`hil.experiment.deadlines`), so such outliers are reported but do not limit the
+rate.
 """
 
 from collections.abc import Sequence
@@ -29,9 +29,7 @@ AGAIN_AFTER_S = 0.5
 SHARE = 0.9
 """Fraction of a period that the exchange may take; the rest is for the computer."""
 RATE_MARGIN = 1.2
-"""Minimum ratio of the measured rate to the rate that is chosen from it, so that a later measurement confirms the
-choice.
-"""
+"""Minimum ratio of the measured rate to the rate chosen from it, so that a later measurement confirms the choice."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +93,7 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
 
 
 def _faster(first: ExchangeMode, second: ExchangeMode) -> ExchangeMode:
-    """The faster of two measurements of one mode; lost replies count in both."""
+    """Return the faster of two measurements of one mode, with the larger number of lost replies."""
     return replace(min(first, second, key=lambda mode: mode.usual_s), lost=max(first.lost, second.lost))
 
 
@@ -111,7 +109,7 @@ def measure_modes(bus: ServoBus) -> list[ExchangeMode]:
 
 
 def choose_mode(bus: ServoBus, modes: Sequence[ExchangeMode], rates: Sequence[float]) -> tuple[ExchangeMode, float]:
-    """The exchange mode to configure, and the highest of `rates` [Hz] that it sustains with a margin.
+    """Return the exchange mode to configure, and the highest of `rates` [Hz] that it sustains with a margin.
 
     The configured mode is kept unless another one loses fewer replies or sustains a higher rate. If no mode sustains
     even the lowest of `rates`, that rate is returned.
@@ -140,7 +138,7 @@ def goals_taken(bus: ServoBus) -> list[Joint]:
     """Return the servos (as single-servo joints) that accept goals from a Sync Write. Torque must be off. Raises
     DriverError.
 
-    Each servo is sent a goal that differs from its present one. The goal is read back, then the previous one is
+    Each servo is sent a goal that differs from its current one. The goal is read back, then the previous one is
     restored.
     """
     before = [servo.read(goal_register(drive)) for drive, servo in bus.drives.items()]
@@ -158,7 +156,7 @@ def goals_taken(bus: ServoBus) -> list[Joint]:
 
 
 def _give_back(bus: ServoBus, goals: Sequence[int]) -> None:
-    """Restore the goals of all servos that can be reached; raises the first DriverError after trying all."""
+    """Restore the goals of all servos that can be reached; raise the first DriverError after trying all."""
     failures: list[DriverError] = []
     for (drive, servo), goal in zip(bus.drives.items(), goals, strict=True):
         try:

@@ -36,7 +36,7 @@ class Pose:
     angles: tuple[float, ...]
     """Joint angles in the description's convention [rad]."""
     end: tuple[float, float, float]
-    """The end link's centre of mass in the base's frame [m]."""
+    """Centre of mass of the end link in the base frame [m]."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class Moved:
     """Angles by which all joints moved [rad]."""
     well: bool
     found: str
-    """Finding in words; if the motion differs from the description, it also says what to change."""
+    """Finding as text; if the motion differs from the description, also what to change."""
 
 
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
     """Return the pose of the arm at these joint angles [rad].
 
-    An angle may be wrong by whole turns, since a servo does not count turns while it is off. They are removed where the
-    position limits show that there are any.
+    An angle may be wrong by whole turns, since a servo does not count turns while it is off. They are removed if the
+    position limits reveal them.
     """
     limits = [joint.position_limit for joint in config.joints]
     angles = tuple(within_limits(*each) for each in zip(angles, limits, strict=True))
@@ -121,13 +121,13 @@ def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Arr
 
 
 def _reversed(joint: JointConfig) -> list[int] | int:
-    """The entry `direction` with every sign reversed."""
+    """Return the entry `direction` with every sign reversed."""
     reverse = [-sign for sign in joint.directions]
     return reverse if len(reverse) > 1 else reverse[0]
 
 
 def _unlike(joint: JointConfig, drives: Array) -> str:
-    """Say that a joint's two servos do not turn as their directions describe; "" if they do."""
+    """Return a message if a joint's two servos do not turn as their directions describe, otherwise ""."""
     if len(joint.ids) == 1 or abs(drives[1] - drives[0]) <= SEVERAL * abs(drives[0]):
         return ""
     first, second = joint.ids
@@ -142,7 +142,7 @@ def _unlike(joint: JointConfig, drives: Array) -> str:
 
 
 def _awaited(read: Read, clock: Clock, before: Array) -> Array:
-    """Displacements of all joints once one has been moved by hand and is held still; about zero if nobody does so."""
+    """Return all joints' displacements once one has been moved by hand and is held still; near zero after a timeout."""
     end = clock.now() + PATIENCE_S
     held_since, last = clock.now(), before
     while clock.now() < end:

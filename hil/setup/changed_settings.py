@@ -55,8 +55,8 @@ Settings = Mapping[tuple[Joint, str], int]
 def settings_now(bus: ServoBus) -> Settings:
     """Read the settings that determine how servos move and what they report.
 
-    Servos that do not answer are left out. Each register is read twice, in opposite orders, because a reply may belong
-    to an earlier request. If the two readings differ, the value is unknown and left out.
+    Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
+    to an earlier request. If the two readings differ, the value is unknown and omitted.
     """
     found: dict[tuple[Joint, str], int] = {}
     for joint, servo in bus.drives.items():
@@ -71,7 +71,7 @@ def settings_now(bus: ServoBus) -> Settings:
 def changed_settings(before: Settings, after: Settings, cause: Cause | None = None) -> str:
     """Return a message that names the settings that differ; "" if none do.
 
-    cause: the cause of a stop; settings that cannot explain it are left out.
+    cause: the cause of a stop; settings that cannot explain it are omitted.
     """
     changed = [
         f"{joint}: {register} is {_told(register, after[joint, register])} and was {_told(register, value)}"
@@ -88,7 +88,7 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
 
 
 def _swapped(before: Settings, after: Settings) -> tuple[Joint, Joint] | None:
-    """A servo that now has all the settings that another one had, and that one; None if there is no such pair."""
+    """Return a servo that now has all the settings of another, and that other servo; None if there is no such pair."""
     old, new = _by_joint(before), _by_joint(after)
     for first, second in permutations(old, 2):
         if old[first] != old[second] == new.get(first):

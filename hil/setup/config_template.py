@@ -1,4 +1,4 @@
-"""The commented TOML file of an arm, generated from a few facts."""
+"""Generate the commented TOML file of an arm from a few facts."""
 
 import json
 import math
@@ -14,9 +14,7 @@ _FASTEST = 10.0  # rad/s, initial limit of servos that could turn faster
 _USUAL_STALL = 4.1  # N m, stall torque of an XM430
 _CYCLE_BYTES = 39  # on the wire per servo: goal, request and reply
 RATES = (400, 300, 250, 200, 160, 125, 100, 80, 64, 50, 40, 32, 25, 20)
-"""Sample rates [Hz] for a new file, so close together that rounding down costs at most a quarter of the possible
-rate.
-"""
+"""Sample rates [Hz] for a new file, spaced so that rounding down costs at most a quarter of the possible rate."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class MeasuredBus:
     """Result of measuring the bus.
 
     rate: sample rate to use [Hz]. sustained: the rate that the bus can sustain [Hz]. one_write, fast: values of
-    port.one_write and port.fast_sync_read with which it was measured.
+    port.one_write and port.fast_sync_read during the measurement.
     """
 
     rate: float
@@ -80,7 +78,7 @@ def usual_length(model: str) -> float:
 
 
 def arm_toml(arm: ArmAnswers) -> str:
-    """The text of the TOML file."""
+    """Return the text of the TOML file."""
     rate = _rate(arm) if arm.measured is None else arm.measured.rate
     head = [f"# {line}" for line in arm.head.splitlines()]
     port = ["[port]", f"url = {json.dumps(arm.url)}", f"baud = {arm.baud}", *_exchange(arm)]
@@ -176,7 +174,7 @@ def _rest_meaning(arm: ArmAnswers) -> str:
 
 
 def _rate(arm: ArmAnswers) -> float:
-    """The highest common rate whose cycle leaves the bus at least half idle."""
+    """Return the highest of `RATES` at which the bus is idle at least half of the time."""
     cycle = _CYCLE_BYTES * len(arm.joints) * 10 / arm.baud + 0.4e-3
     return float(next((rate for rate in RATES if 2 * cycle < 1 / rate), RATES[-1]))
 
@@ -188,7 +186,7 @@ def _rate_meaning(arm: ArmAnswers) -> str:
 
 
 def _exchange(arm: ArmAnswers) -> list[str]:
-    """The settings of [port] with which the measured rate was reached, where they are not the defaults."""
+    """Return the [port] settings of the measured rate that differ from the defaults."""
     if arm.measured is None:
         return []
     one_write = [] if arm.measured.one_write else [_line("one_write = false", "this bus is faster with two writes")]

@@ -1,4 +1,4 @@
-"""Checks of the bus before anything moves: the servos' own limits, and one second of exchanges with torque off."""
+"""Check the bus before anything moves: the servos' own limits, and one second of exchanges with torque off."""
 
 import numpy as np
 

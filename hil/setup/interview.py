@@ -13,7 +13,7 @@ from hil.setup.config_template import STANDARD_GRAVITY, ArmAnswers, JointAnswers
 from hil.setup.scan import Found, Heard
 
 Ask = Callable[[str, str], str]
-"""Asks a question with a default answer; returns the answer."""
+"""Ask a question with a default answer; return the answer."""
 Say = Callable[[str], None]
 
 _NAMES = ("shoulder", "elbow")
@@ -65,7 +65,7 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
         beyond = "the tip" if number == len(chosen) - 1 else names[number + 1]
         usual = f"{1e3 * usual_length(str(found.model)):.0f}"
         length = 1e-3 * _number(f"Length from {name} to {beyond} in mm", usual, _LENGTHS_MM, ask, say)
-        question = f"How far may {name} swing from there to either side, in degrees"
+        question = f"How far may {name} swing from its rest angle to either side, in degrees"
         swing = math.radians(_number(question, "90", (5.0, _MOST_SWING), ask, say))
         answers = JointAnswers(name, found.id, str(found.model), zero, rest, directions[number], swing, length)
         joints.append(replace(answers, voltage=found.voltage))
@@ -78,7 +78,9 @@ def interview(port: Port, url: str, heard: Sequence[Heard], ask: Ask, say: Say) 
 
 
 def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: Ask, say: Say) -> list[int]:
-    """Present Positions in the rest pose. Hanging joints are read from both sides, since friction holds them."""
+    """Return the Present Positions in the rest pose. Hanging joints are read from both sides, since friction holds
+    them.
+    """
     ask(_POSE[stance], "")
     first = [servo.read("Present Position") for servo in handles]
     if stance != HANGING:
@@ -97,7 +99,7 @@ def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: A
 
 
 def _one_baud(heard: Sequence[Heard]) -> tuple[int, list[Found]]:
-    """The baud rate at which servos answered, and the servos of supported models among them."""
+    """Return the baud rate at which servos answered, and those that are of supported models."""
     answered = {each.baud: [found for found in each.servos if found.model in SERVO_MODELS] for each in heard}
     usable = {baud: servos for baud, servos in answered.items() if servos}
     if not usable:
@@ -147,7 +149,7 @@ def _name(number: int, found: Found, ask: Ask) -> str:
 def _direction(servo: Servo, name: str, ask: Ask, say: Say) -> int:
     """Determine which way Present Position counts; +1 if it increases counter-clockwise.
 
-    The arm is viewed so that it hangs down and points to the right when it is lifted.
+    The arm is viewed so that it hangs down, and points to the right when lifted.
     """
     before = servo.read("Present Position")
     given = {"1": 1, "+1": 1, "-1": -1}

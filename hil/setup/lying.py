@@ -20,12 +20,10 @@ AFTER_A_RUN = 2.0
 """
 
 NEAR_RAD = 0.02
-"""Deviation up to which arm.rest_pose is used although the arm lies elsewhere [rad]."""
+"""Deviation up to which arm.rest_pose is used although the arm is not exactly there [rad]."""
 
 SAGGED_RAD, FROM_REST_RAD = 0.05, 0.1
-"""Smallest motion after torque off that is reported, and largest deviation from the rest pose before that motion
-[rad].
-"""
+"""Smallest reported motion after torque off, and largest deviation from the rest pose before that motion [rad]."""
 
 _LONGEST_SAG_S = 3.0  # wait for an arm that moves after torque off
 
@@ -43,7 +41,7 @@ def tolerance_now(config: Config) -> float:
 def wait_for_rest(bus: ServoBus, longest: float = _LONGEST_REST_S) -> str:
     """Wait at most `longest` [s] for an arm that is still swinging or falling after an earlier run.
 
-    Returns a sentence about a joint that is still moving after that time; "" if all are at rest. Raises BusShared if
+    Returns a sentence naming a joint that is still moving after that time; "" if all are at rest. Raises BusShared if
     another program switches torque on in the meantime.
     """
     clock = bus.port.clock
@@ -91,7 +89,7 @@ def moved_without_torque(config: Config, bus: ServoBus, before: Sequence[float])
 
 
 def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
-    """The configuration with the measured pose (joints,) [rad], clipped to position_limit, as rest pose.
+    """Return the configuration with the measured pose (joints,) [rad], clipped to position_limit, as rest pose.
 
     The configuration is returned unchanged if the two poses hardly differ, or if they differ so much that the run will
     be refused.
@@ -107,7 +105,7 @@ def from_where_it_lies(config: Config, position: Sequence[float]) -> Config:
 
 
 def said_of_the_rest(config: Config, lies: Config) -> str:
-    """Return a message that the arm does not lie in its rest pose, with the angles at which it lies."""
+    """Return a message that the arm does not lie in its rest pose, with its actual angles."""
     each = zip(config.joints, lies.arm.rest_pose, config.arm.rest_pose, strict=True)
     away = [
         f"{joint.name!r} at {now:.3f} rad ({now - rest:+.3f})"

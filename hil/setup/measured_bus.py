@@ -1,4 +1,4 @@
-"""Sample rate for the file of a new arm, measured on its bus with torque off."""
+"""Measure the sample rate for a new arm's file on its bus, with torque off."""
 
 from pathlib import Path
 
@@ -11,10 +11,10 @@ from hil.setup.config_template import RATES, ArmAnswers, MeasuredBus, arm_toml
 
 
 def measured_bus(arm: ArmAnswers, path: Path) -> tuple[MeasuredBus | None, str]:
-    """Measure the bus of an arm that has been described; path: path of the file to be written, for messages.
+    """Measure the bus of the described arm. path: path of the file to be written, for messages.
 
     Returns:
-        The measurement, or None if it failed; and a message for the user about it.
+        The measurement, or None if it failed, and a message about it for the user.
     """
     config = parse_config(arm_toml(arm), path)
     fakes.register_for(config.url)

@@ -8,13 +8,13 @@ from hil.drivers.servo import Servo
 from hil.setup.scan import Found, listen
 
 _AT_ONCE_S = 0.005
-"""Listening time on a virtual bus [s], where replies are immediate; real servos may each wait for a time slot."""
+"""Listening time on a virtual bus [s], where replies are immediate; real servos may wait for their time slots."""
 
 
 def others_on_the_bus(bus: ServoBus) -> list[str]:
     """Describe each servo at this baud rate that is not part of the arm.
 
-    Raises PortLost; WrongSetting if one of them obeys commands to a servo of the arm.
+    Raises PortLost, or WrongSetting if one of them obeys commands to a servo of the arm.
     """
     ours = {drive.id for drive in bus.drives}
     heard = listen(bus.port) if isinstance(bus.port.clock, WallClock) else listen(bus.port, _AT_ONCE_S)
@@ -34,8 +34,9 @@ def _describe(bus: ServoBus, found: Found) -> str:
     for drive in bus.drives:
         if drive.id == secondary:
             raise WrongSetting(
-                f"{name}: its Secondary ID is {secondary}, so it obeys torque and goals meant for {drive}, in its own "
-                "mode and unwatched, although it is not in the configuration. Remove the Secondary ID: hil setup "
-                f"{bus.port.url} --id {found.id} --secondary-id 255. If it moves the same joint, list both IDs there."
+                f"{name}: its Secondary ID is {secondary}, so it obeys torque and goal commands for {drive} in its "
+                "own mode, without a watchdog, although it is not configured. Remove the Secondary ID: "
+                f"hil setup {bus.port.url} --id {found.id} --secondary-id 255. If it moves the same joint, list both "
+                "IDs in the configuration."
             )
     return f"{name}, torque {'on' if torque else 'off'}"

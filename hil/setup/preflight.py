@@ -1,4 +1,4 @@
-"""Checks for anything that would stop an experiment, with instructions for fixing it. Torque stays off."""
+"""Check for anything that would stop an experiment, and say how to fix it. Torque stays off."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -43,7 +43,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One check: where it was made, what was checked, what was found, and how to fix it if necessary."""
+    """Result of a check: where it was made, what was checked, what was found, and how to fix it if necessary."""
 
     level: Level
     where: str
@@ -87,7 +87,7 @@ def check_arm(config: Config) -> Iterator[Finding]:
 
 
 def _torque_of_pilot(config: Config) -> Iterator[Finding]:
-    """Report a torque that the pilot ignores, and one that is missing without a pilot."""
+    """Report a torque setting that the pilot ignores, or one that is missing without a pilot."""
     if config.experiment.pilot and config.experiment.peak_torque is not None:
         fix = (
             "`hil identify` ignores peak_torque: the pilot finds the torque, up to current_limit or voltage_limit. "
@@ -100,7 +100,7 @@ def _torque_of_pilot(config: Config) -> Iterator[Finding]:
 
 
 def _path(config: Config) -> Iterator[Finding]:
-    """Report a path of a spatial arm that a run without a pilot would refuse."""
+    """Report a spatial arm's path that a run without a pilot would refuse."""
     if why := missing_path(config):
         yield Finding(Level.STOP, "experiment", "path", "joint_path is missing", why)
         return
@@ -172,7 +172,7 @@ def _others(config: Config, bus: ServoBus) -> Iterator[Finding]:
 
 
 def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo) -> Iterator[Finding]:
-    """Check one servo; ends early if it does not answer or is another model.
+    """Check one servo; stop early if it does not answer or is of another model.
 
     Nothing is written, except to restore settings that an earlier program left behind.
     """
@@ -209,7 +209,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
 
 
 def _still_off(bus: ServoBus) -> Iterator[Finding]:
-    """Report torque that has come on since the servos were checked: nothing here switches it on, or off."""
+    """Report torque that has come on since the servos were checked: this check neither switches it on nor off."""
     try:
         on = switched_on(bus.drives)
     except DriverError as error:
@@ -218,7 +218,7 @@ def _still_off(bus: ServoBus) -> Iterator[Finding]:
     if on:
         fix = (
             f"{on}: torque was off when this check began. Another program has switched it on and is driving the arm: "
-            "stop that program first; or cut the supply."
+            "stop that program first, or cut the supply."
         )
         yield Finding(Level.STOP, "bus", "torque", "switched on during this check", fix)
 
@@ -265,7 +265,7 @@ def _status_level(_config: Config, _joint_config: JointConfig, _joint: Joint, se
 
 def _hardware_error(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     error = servo.hardware_error()
-    stays = "It stays without torque until rebooted: find" if shuts_down(servo, error) else "Find"
+    stays = "Its torque stays off until it is rebooted: find" if shuts_down(servo, error) else "Find"
     fix = f"{stays} the cause, then power-cycle it."
     return _graded(error == HardwareError(0), "hardware error", describe_error(error), fix)
 

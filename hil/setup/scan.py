@@ -22,8 +22,8 @@ _PATIENCE_S = _SLOT_S * (MAX_ID + 1)
 _STATUS_BYTES = 14
 
 _DIFFERENT = ("Present Position", "Realtime Tick")
-"""Registers that differ between any two servos. Two with the same ID answer at once; equal replies, as to a ping, merge
-into one, but different ones corrupt each other.
+"""Registers that differ between any two servos. Two servos with the same ID answer at once: equal replies, as to a
+ping, merge into one, but different replies corrupt each other.
 """
 
 
@@ -97,7 +97,7 @@ def scan(port: Port, bauds: Sequence[int] = BAUD_RATES, watch: Watch = lambda _:
 
 
 def _set_to(port: Port, servos: Sequence[Found]) -> int:
-    """The baud rate that these servos are set to; adopted for `port`, whose wire times depend on it."""
+    """Return the baud rate that these servos are set to, and adopt it for `port`, whose wire times depend on it."""
     if servos:
         port.set_baud(servos[0].baud)
     return port.baud

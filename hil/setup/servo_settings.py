@@ -21,7 +21,7 @@ _PING_ONLY = load_control_table("XM430-W350")
 
 
 class Change(NamedTuple):
-    """The change of one register: old and requested value, and whether it was written (and read back) or declined."""
+    """A register change: old and requested values, and whether it was written (and read back) or declined."""
 
     register: str
     before: int

@@ -14,7 +14,7 @@ from hil.errors import ExperimentError
 __all__ = ["MOST_RAD", "Lies", "has_stirred", "refuse_moved", "where_it_lies"]
 
 MOST_RAD = 0.05
-"""Largest allowed motion before torque is switched on [rad]; the guard allows as much before the start."""
+"""Largest motion allowed before torque is switched on [rad]; the guard allows the same before the start."""
 
 STIRRED_RAD = 0.004
 """Motion that encoder noise cannot explain [rad]: the arm is not at rest."""
@@ -36,8 +36,8 @@ def has_stirred(before: Lies, now: Lies) -> bool:
 def refuse_moved(before: Lies, now: Lies, bus: ServoBus) -> None:
     """Raise ExperimentError if a joint has moved by more than MOST_RAD between two readings.
 
-    Such a joint is read again, because a reply to an earlier request is not its angle: the two readings then differ by
-    more than an arm can turn in between. Raises the same errors as `Servo.read`.
+    Such a joint is read again, because the first reply may belong to an earlier request: the two readings then differ
+    by more than an arm can turn in between. Raises the same errors as `Servo.read`.
     """
     for drive in now:
         turned = _turned(drive, before, now)

@@ -69,7 +69,7 @@ def checked_arm(study: Study, run: int) -> Config:
 
 
 def _check_fake(study: Study, config: Config) -> None:
-    """Raise ConfigError for an arm that would move, unattended and by several workers at once."""
+    """Raise ConfigError for a real arm, which several workers would move at once, unattended."""
     if study.study.task != "dry_run" and not config.url.startswith("fake://"):
         raise ConfigError(
             f'{study.path}: study.config: {arm_path(study).name} has port.url = "{config.port.url}", and a study never '

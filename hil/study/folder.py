@@ -68,7 +68,7 @@ def opened(study: Study, out: Path, runs: int, *, resume: bool) -> Iterator[Data
 
 
 def _discard(out: Path) -> None:
-    """Remove what a start that failed before its first row left behind, so that it does not block the next one."""
+    """Remove the remains of a start that failed before its first row, so that they do not block the next one."""
     for name in ("study.toml", "about.json", ".lock"):
         (out / name).unlink(missing_ok=True)
     with suppress(OSError):  # files of others are kept
@@ -106,7 +106,7 @@ def _read(about: Path) -> dict[str, Any]:
 
 
 def _check_begun(out: Path, then: dict[str, Any], now: dict[str, Any]) -> None:
-    """Rows of one study come from one arm, one set of recordings, and one set of versions."""
+    """Refuse to mix rows of different arms, recordings or versions in one study."""
     if not then:
         return
     for key, what in (

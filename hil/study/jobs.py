@@ -22,7 +22,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _AHEAD = 8
-"""Jobs given to each worker beyond the one it works on: enough that none waits, few enough to limit memory use."""
+"""Jobs given to each worker beyond its current one: enough that no worker waits, few enough to limit memory use."""
 
 
 _TASK_S, _MOST_IN_A_TASK = 0.1, 50

@@ -112,7 +112,7 @@ class KeepTable(_Table):
     columns: list[str] | None = Field(
         None, min_length=1, description="column names, with * as wildcard; default: those of the task"
     )
-    run_folders: bool = Field(False, description="keep the run folders too, recordings and reports included")
+    run_folders: bool = Field(False, description="also keep the run folders, with recordings and reports")
 
 
 class EngineTable(_Table):
@@ -161,9 +161,7 @@ class Study(_Table):
         if self.study.runs is None and self.study.task != "estimate":
             drawn = [key for key, values in self.vary.items() if isinstance(values, Draw)]
             if drawn:
-                raise ValueError(
-                    f'study.runs is missing: vary."{drawn[0]}" is drawn at random, so the number of runs is needed'
-                )
+                raise ValueError(f'study.runs is missing: vary."{drawn[0]}" is drawn at random, so runs must be given')
         return self
 
 
@@ -177,7 +175,7 @@ def load_study(path: Path) -> Study:
         raise ConfigError(f"{path}: path is not a known key.")
     if "study" not in values and "joints" in values:
         raise ConfigError(
-            f"{path}: it describes an arm, not a study. A study is a separate file with a [study] table that names "
+            f"{path} describes an arm, not a study. A study is a separate file with a [study] table that names "
             "the arm's file: see docs/scale.md."
         )
     try:

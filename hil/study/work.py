@@ -37,7 +37,7 @@ _ONE_AT_A_TIME = threading.Lock()
 class Spec:
     """Specification of one run.
 
-    toml: the arm's file with this run's values in it, or "". versions: package versions that the worker must have.
+    toml: the arm's file with this run's values inserted, or "". versions: package versions that the worker must have.
     seconds: processor time after which the run counts as failed. recording: the run folder to estimate, or None.
     keep_in: where the run folder is kept; None if it is deleted.
     """
@@ -164,7 +164,7 @@ def _result(spec: Spec, folder: Path) -> Row:
 
 
 def _without(folder: Path, value: Any) -> Any:
-    """Text that does not depend on where a worker did the run."""
+    """Remove the folder's path from text, so that rows do not depend on where a worker did the run."""
     return value.replace(f"{folder}/", "") if isinstance(value, str) else value
 
 
@@ -181,7 +181,7 @@ def _done(spec: Spec, folder: Path) -> Any:
 
 @contextmanager
 def _place(spec: Spec) -> Iterator[Path]:
-    """The folder of a run, removed afterwards unless it is to be kept; hil's state folder for the user is there too."""
+    """The folder of a run, removed afterwards unless it is to be kept; hil's user state folder is inside it."""
     with tempfile.TemporaryDirectory(prefix="hil-study-", dir=_scratch(), ignore_cleanup_errors=True) as scratch:
         folder = Path(spec.keep_in) if spec.keep_in else Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
@@ -226,7 +226,7 @@ def _dry_run(arm: Path) -> Any:
 
 
 def _estimated(spec: Spec, folder: Path) -> Any:
-    """Estimate a copy of the recording, so that the fleet's own folders stay as they are."""
+    """Estimate a copy of the recording, so that the fleet's own folders are not modified."""
     from hil.estimation.settled_estimate import estimate_run
     from hil.runs.run_folder import RunFolder
 

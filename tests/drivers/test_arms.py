@@ -166,7 +166,7 @@ def test_another_master_is_found_on_current_and_pwm_joints_of_one_arm(opened: Op
     with (
         bus,
         bus.torque(watchdog=0.1),
-        pytest.raises(BusShared, match=f"ID {place}.* another program.* changed on the way"),
+        pytest.raises(BusShared, match=f"ID {place}.* another program.* altered in transit"),
     ):
         for cycle in range(40):
             due = port.clock.now() + 0.01

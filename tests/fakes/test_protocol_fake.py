@@ -107,7 +107,7 @@ def test_baud_can_be_changed(port: FakeSerial) -> None:
     port.baudrate = 1_000_000
     port.write(PING)
     assert port.read(14) == PONG
-    with pytest.raises(ValueError, match="not positive"):
+    with pytest.raises(ValueError, match="must be positive"):
         port.baudrate = 0
 
 

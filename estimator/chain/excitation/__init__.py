@@ -1,1 +1,1 @@
-"""Motions of a chain that reveal its parameters."""
+"""Excitation: motions that reveal a chain's parameters."""

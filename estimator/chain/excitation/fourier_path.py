@@ -1,13 +1,13 @@
 """Excitation of a chain by paths that are finite Fourier series of the joint angles.
 
 The arm is driven with the torque that an approximate model requires for the path, plus that of a software spring and
-damper. The series is optimised for what the result is used for: predicting the torque of other motions in the same
-range. The criterion is that of the worst joint and includes all unknowns of the regression, friction and offsets too.
-If a joint moves little, its gravity torque cannot be distinguished from an offset; a criterion on inertial parameters
-alone would miss this.
+damper. The series is optimised for the purpose of the result: predicting the torque of other motions in the same range.
+The criterion is evaluated for the worst joint and covers all unknowns of the regression, including friction and
+offsets. If a joint moves little, its gravity torque cannot be distinguished from an offset; a criterion on inertial
+parameters alone would miss this.
 
 This designer is for a box of angles and speeds that the user has chosen ([joint_path]); nothing else limits the path.
-If the box itself is to be found, within limits of torque and clearance, `path_design` chooses it.
+To find the box itself, within limits of torque and clearance, use `path_design`.
 """
 
 from dataclasses import dataclass

@@ -1,16 +1,16 @@
 """Paths whose amplitudes, phases and centre make the least certain base parameter as certain as possible.
 
 The search is an evolution strategy (a mean that moves towards the better half of random variations, N. Hansen and A.
-Ostermeier, Evolutionary Computation 9 (2001) 159, with one step size for all) over the coefficients of the finite
-Fourier series of `hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation
-is scaled to the limits of position and speed and then shrunk until `allowed` accepts it.
+Ostermeier, Evolutionary Computation 9 (2001) 159, with a single step size) over the coefficients of the finite Fourier
+series of `hil.estimator.chain.excitation.fourier_path`. It needs no gradient of the criterion. Every variation is
+scaled to the limits of position and speed and then shrunk until `allowed` accepts it.
 
-Friction is treated as unknown too, and its model as no more accurate than that of the links. If it were taken as known,
-slow, creeping motion would seem to identify a light joint, whose torque is mostly friction.
+Friction, too, is treated as unknown, and its model as no more accurate than that of the links. If it were known, slow,
+creeping motion would seem to identify a light joint, whose torque is mostly friction.
 
-This designer is for the pilot experiment, for which only limits are known: it also chooses the centre and the width of
-the motion. For a box that the user has chosen, `fourier_path.design_path` is simpler; its criterion, the prediction of
-other motions in that box, needs the box to be given.
+This designer is for the pilot experiment, where only limits are known: it also chooses the centre and width of the
+motion. For a box that the user has chosen, `fourier_path.design_path` is simpler; its criterion, the prediction of
+other motions in that box, requires a given box.
 """
 
 from collections.abc import Callable
@@ -71,7 +71,8 @@ class Design:
 
 
 class PathDesigner:
-    """Designs paths of one period [s] at `rate` with harmonics up to `highest` [Hz]. Raises ExcitationError.
+    """Designs paths of one `period` [s], sampled at `rate`, with harmonics up to `highest` [Hz]. Raises
+    ExcitationError.
 
     friction: typical Coulomb friction (joints,) [N m].
     """
@@ -155,7 +156,7 @@ class PathDesigner:
         return float(errors.max()), float(np.median(errors))
 
     def _start(self, random: np.random.Generator, told: Callable[[], None]) -> tuple[Array, Array]:
-        """Return centre and coefficients of the best random path, about random centres or the middle of the limits."""
+        """Return the centre and coefficients of the best random path about random centres or the limits' middle."""
         low, high = self._limits.low, self._limits.high
         best: tuple[float, Array, Array] | None = None
         for number in range(CENTRES):
@@ -199,7 +200,7 @@ class PathDesigner:
         return float((1.0 - _MEAN_SHARE) * errors.max() + _MEAN_SHARE * errors.mean())
 
     def _errors(self, path: Path, every: int) -> Array:
-        """Return standard errors after one whole period (base parameters,), relative to the prior's."""
+        """Return the standard errors after one whole period (base parameters,), relative to the prior's."""
         some = slice(0, None, every)
         Y = self._base.regressor(path.position[:, some], path.velocity[:, some], path.acceleration[:, some])
         level = np.sqrt(np.mean((Y @ self._prior.value) ** 2, axis=1) + self._friction**2) + 1e-6

@@ -25,7 +25,7 @@ POSITIVE = {
     "lag_ratio": 0.1,
     "back_emf": 0.5,
 }
-"""Kinds of positive parameters and the minimum initial value of each [its unit]."""
+"""Kinds of positive parameters, and the minimum initial value of each [in its unit]."""
 SMALL = {
     "offset": 0.01,
     "zero": 0.02,
@@ -33,7 +33,7 @@ SMALL = {
     "base_tilt_x": 0.02,
     "base_tilt_y": 0.02,
 }
-"""Scales of the parameters that are neither positive nor base parameters [unit of each]."""
+"""Scales of the parameters that are neither positive nor base parameters [in their units]."""
 SHAPES = {
     "coulomb_width": (0.01, 2.5),
     "stribeck_rise": (0.3, 1.0),
@@ -43,10 +43,10 @@ SHAPES = {
     "lag_ratio": (1.0, 0.6),
     "back_emf": (0.92, 0.08),
 }
-"""Priors on the shape of friction and on drives: typical value [its unit] and standard deviation of its logarithm.
+"""Priors on the shape of friction and on drives: typical value [in its unit] and standard deviation of its logarithm.
 
 Without them, these parameters would be undetermined for a joint that never moves slowly, or has little inertia. Early
-in a fit they are held fixed: a lag that is driven to zero while other errors dominate would hardly grow again.
+in a fit they are held fixed: a lag that is driven to zero while other errors dominate would hardly recover.
 """
 ANGLES = {"zero": 0.1, "base_tilt_x": 0.1, "base_tilt_y": 0.1}
 """Priors on small angles that gravity may not reveal: standard deviations around zero [rad]."""
@@ -77,7 +77,7 @@ class ChainCoordinates:
         return x
 
     def moved(self, x: Array, step: Array) -> Array:
-        """Return the point reached by `step` from `x`; other coordinates may follow in both arrays.
+        """Return the point reached by `step` from `x`; both arrays may end with other coordinates.
 
         If a recording barely constrains the torque of some joints relative to that of the first, their torque scales
         and all parameters of their links can change by a common factor. The scales are exponentials of their
@@ -92,7 +92,7 @@ class ChainCoordinates:
         return y
 
     def raised(self, x: Array) -> Array:
-        """Return `x` with every width raised to its floor; other coordinates may follow in `x`."""
+        """Return `x` with every width at or above its floor; `x` may end with other coordinates."""
         y = x.copy()
         y[self._widths] = np.maximum(x[self._widths], np.log(self._least[self._widths]))
         return y
@@ -101,7 +101,7 @@ class ChainCoordinates:
         """Return the largest possible decrease of each parameter's coordinate, as a negative number or 0
         (parameters,).
 
-        Only widths have a floor; other coordinates may follow in `x`.
+        Only widths have a floor; `x` may end with other coordinates.
         """
         least = np.full(len(self.names), -np.inf)
         least[self._widths] = np.minimum(np.log(self._least[self._widths]) - x[self._widths], 0.0)
@@ -127,7 +127,7 @@ class ChainCoordinates:
 
     @cached_property
     def likely(self) -> tuple[npt.NDArray[np.int64], Array, Array]:
-        """Indices, prior means and prior standard deviations of the parameters that have a prior of their own (friction
+        """Indices, prior means and prior standard deviations of the parameters that have their own prior (friction
         shapes, drives, small angles).
         """
         found = [
@@ -156,8 +156,8 @@ class ChainCoordinates:
     def _following(self) -> Array:
         """Weights with which parameters follow the logarithms of the torque scales (parameters, joints - 1).
 
-        An offset follows the scale of its own joint, a link's parameters the mean scale of all joints but the first up
-        to its own; those of the first link follow none.
+        An offset follows the scale of its own joint. A link's parameters follow the mean scale of the joints from the
+        second to its own; those of the first link follow none.
         """
         weights = np.zeros((len(self.names), self.torque_scales.size))
         for index, (name, kind) in enumerate(zip(self.names, self._kinds, strict=True)):

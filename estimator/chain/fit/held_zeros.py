@@ -17,18 +17,18 @@ from hil.estimator.fit.levenberg_marquardt import Minimum
 
 @dataclass(frozen=True)
 class HeldZeros:
-    """Encoder zeros of all joints but the first, as far as the recording reveals them."""
+    """Encoder zeros of all joints but the first, as far as the recording determines them."""
 
     shift: Array
     """Estimated true minus measured angle (joints - 1,) [rad]; close to 0 if gravity does not reveal it."""
     gain: float
-    """Expected decrease of the sum of squares if the zeros were fitted, in units of the white noise's variance."""
+    """Expected decrease of the sum of squares if the zeros were fitted, in units of the white-noise variance."""
 
 
 def held_zeros(problem: ChainProblem, x: Array, unfinished: float) -> HeldZeros:
     """Estimate the encoder zeros that `problem` holds at 0, evaluated at its minimum `x`.
 
-    unfinished: decrease of the sum of squares that one more step without fitting the zeros is expected to bring.
+    unfinished: expected decrease of the sum of squares in one more step that does not fit the zeros.
     """
     model = replace(problem.model, zeros=True)
     names, size = model.names, len(model.names)

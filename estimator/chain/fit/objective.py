@@ -32,7 +32,7 @@ MOST_KEPT = 1 << 26  # bytes of derivatives
 class _Latest:
     """The latest simulation with derivatives.
 
-    Problems that differ in weights or prior only share it, and the covariance needs the one at the minimum again.
+    Problems that differ only in weights or prior share it, and the covariance reuses the one at the minimum.
     """
 
     x: Array | None = None
@@ -40,7 +40,7 @@ class _Latest:
     settings: tuple[float, ...] = ()
     """Other settings on which the simulation depends."""
     parts: dict[int, list[tuple[slice, Array, Array]]] = field(default_factory=dict)
-    """Samples, angles and derivatives of each period that was simulated to its end."""
+    """Samples, angles and derivatives of each period that was simulated to the end."""
     size: int = 0
 
 
@@ -72,8 +72,8 @@ class ChainProblem:
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; less near the minimum."""
     prior_weight: float = 1.0
-    """Factor on the prior's precision. It is above 1 while model errors exceed the noise that the weights assume: the
-    prior then still decides what the data do not determine.
+    """Factor on the prior's precision; above 1 while model errors exceed the noise that the weights assume, so that the
+    prior still decides what the data do not determine.
     """
     added: tuple[Array | None, ...] = ()
     """Known base parameters of the mass added to the arm in each period (base parameters,) [SI]; None if none was
@@ -97,7 +97,7 @@ class ChainProblem:
         return (x[first : first + size] * self.state_scale).reshape(2, -1)
 
     def run_of(self, period: SettledPeriod, parameters: dict[str, float]) -> ChainRun:
-        """Return the simulation's input for a period, with the delay and lag of these parameters."""
+        """Return the simulation's input for a period, with the delay and lag in `parameters`."""
         torque, slopes = torque_and_slopes(
             *(period.torque, period.rate, period.command_to_sample, self.steps),
             delay=parameters.get("delay", 0.0),
@@ -112,7 +112,7 @@ class ChainProblem:
         )
 
     def _measured(self, period: SettledPeriod) -> Array:
-        """Return the angles that are compared (samples, joints) [rad]."""
+        """Return the measured angles to be compared (samples, joints) [rad]."""
         return np.ascontiguousarray(period.position.T[:: self.every][: period.samples // self.every])
 
     def _thinned(self, of_steps: Array) -> Array:
@@ -152,7 +152,7 @@ class ChainProblem:
         return max(1.0, sum(float(np.sum(each)) for each in counted))
 
     def _with_prior(self, x: Array, data: Quadratic) -> Quadratic:
-        """Return the sum of squares with the prior's part; infinite as a whole if that of the data is."""
+        """Return the sum of squares including the prior's part; infinite if the data's part is."""
         normal, gradient = data.normal.copy(), data.gradient.copy()
         if not np.isfinite(data.cost):
             return Quadratic(np.inf, normal, gradient)
@@ -212,7 +212,7 @@ class ChainProblem:
         return self._add_prior(x, np.zeros((x.size, x.size)), np.zeros(x.size))
 
     def cost(self, x: Array) -> float:
-        """Return the sum of squares at `x` alone; infinite if the motion diverges."""
+        """Return only the sum of squares at `x`; infinite if the motion diverges."""
         total = self.prior_cost(x)
         for position, period, weight in zip(self._motions(x), self.periods, self.weights, strict=True):
             if position is None:
@@ -243,7 +243,7 @@ class ChainProblem:
             yield simulation.go_on(run, slice(0, len(run.measured)))[0]
 
     def _knows(self, x: Array) -> bool:
-        """Whether the latest simulation with derivatives was this one."""
+        """Whether the latest simulation with derivatives was of this problem at `x`."""
         latest = self.latest
         return (
             latest.x is not None

@@ -7,7 +7,7 @@ from hil.estimator.options import CoordinateOptions
 
 @dataclass(frozen=True)
 class ChainOptions:
-    """Options of stage 2 for chains; those that `hil.estimator.options` also has are named as there."""
+    """Options of stage 2 for chains; those shared with `hil.estimator.options` have the same names."""
 
     softness: tuple[float, ...] = (3.0, 1.5, 1.0)
     """Natural frequencies of the observer, in order of use [Hz].
@@ -30,7 +30,7 @@ class ChainOptions:
     """Number of smaller steps that replace one step near standstill in the last iterations."""
     widths_per_substep: float = CoordinateOptions.widths_per_substep
     width_floor: float = 3e-4
-    """Minimum width of every Coulomb step [rad/s]; its effect is hardly distinguishable from true sticking."""
+    """Minimum width of every Coulomb step [rad/s]; a step this narrow is hardly distinguishable from true sticking."""
     initial_width: float = 0.03
     """Initial width of the smoothed Coulomb step [rad/s]."""
     other_initial_widths: tuple[float, ...] = (0.005, 0.001)

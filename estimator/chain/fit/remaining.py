@@ -12,7 +12,7 @@ MINIMISER = MinimiserOptions()
 
 
 def remaining(minimum: Minimum, coordinates: ChainCoordinates) -> tuple[Array, float]:
-    """Return the undamped step from a minimum (coordinates,), and the decrease that the normal equations predict.
+    """Return the undamped step from `minimum` (coordinates,) and the decrease that the normal equations predict for it.
 
     If the sum of squares is slightly discontinuous, all damped steps may fail although the gradient is not zero.
     A friction width at its lower bound stays there, and no positive parameter becomes negative.

@@ -29,7 +29,7 @@ class ChainLinear:
     std: Array
     """Standard errors assuming a white residual, in the order of `value` [SI]."""
     delay: float
-    """Delay of the motors' torque [s]."""
+    """Delay of the motor torque [s]."""
     motions: tuple[PeriodicMotion, ...]
     """Motion of each period, computed from its Fourier lines."""
     relative_residual: Array

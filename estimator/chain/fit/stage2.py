@@ -38,10 +38,10 @@ from hil.estimator.options import CovarianceOptions, MinimiserOptions
 
 MINIMISER, COVARIANCE = MinimiserOptions(), CovarianceOptions()
 NEARER, LAST = MinimiserOptions(max_damping=0.1), MinimiserOptions(max_damping=1.0)
-"""Options of the last iterations with coarse steps, and of those with fine steps that follow.
+"""Options for the last iterations with coarse steps, and for the following ones with fine steps.
 
-If a joint is on the verge of sticking, the sum of squares is slightly discontinuous. A decrease that is only achieved
-with heavy damping is due to such a discontinuity and is not pursued.
+If a joint is on the verge of sticking, the sum of squares is slightly discontinuous. A decrease achieved only with
+heavy damping is due to such a discontinuity and is not pursued.
 """
 
 
@@ -70,9 +70,9 @@ class ChainFit:
     softness: float
     """Natural frequency of the observer at the end [Hz]."""
     remaining: float
-    """Decrease of the sum of squares that is expected from one more step, the one that would reach the minimum."""
+    """Expected decrease of the sum of squares in one more step, which would reach the minimum."""
     neglected: Array
-    """Covariance due to the effects that the model of voltage-driven joints neglects (parameters, parameters) [SI]."""
+    """Covariance due to effects neglected in the model of voltage-driven joints (parameters, parameters) [SI]."""
     at_bound: tuple[str, ...] = ()
     """Parameters at a bound although the data favour values beyond it; empty unless this affects base parameters."""
     held_zeros: HeldZeros | None = None
@@ -194,8 +194,8 @@ def _fit(
 
 
 def _at_bound(problem: ChainProblem, minimum: Minimum, value: Array, std: Array) -> tuple[str, ...]:
-    """Return the parameters at a bound although the data favour values beyond it, if base parameters, viscous or dry
-    friction depend on them or are among them.
+    """Return the parameters at a bound although the data favour values beyond it, if this affects base parameters or
+    viscous or dry friction.
 
     std: standard errors of the parameters `value` (parameters,).
     """

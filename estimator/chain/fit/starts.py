@@ -1,4 +1,4 @@
-"""Starts of stage 2 for chains: from stage 1's result to a rough minimum with a soft observer.
+"""Start of stage 2 for chains: from stage 1's result to a rough minimum with a soft observer.
 
 The observer starts stiff, so that the simulation can follow the motion with stage 1's parameters, and is softened as
 the fit improves.
@@ -90,8 +90,8 @@ def repeated(period: SettledPeriod) -> Array:
 
 
 def started(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
-    """Return the optimisation problem refined so that it resolves friction near standstill, its approximate minimum,
-    and the number of simulations used.
+    """Return the optimisation problem refined to resolve friction near standstill, its approximate minimum, and the
+    number of simulations used.
 
     x: stage 1's result. Raises ConvergenceError if the stiffest observer does not follow the motion.
     """
@@ -124,8 +124,8 @@ def _softened_later(coarse: ChainProblem, x: Array, options: ChainOptions) -> tu
 
 
 def resolved(coarse: ChainProblem, soft: Array, options: ChainOptions) -> tuple[ChainProblem, Minimum, int]:
-    """Return the problem refined so that it fits the shape of friction and resolves motion near standstill, its minimum
-    reached from `soft`, and the number of simulations used.
+    """Return the problem refined to fit the shape of friction and resolve motion near standstill, its minimum reached
+    from `soft`, and the number of simulations used.
     """
     narrowest = resolved_widths(coarse, soft, options.fine_step / options.finest, options.widths_per_substep)
     # An early fit may be far off: where it makes a joint much too light, the friction step must not stay wide.
@@ -150,7 +150,8 @@ def _of_data(problem: ChainProblem, x: Array) -> float:
 def narrowed(problem: ChainProblem, value: Array, starts: Sequence[Array], options: ChainOptions) -> Array:
     """Return the coordinates of an earlier fit, with Coulomb steps no wider than the initial width.
 
-    value, starts: its parameters (parameters,) and the state at the first sample of each period (2, joints) [SI].
+    value, starts: the earlier fit's parameters (parameters,) and the state at the first sample of each period (2,
+    joints) [SI].
     """
     kinds = np.array([kind_of(name) for name in problem.coordinates.names])
     value = np.where(kinds == "coulomb_width", np.minimum(value, options.initial_width), value)
@@ -159,10 +160,10 @@ def narrowed(problem: ChainProblem, value: Array, starts: Sequence[Array], optio
 
 
 def softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Array, float, int]:
-    """Return the minimum with the softest observer that follows the motion, the softness of that observer, and the
-    number of simulations used.
+    """Return the minimum with the softest observer that follows the motion, that observer's softness, and the number of
+    simulations used.
 
-    Raises ConvergenceError if even the stiffest does not.
+    Raises ConvergenceError if even the stiffest observer does not follow the motion.
     """
     skip = max(1, int(options.first_step * min(period.rate for period in coarse.periods)))
     spent = 0
@@ -192,7 +193,7 @@ def softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Arr
 
 
 def _minimised(problem: ChainProblem, x: Array, ftol: float) -> tuple[Minimum, ChainProblem]:
-    """Return the minimum from `x` with the prior's weight raised by the residual there, and that problem."""
+    """Return the minimum from `x`, with the prior's weight raised according to the residual, and that problem."""
     trial, at = problem.tempered(x)
     found = trial.minimise(x, ftol, at=at)
     return replace(found, iterations=found.iterations + 1), trial

@@ -45,11 +45,10 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
 
 
 def neglected_covariance(problem: ChainProblem, x: Array) -> Array:
-    """Return the covariance (parameters, parameters) [SI] due to the effects that the model of a lagging back-EMF
-    neglects.
+    """Return the covariance (parameters, parameters) [SI] due to effects neglected in the model of a lagging back-EMF.
 
     The effect of friction on the motor's current is delayed by the difference between the fitted lag and the winding's.
-    This makes a joint's inertia wrong by the square of its apparent loss of inertia, divided by the inertia
+    This biases a joint's inertia by the square of its apparent loss of inertia, divided by the inertia
     (`hil.estimator.simulation.back_emf.neglected`).
     """
     base, parameters = problem.model.base, problem.parameters(x)
@@ -76,7 +75,7 @@ class _Spectrum:
     share: Array
     """Leverage: fraction of the noise on each line that the fit absorbs (lines,)."""
     stands_for: float
-    """Ratio of the period's number of samples to the number of those from which the Jacobian was computed."""
+    """Ratio of the period's number of samples to the number used for the Jacobian."""
 
     def information(self) -> Array:
         """Return the information under white noise, summed over frequencies (coordinates, coordinates)."""
@@ -100,7 +99,7 @@ def _spectra(problem: ChainProblem, x: Array, index: int, scale: Array, inverse:
 
 
 def _levels(parts: Sequence[_Spectrum], joints: int) -> Array:
-    """Return each joint's noise level (joints,) at the frequencies that determine the parameters; 1 if it is white."""
+    """Return each joint's noise level (joints,) at the frequencies that determine the parameters; 1 for white noise."""
     power, expected, spread = np.zeros((3, joints))
     for part in parts:
         power[part.joint] += float(part.share @ part.power)

@@ -5,9 +5,8 @@ the order first moments, inertias, rotor, mass. A column that depends linearly o
 its parameter is lumped into theirs (Gautier, Journal of Robotic Systems 8 (1991) 485). In this order the sums stay
 short, such as `moment_x_3 + 0.124 mass_4`, since a link's mass acts like a moment of the previous link.
 
-Columns that are nearly dependent are considered after all others, the least dependent first. With an axis
-that is a degree off its link's y axis, the moment along y would otherwise be kept, and the sums would have large terms
-that nearly cancel.
+Columns that are nearly dependent are considered after all others, the least dependent first. Otherwise, with an axis a
+degree off its link's y axis, the moment along y would be kept, and the sums would have large terms that nearly cancel.
 """
 
 from dataclasses import dataclass, replace
@@ -107,10 +106,10 @@ class BaseParameters:
 
 
 def _norms_by_kind(norm: Array) -> Array:
-    """Return the largest norm of the columns of the same link and kind, for each column.
+    """Return, for each column, the largest norm of the columns of the same link and kind.
 
-    Where a kind has hardly any effect in a link, such as the moments of the first link if its axis is vertical up to
-    rounding, it is that of all links: these columns must not be scaled up.
+    If a kind has hardly any effect in a link, such as the moments of the first link if its axis is vertical up to
+    rounding, the largest norm of all links is used, so that these columns are not scaled up.
     """
     largest = norm.reshape(-1, TERMS).copy()
     for kind in KINDS:
@@ -120,7 +119,7 @@ def _norms_by_kind(norm: Array) -> Array:
 
 
 def _independent(Y: Array, order: list[int]) -> Columns:
-    """Return which columns of `Y`, scaled by the largest of their kind, are independent of each other."""
+    """Return the linearly independent columns of `Y`, whose columns are scaled by the largest of their kind."""
     left = Y[:, order].copy()
     kept: list[int] = []
 

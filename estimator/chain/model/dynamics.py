@@ -73,8 +73,8 @@ def regressor(
 
 
 def places(joints: int, chosen: Columns) -> Columns:
-    """Return the index of each link's parameters among the chosen ones (joints, 11). A parameter that was not chosen
-    has the number of chosen ones as its index.
+    """Return the index of each link parameter among the chosen ones (joints, 11); for parameters that were not chosen,
+    the number of chosen ones.
     """
     column = np.full(TERMS * joints, chosen.size)
     column[chosen] = np.arange(chosen.size)

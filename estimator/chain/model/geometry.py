@@ -33,7 +33,7 @@ class Chain:
     translation: Array
     """Origin of each link's frame in that of the previous link (joints, 3) [m]."""
     axis: Array
-    """Unit vector along the axis of each joint, in its own frame (joints, 3)."""
+    """Unit vector along the axis of each joint, in its link's frame (joints, 3)."""
     gravity: Array
     """Gravity in the base's frame (3,) [m/s^2]; (0, 0, -9.81) for an upright base."""
 
@@ -69,7 +69,7 @@ class Chain:
 def parameter_names(joints: int) -> tuple[str, ...]:
     """Return the names of all inertial parameters.
 
-    Link by link these are the terms of LINK_TERMS and `armature`, the rotor's inertia times the gear ratio squared.
+    For each link, these are the terms in LINK_TERMS and `armature`, the rotor's inertia times the gear ratio squared.
     """
     return tuple(f"{term}_{joint + 1}" for joint in range(joints) for term in (*LINK_TERMS, "armature"))
 

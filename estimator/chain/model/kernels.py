@@ -3,8 +3,8 @@
 The algorithms are recursive Newton-Euler and composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms,
 2008), with all spatial vectors expressed about the base's origin, so that no transformation between links is needed:
 motions are (angular, linear), forces (moment, force). The derivatives follow Singh, Russo and Wensing, IEEE Robotics
-and Automation Letters 7 (2022) 1776. Of their Coriolis matrix B only the product with a motion w is needed; integrated
-over the mass it is
+and Automation Letters 7 (2022) 1776. Only the product of their Coriolis matrix B with a motion w is needed; integrated
+over the mass, it is
 
     2 B w = (2 (tr G - G) w_angular, 2 w_angular x l)       G = sum of dm velocity position^T, l the momentum,
 
@@ -31,7 +31,7 @@ MASS, MOMENT, INERTIA, MOMENTUM, FLOW, FORCE, BODY = 0, 1, 4, 10, 13, 22, 28
 
 
 def room(joints: int) -> Any:
-    """Return the work arrays of the functions below.
+    """Return the work arrays for the functions below.
 
     frame    rotation by rows and origin of each link (joints, 12)
     motion   joint axis; velocity; acceleration, with gravity as an upward acceleration; time derivative of the axis;
@@ -200,8 +200,8 @@ def accelerate(armature: Any, gravity: Any, v: Any, a: Any, room: Any) -> None:
 
 
 def differentiate(gravity: Any, room: Any) -> None:
-    """Compute the torques' derivatives with respect to angles and velocities, at the accelerations that `accelerate`
-    computed last.
+    """Compute the torques' derivatives with respect to angles and velocities, at the accelerations last passed to
+    `accelerate`.
     """
     _, motion, body, seized, _, _, by_q, by_v, spare = room
     n = motion.shape[0]
@@ -259,7 +259,7 @@ def _flow(b: Any, trace: float, w: Any, out: Any) -> None:
 
 
 def regress(column: Any, a: Any, room: Any, Y: Any) -> None:
-    """Compute the regressor Y (joints, columns) at the accelerations that were last passed to `accelerate`.
+    """Compute the regressor Y (joints, columns) at the accelerations last passed to `accelerate`.
 
     column (joints, 11): column of Y for each of a link's parameters and the armature; unwanted columns are written but
     never read. Entries that are always zero are not written.

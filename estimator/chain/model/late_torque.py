@@ -1,4 +1,4 @@
-"""What delays the torque of a chain's drives: each joint's own lag, and the back-EMF of voltage-driven joints.
+"""Delays of the torque of a chain's drives: the lag of each joint, and the back-EMF of voltage-driven joints.
 
 The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
 product of its back-EMF and its lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous
@@ -16,8 +16,8 @@ from hil.estimator.arrays import Array
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.dynamics import TERMS, mass_matrix
 
-MEANINGS = {"lag_ratio": "lag of the joint's current loop relative to joint 1's, as a ratio"}
-"""Meanings of the kinds of parameters that only chains have."""
+MEANINGS = {"lag_ratio": "ratio of the lag of the joint's current loop to joint 1's"}
+"""Meanings of the kinds of parameters specific to chains."""
 PART = 0.1
 """`limited` names a joint's back-EMF only if the joint contributes more than this fraction to the motion that loses the
 most inertia.
@@ -62,7 +62,7 @@ def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -
     """Return the names of the lagging back-EMFs that would cancel more inertia than the simulation allows.
 
     The loss that is simulated is then smaller than the parameters imply, which biases the estimated inertias. A
-    back-EMF is only named if its loss exceeds the standard error of a base parameter. std: standard errors of the base
+    back-EMF is named only if its loss exceeds the standard error of a base parameter. std: standard errors of the base
     parameters; those of other parameters may follow.
     """
     generating = _generating(base.chain.joints, parameters)
@@ -84,7 +84,7 @@ def rotor(base: BaseParameters, joint: int) -> Array:
 
 Losses = list[tuple[Array, dict[int, float]]]
 """For each voltage-driven joint: its rotor (base parameters,), and the decrease of its inertia [kg m^2] per unit of
-each parameter that its lagging back-EMF depends on, by that parameter's index.
+each parameter that its lagging back-EMF depends on, keyed by that parameter's index.
 """
 
 
@@ -138,7 +138,7 @@ def _generating(joints: int, parameters: Mapping[str, float]) -> list[tuple[int,
 def _possible(
     base: BaseParameters, parameters: Mapping[str, float], generating: Sequence[tuple[int, float, float, float]]
 ) -> float:
-    """Return the fraction, at most 1, of the inertias lost to lagging back-EMF that these joints can lose."""
+    """Return the factor, at most 1, that limits the inertias lost to lagging back-EMF to what is possible."""
     most, _ = _most_lost(base, parameters, generating)
     return min(1.0, MOST_LOST / most) if most > 0.0 else 1.0
 
@@ -146,7 +146,7 @@ def _possible(
 def _most_lost(
     base: BaseParameters, parameters: Mapping[str, float], generating: Sequence[tuple[int, float, float, float]]
 ) -> tuple[float, Array]:
-    """Return the largest fraction of its inertia that any motion loses, and the joints' parts in it (joints,)."""
+    """Return the largest fraction of inertia lost in any motion, and each joint's contribution to it (joints,)."""
     lost = np.zeros(base.chain.joints)
     for joint, share, viscous, late in generating:
         lost[joint] = share * viscous * late

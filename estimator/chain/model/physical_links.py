@@ -33,7 +33,7 @@ class PhysicalLinks:
     armature: Array
     """Reflected rotor inertias (joints,) [kg m^2]."""
     misfit: float
-    """Largest deviation of a base parameter from the identified one, in standard errors."""
+    """Largest deviation of a base parameter from its identified value, in standard errors."""
 
 
 @one_blas_thread

@@ -1,4 +1,4 @@
-"""A weak prior from a description of the arm, for what the data do not determine: base parameters, torque constants."""
+"""Weak prior, from a description of the arm, on base parameters and torque constants that the data do not determine."""
 
 from dataclasses import dataclass
 
@@ -69,7 +69,7 @@ def spread_of(described: Array) -> Array:
 def scale_precision(std: Array) -> Array:
     """Return the precision matrix (joints - 1, joints - 1) of the logarithms of the joints' torque scales.
 
-    A torque scale is the ratio of a joint's torque constant to the first one's.
+    A torque scale is the ratio of a joint's torque constant to that of the first joint.
 
     std: relative standard deviations of the torque constants (joints,).
     """

@@ -53,7 +53,7 @@ def tilt_slopes(gravity: Array, x: float, y: float) -> Array:
 
 
 def tilt_between(gravity: Array, real: Array) -> tuple[float, float]:
-    """Return the angles with `tilted(gravity, x, y) == real`, for two vectors of the same length."""
+    """Return the angles for which `tilted(gravity, x, y) == real`, for two vectors of the same length."""
     turn = np.cross(real, gravity)
     sine, cosine = float(np.linalg.norm(turn)), float(real @ gravity)
     if sine == 0.0:

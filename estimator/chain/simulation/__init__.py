@@ -1,1 +1,1 @@
-"""Simulated motion of chains: with sensitivities, in closed loop, and observed while an arm moves."""
+"""Simulation of chains: with sensitivities, in closed loop, and for observing an arm while it moves."""

@@ -1,17 +1,17 @@
-"""Checks at every sample whether the motion of a spatial arm is consistent with what is known about it.
+"""Check at every sample whether the motion of a spatial arm is consistent with its known parameters.
 
 Angles, velocities and commanded torques pass through the same first-order low-pass filter, which also yields
 accelerations. The residual torque, `torque - Y(q, v, a) theta`, is compared with its uncertainty, due to the
 parameters' covariance, rounding of the velocities, and noise that is estimated while the arm moves. The parameters are
 updated as well (a Kalman filter for slowly drifting constants), so the tolerance narrows over time. As in
 `hil.estimator.models.momentum_observer`, which planar arms use, the friction that can hold a joint at rest is
-subtracted from the residual. There is an alarm if the remainder exceeds `TIMES` standard deviations and a fraction of
+subtracted from the residual. An alarm is raised if the remainder exceeds `TIMES` standard deviations and a fraction of
 the largest planned torque for `HOLD_S`; large residuals raise it sooner.
 
-The noise estimate describes motion, so it only learns from motion. The residual of a joint at rest is due to friction,
-or to something that blocks it, and would widen the tolerance until nothing exceeded it. A joint at rest is also judged
-by the range of torques on it (`hil.estimator.models.standstill`). A residual that may become an alarm enters the noise
-estimate only after it has ended without an alarm.
+The noise estimate describes motion, so it is updated only during motion. The residual of a joint at rest is due to
+friction, or to something that blocks it, and would widen the tolerance until nothing exceeded it. A joint at rest is
+also judged by the range of torques on it (`hil.estimator.models.standstill`). A residual that may become an alarm
+enters the noise estimate only after it has ended without an alarm.
 """
 
 import math
@@ -55,7 +55,7 @@ ANGLE, VELOCITY, TORQUE, SLOPE, NOISE, STANDS, HELD, SAMPLES, LACKING, TAUGHT, T
 
 
 class ChainObserver:
-    """Detects motion that is inconsistent with the arm's parameters, and refines these as the arm moves.
+    """Detects motion that is inconsistent with the arm's parameters, and refines the parameters as the arm moves.
 
     mean: base parameters, then viscous friction, dry friction and offsets (base + 3 joints,) [SI].
     covariance: covariance of `mean`.
@@ -114,8 +114,8 @@ class ChainObserver:
             torque: torques commanded since the previous sample [N m].
             seconds: time since the previous sample [s].
             is_free: whether the motion of each joint can be judged; one value for all or one per joint.
-            support: 1 or -1 for each joint that may lie on a stop, which prevents motion in this direction, otherwise 0
-                (joints,); None if there is none.
+            support: 1 or -1 for each joint that may rest against a stop that blocks motion in this direction, otherwise
+                0 (joints,); None if no joint does.
         """
         return _observe(
             *(self._memory, self._rests, self._theta, self._covariance, self._constants, self._chain, self._work),
@@ -279,7 +279,7 @@ def _observe_loop(  # noqa: PLR0912, PLR0915
 
 
 def _teach_noise_of(memory: Any, j: int, taught: float, dt: float) -> None:
-    """Update the noise variance; the contribution of a possible alarm waits until the alarm has ended."""
+    """Update the noise variance; the contribution of a possible alarm is held back until the alarm has ended."""
     memory[TAUGHT, j] += taught * dt
     memory[TEACHES, j] += dt
     if memory[SAMPLES, j] > 0.0 or memory[TEACHES, j] <= 0.0:

@@ -1,4 +1,4 @@
-"""Closed-loop simulation of chains under goal torques: how the arms of an ensemble would move in an experiment.
+"""Closed-loop simulation of an ensemble of chains under goal torques, as in an experiment.
 
 At each sample, a goal torque is added to the torque of a software spring and damper, which is computed from angles and
 velocities of the previous sample as in the real loop. In between, the motion is integrated by the linearly implicit
@@ -32,7 +32,7 @@ DRIVE_TERMS = ("viscous", "coulomb", "offset", "coulomb_width", "torque_scale", 
 
 @dataclass(frozen=True)
 class ChainArms:
-    """An ensemble of arms, each of which may be the real one.
+    """An ensemble of arms, each a candidate for the real one.
 
     rigid: base parameters (arms, base parameters) [SI].
     drive: DRIVE_TERMS (arms, 6, joints) [SI]; `torque_scale` is the ratio of true to commanded torque.
@@ -52,7 +52,7 @@ class ChainArms:
         return ChainArms(self.base, self.rigid[:count], self.drive[:count])
 
     def and_more(self, others: "ChainArms") -> "ChainArms":
-        """Return these arms, followed by others of the same chain."""
+        """Return these arms followed by others of the same chain."""
         return ChainArms(
             self.base, np.concatenate((self.rigid, others.rigid)), np.concatenate((self.drive, others.drive))
         )
@@ -76,8 +76,8 @@ class Loop:
     stiffness, damping: gains of the spring [N m/rad] and damper [N m s/rad] towards `pose` (joints,).
     pose: rest pose (joints,) [rad], in which a surface keeps gravity from moving joints further down.
     limit: largest commanded torque (joints,) [N m].
-    stops: side on which a joint lies on its own stop in the rest pose (joints,), -1, 1, or 0 if it does not; None if
-    none does. A stop supports its joint instead of the surface, whatever the angles of the other joints. Nothing
+    stops: side on which each joint rests against its own stop in the rest pose (joints,): -1, 1, or 0 for none; None if
+    no joint does. A stop supports its joint instead of the surface, whatever the angles of the other joints. Nothing
     supports a joint whose largest torque is 0.
     pull: added to the spring and damper; None if they act alone.
     """
@@ -120,7 +120,7 @@ class Motions:
 def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = None) -> Motions:
     """Return the motions of all arms from angles `start` (joints,) or (arms, joints) [rad].
 
-    They start at rest unless `speed` [rad/s] is given, which has the same shape as `start`.
+    The arms start at rest unless `speed` [rad/s], of the same shape as `start`, is given.
     """
     n, samples = arms.base.chain.joints, len(loop.goal)
     at = np.broadcast_to(start, (arms.size, n))
@@ -147,7 +147,7 @@ def roll_out(arms: ChainArms, loop: Loop, start: Array, speed: Array | None = No
 
 
 def _pull_of(loop: Loop) -> tuple[Array, Array, Array]:
-    """Path (samples, joints), empty if there is none, growth per sample and rad (joints,), largest torque (joints,)."""
+    """Return path (samples, joints), empty if none; growth per sample and rad (joints,); largest torque (joints,)."""
     if loop.pull is None:
         return np.empty((0, len(loop.limit))), np.zeros_like(loop.limit), np.zeros_like(loop.limit)
     return loop.pull.path, loop.pull.per_second / loop.rate * loop.stiffness, loop.pull.share * loop.limit
@@ -190,7 +190,7 @@ def inertias(arms: ChainArms, poses: Array) -> tuple[Array, Array]:
 
 
 def is_physical(arms: ChainArms, poses: Array) -> Any:
-    """Return whether each arm's mass matrix is positive definite in all `poses` (poses, joints), as (arms,)."""
+    """Return whether each arm's mass matrix is positive definite in all `poses` (poses, joints) (arms,)."""
     n = arms.base.chain.joints
     work, still = room(n), np.zeros(n)
     rotation, translation, axis, _ = arms.base.chain.arrays

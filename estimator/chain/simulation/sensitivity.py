@@ -1,4 +1,4 @@
-"""Simulated motion of a chain and its sensitivities to all parameters, as the likelihood needs them."""
+"""Simulated motion of a chain and its sensitivities to all parameters, as needed by the likelihood."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from hil.estimator.chain.model.tilt import TILT, tilt_slopes, tilted
 from hil.estimator.chain.simulation.stepping import JOINT_TERMS, run
 
 ABSENT = {"coulomb_width": 1.0, "stribeck_velocity": 1.0, "torque_scale": 1.0}
-"""Values that disable a term that the model lacks; zero for all other terms."""
+"""Values that disable terms absent from the model; 0 for all other terms."""
 AT_ONCE = 8
 LINE = 8  # numbers in a cache line
 
@@ -122,7 +122,7 @@ class Simulation:
 
 
 def _aligned(rows: int, columns: int) -> Array:
-    """Return zeros that start at a multiple of the length of a cache line, so that no vector straddles two lines."""
+    """Return an array of zeros aligned to cache lines, so that no vector straddles two lines."""
     spare = np.zeros(rows * columns + LINE)
     first = -(spare.ctypes.data // spare.itemsize) % LINE
     return spare[first : first + rows * columns].reshape(rows, columns)

@@ -1,4 +1,4 @@
-"""The compiled motion of a chain under given motor torques, and its derivatives (parameters, initial state).
+"""Compiled simulation of a chain under given motor torques, with derivatives (parameters, initial state).
 
 Friction and drive are modelled as in `hil.estimator.simulation.arm`. Each step uses that module's Rosenbrock method
 ROS2, with the second stage written so that both stages need the regressor at one acceleration only. With f the torques
@@ -39,7 +39,7 @@ WORST = 1e4  # rad or rad/s: a simulation that reaches this has diverged
 
 
 def _left(p: Any, j: int, v: float, t: float, out: Any) -> None:
-    """Compute the torque of drive j minus friction and offset, the slope of friction, and its shape, into `out`."""
+    """Write to `out` the torque of drive j minus friction and offset, and the slope and shape of friction."""
     motor = p[SCALE, j] * t
     ratio = v / p[FADING, j]
     past = ratio * ratio
@@ -106,7 +106,7 @@ def _direct(
 def _add_eight(out: Any, i: int, A: Any, X: Any, j: int, width: int) -> None:
     """Add the products of A's columns j to j + 7 in rows i and i + 1 with those rows of X to those rows of out.
 
-    Two rows at a time: X is read half as often.
+    Processing two rows at a time halves the number of reads of X.
     """
     a, b, c, d = A[i, j], A[i, j + 1], A[i, j + 2], A[i, j + 3]
     e, f, g, h = A[i, j + 4], A[i, j + 5], A[i, j + 6], A[i, j + 7]

@@ -19,8 +19,8 @@ _VALUE, _LIMITS, _HEALTH = 7, 12, 14  # columns of a value, of a gauge's two lim
 
 @dataclass(frozen=True)
 class Layout:
-    """The parts of the display that fit into the terminal. gauge: width of a gauge in columns; gauges: how many of the
-    two quantities, position and goal, have a gauge.
+    """The parts of the display that fit the terminal. gauge: width of a gauge in columns; gauges: how many of the two
+    quantities, position and goal, have a gauge.
     """
 
     gauge: int
@@ -30,7 +30,7 @@ class Layout:
 
 
 def layout_for(columns: int, name: int) -> Layout:
-    """The richest layout that fits into `columns` without wrapping; name: length of the longest joint name."""
+    """Return the most detailed layout that fits `columns` without wrapping. name: length of the longest joint name."""
     for gauges, limits, health in ((2, True, True), (2, True, False), (2, False, False), (1, False, False)):
         # A value, a gauge and a unit for position and goal, each followed by a space.
         fixed = name + 1 + 2 * (_VALUE + 1) + gauges * (1 + _LIMITS * limits) + len("rad") + 1 + len("A")
@@ -103,7 +103,7 @@ class LiveView:
         return f"{heat:.0f} °C {supply:.1f} V" if math.isfinite(heat) and math.isfinite(supply) else ""
 
     def _gauge(self, value: float, low: float, high: float, place: int) -> list[Text]:
-        """The value, and a gauge that shows its position between its limits; yellow near a limit."""
+        """Return the value and a gauge of its position between its limits, which turns yellow near a limit."""
         width, outside = self._layout.gauge, not low <= value <= high
         shown = Text(f"{value:+{_VALUE}.2f}" if math.isfinite(value) else " " * _VALUE, style="red" if outside else "")
         if place > self._layout.gauges:

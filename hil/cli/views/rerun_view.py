@@ -1,4 +1,4 @@
-"""A running experiment in the Rerun viewer: curves for every joint, and the motion of planar arms.
+"""Show a running experiment in the Rerun viewer: curves for every joint, and the motion of planar arms.
 
     hil identify arm.toml --live rerun              # starts the viewer
     hil identify arm.toml --live rerun:watch.rrd    # writes a file, to be opened with `rerun watch.rrd`
@@ -48,7 +48,7 @@ def rerun_view(live: str, config_path: Path) -> Iterator[OnProgress]:
 
 
 def _open(recording: Any, place: str) -> None:
-    """Send to `place`: a file or a URL; if it is empty, start a viewer."""
+    """Send the recording to `place`, a file or a URL; if it is empty, start a viewer."""
     if "://" in place:
         recording.connect_grpc(place)
     elif place:

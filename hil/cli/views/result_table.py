@@ -38,7 +38,7 @@ def print_result(result: SettledResult, config: Config, run: Path, console: Cons
 
 
 def print_shooting_result(result: ShootingResult, run: Path | None) -> None:
-    """Print a result of multiple shooting. run: its folder."""
+    """Print a multiple-shooting result. run: folder of the result."""
     print(f"{result.joints}-joint arm, {result.config}")
     for name, entry in result.quantities.items():
         value, std = _shown(entry)
@@ -98,12 +98,12 @@ def _parameters(result: SettledResult, truth: Truth) -> Table:
 
 
 def _shown(entry: Quantity) -> list[str]:
-    """Value and standard error; no digits of a value about which the motion provides no information."""
+    """Return value and standard error; no digits if the motion provides no information about the value."""
     return [f"{entry.value:.5g}", f"{entry.std:.1e}"] if entry.std < math.inf else ["undetermined", "-"]
 
 
 def _numbers(name: str, entry: Quantity, truth: Truth) -> list[str]:
-    """Return the cells of a parameter: value, standard error and, if there is any truth, the error."""
+    """Return the cells of a parameter: value, standard error and, if the true value is known, the error."""
     value, std = entry.value, entry.std
     cells = _shown(entry)
     if name not in truth.values:
@@ -190,7 +190,7 @@ def _next(result: SettledResult, run: Path) -> list[str]:
 
 
 def what_next(result: Result, run: Path) -> str:
-    """The line that names the next command: export, or another estimate if the numbers should not be used."""
+    """Return the line that names the next command: export, or another estimate if the numbers should not be used."""
     if _is_useless(result):
         return next_step("estimate", run)
     return next_step("export", run, "--format", _usual_format(result))
@@ -201,6 +201,6 @@ def _is_useless(result: Result) -> bool:
 
 
 def _usual_format(result: Result) -> str:
-    """A format that can hold this arm: MJCF needs the length of link 1, which can only be determined with gravity."""
+    """Return a format that suits this arm: MJCF needs the length of link 1, which only gravity reveals."""
     flat = result.chain is None and result.arm is not None and not result.arm.gravity
     return "toml" if flat else "mjcf"

@@ -65,7 +65,7 @@ def print_scan(heard: Sequence[Heard], port: str) -> None:
 
 
 def _after_scan(servos: Sequence[Found], port: str) -> str:
-    """The next command: bring all servos to one baud rate if necessary, else describe or check the arm."""
+    """Return the next command: set all servos to one baud rate if necessary, otherwise describe or check the arm."""
     if Path(port).is_file() or not ("/" in port or ":" in port or port.upper().startswith("COM")):
         return next_step("check", port)
     if len({servo.baud for servo in servos}) > 1:
@@ -78,7 +78,7 @@ def _after_scan(servos: Sequence[Found], port: str) -> str:
 def print_findings(findings: Sequence[Finding], config: Path, *, has_dry_run: bool) -> None:
     """Print one line per finding, with its fix below it, and whether an experiment can start.
 
-    has_dry_run: the arm is described well enough for `hil dry-run`, which is then the next command.
+    has_dry_run: whether the arm is described well enough for `hil dry-run`, which is then the next command.
     """
     console = result_console()
     former = None

@@ -4,7 +4,7 @@ Every common parameter is tested on its own: z = difference / sqrt(std_a^2 + std
 also tested as a whole (hil.estimation.changes.friction_change). Holm's step-down correction keeps the probability of
 any false alarm in the whole table at `false_alarms` (S. Holm, Scandinavian Journal of Statistics 6 (1979) 65). A change
 must also be larger than the fraction `least_share` of the parameter's magnitude: standard errors cover noise only, and
-two runs of an arm with some unmodelled friction differ by a little more.
+two runs of an arm with some unmodelled friction differ by slightly more than these.
 """
 
 import math
@@ -56,7 +56,7 @@ class Difference:
     """The changes from one run to another.
 
     only_before, only_after: terms that only one of the two models has. detectable: smallest change of each friction
-    term alone that two runs like these would show with a probability of 95 % [% of its value before].
+    term alone that two runs like these would show with a probability of 95 % [% of its earlier value].
     """
 
     before: str
@@ -67,9 +67,7 @@ class Difference:
     detectable: Mapping[str, float] = field(default_factory=dict)
     trust: tuple[str | None, str | None] = (None, None)
     other_joints: tuple[str, ...] = ()
-    """Warnings: one sentence per joint with a different description (perhaps another arm), or one about a run compared
-    with itself.
-    """
+    """Warnings: one sentence per joint whose description differs, and one if a run is compared with itself."""
 
     @property
     def changed(self) -> tuple[Change, ...]:
@@ -78,12 +76,12 @@ class Difference:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Warnings: sentences on joints whose descriptions differ, and on each of the two models that should not be
-        trusted without reservation.
+        """Warnings: those in `other_joints`, and a sentence on each model that should not be trusted without
+        reservation.
         """
         untrusted = tuple(
-            f"{name}: trust this model: {trust}. Its values may be biased by more than their standard errors, so a "
-            "change may come from the model instead of the arm; the report says why."
+            f'The report of {name} says "trust this model: {trust}", and why: its values may be biased by more than '
+            "their standard errors, so a change may come from the model instead of the arm."
             for name, trust in zip((self.before, self.after), self.trust, strict=True)
             if trust not in (None, "yes")
         )
@@ -186,7 +184,7 @@ def diff_models(
 
 
 def _detectable(before: ArmModel, friction: Sequence[FrictionChange], level: float) -> dict[str, float]:
-    """Smallest detectable change of each friction term [%], where a difference needs a p-value below `level`."""
+    """Smallest detectable change of each friction term [%] if its p-value must be below `level`."""
     found = {}
     for row in friction:
         threshold = NormalDist().inv_cdf(1 - level / (len(row.stds) + 1) / 2)
@@ -222,7 +220,7 @@ def _holm(p: dict[str, float], level: float) -> set[str]:
 
 
 def _scale(before: ArmModel, after: ArmModel, name: str) -> float:
-    """Magnitude that a change is compared with: the parameter's own, or the joint's Coulomb friction for an offset."""
+    """Magnitude that a change is compared with: the parameter's, or the joint's Coulomb friction for an offset."""
     values = [abs(model.values[name]) for model in (before, after)]
     kind, _, joint = name.rpartition("_")
     if kind == "offset":

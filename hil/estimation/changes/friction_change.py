@@ -1,9 +1,9 @@
-"""Whether one joint's friction changed between two runs, tested with the full covariance of its parameters.
+"""Test whether one joint's friction changed between two runs, using the full covariance of its parameters.
 
 Coulomb friction, its rise at low speed and the speed at which it falls are known far better in combination than
 individually: a change of one of them by 10 % may be less than its own standard error and still be obvious. Let d be the
 difference of the joint's friction parameters between the runs, and S the sum of their covariances in both. Two kinds of
-question are asked.
+test are made.
 
 one term alone    Did only term i change? The most powerful test is z_i = (S^-1 d)_i / sqrt((S^-1)_ii), and
                   (S^-1 d)_i / (S^-1)_ii is the change that this implies (generalised least squares).
@@ -33,16 +33,16 @@ KINDS = ("viscous", "coulomb", "coulomb_width", "stribeck_rise", "stribeck_veloc
 rise.
 """
 REPEATABILITY = 0.005
-"""Standard deviation of a friction parameter from run to run of an unchanged arm, relative to its value."""
+"""Run-to-run standard deviation of a friction parameter of an unchanged arm, relative to its value."""
 
 
 @dataclass(frozen=True)
 class FrictionChange:
     """The friction of one joint in two runs.
 
-    term: the term that explains the difference best if it alone changed. before, after: its values if nothing else in
-    the joint's friction changed. std: standard error of that change [unit of the term]. z: change in standard errors.
-    p: probability of a difference like this, in any term, if the joint is unchanged. stds: standard error of
+    term: the single term whose change explains the difference best. before, after: its values if nothing else in the
+    joint's friction changed. std: standard error of that change [unit of the term]. z: change divided by `std`.
+    p: probability of a difference at least this large, in any term, if the joint is unchanged. stds: standard error of
     the change of each term alone [unit of the term].
     """
 
@@ -103,13 +103,13 @@ def _of_joint(
 
 
 def _comparable(models: Sequence[ArmModel], name: str) -> bool:
-    """Whether both models have the term, or one has it and its absence from the other is the same as a value of 0."""
+    """Whether both models have the term, or one has it and its absence from the other means 0."""
     having = [name in model.values for model in models]
     return all(having) or (any(having) and TERMS[name.rpartition("_")[0]].absent == 0.0 and "velocity" not in name)
 
 
 def _block(kept: Covariance, model: ArmModel, names: Sequence[str]) -> Array:
-    """Covariance of these parameters: zero for those that the model does not have, infinite where it is unknown."""
+    """Covariance of these parameters: zero for those that the model lacks, infinite where it is unknown."""
     found = np.zeros((len(names), len(names)))
     rows = [row for row, name in enumerate(names) if name in kept.names]
     index = [kept.names.index(names[row]) for row in rows]

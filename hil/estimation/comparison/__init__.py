@@ -1,1 +1,1 @@
-"""Other methods on the recording of a run, compared with its result."""
+"""Comparison of a run's result with those of other methods."""

@@ -65,7 +65,7 @@ class Judge:
 
     def error(self, parameters: Mapping[str, float], period: SettledPeriod | None = None) -> float | None:
         """Prediction error relative to the motion's RMS, for the worst joint; None if nothing was held out or if the
-        simulated arm diverges. period: the one to predict, by default the held-out one.
+        simulated arm diverges. period: the period to predict, by default the held-out one.
         """
         shown = self._held_out if period is None else period
         if shown is None:
@@ -78,8 +78,7 @@ class Judge:
 
 
 def worst_chain_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
-    """Return the parameter with the largest relative error and that error, among large base parameters and friction
-    terms.
+    """Return the base parameter or friction term with the largest relative error, and that error.
 
     Offsets are left out, and so are sums that are small compared with others of their kind (see LARGE).
     """
@@ -119,7 +118,7 @@ def _methods(config: Config, period: SettledPeriod, judge: Judge) -> Iterator[Pe
 
 
 def _best(fit: Callable[[float], tuple[Array, Array]], judge: Judge, period: SettledPeriod) -> Peer:
-    """The cut-off whose simulation is closest to the fitted period, as for planar arms."""
+    """The result at the cut-off that gives the closest simulation of the fitted period, as for planar arms."""
     model = judge.model
     found: list[tuple[float, Peer]] = []
     for cutoff in CUTOFFS:

@@ -51,7 +51,7 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The contents of compare.json: every method on one settled period; the true parameters on a fake arm only."""
+    """The contents of compare.json: every method's result for one settled period, and a fake arm's true parameters."""
 
     schema: int
     config: str
@@ -145,8 +145,7 @@ def _entry(peer: Peer, held_out: float | None, name: str | None, worst: float | 
 
 
 def worst_error(parameters: Mapping[str, float], truth: Mapping[str, float]) -> tuple[str, float]:
-    """Return the parameter with the largest relative error and that error, among inertias, gravity, viscous and Coulomb
-    friction.
+    """Return the inertia, gravity or friction parameter with the largest relative error, and that error.
 
     Offsets are left out: they are near zero, so a relative error is meaningless. A parameter that the method does not
     estimate counts as 0, a relative error of 1.

@@ -1,11 +1,11 @@
 """mujoco.sysid on a settled period, for comparison; installed with the extra `peers`.
 
-The arm is a MuJoCo model with one or two hinges. The unknowns are first moment and inertia of each link, armature of
-joint 2, and damping, friction loss and a constant torque of each joint, each scaled by its expected value. The method
-gets every advantage: an initial guess within 50 % of the expected values (from farther away, it does not converge), the
-length of link 1, the initial state from the period's Fourier lines, the delay found by hil's stage 1, mujoco.sysid's
-own optimiser with rollouts on all cores, and the smallest number of integration steps per sample (two) that does not
-change its answer.
+The arm is a MuJoCo model with one or two hinges. The unknowns are the first moment and inertia of each link, the
+armature of joint 2, and each joint's damping, friction loss and constant torque, all scaled by expected values. The
+method gets every advantage: an initial guess within 50 % of the expected values (from farther away, it does not
+converge), the length of link 1, the initial state from the period's Fourier lines, the delay found by hil's stage 1,
+mujoco.sysid's own optimiser with rollouts on all cores, and the smallest number of integration steps per sample (two)
+that does not change its answer.
 """
 
 import importlib

@@ -1,1 +1,1 @@
-"""What drove the motors: currents that differ from the commanded ones, and a supply that sags."""
+"""Detection of currents that differ from the commanded ones, and of supply sag."""

@@ -1,7 +1,7 @@
 """Currents that differ from the commanded ones: they were clipped, or this program's goals did not cause them.
 
 A clipped current is smaller than a large goal, follows a small one, and never opposes it. Any other deviation has
-another cause: goals were changed on the way or by another program, or the reported current is wrong. The torque that
+another cause: goals were altered in transit or by another program, or the reported current is wrong. The torque that
 drove the arm is then not the one that the estimate is based on.
 """
 
@@ -26,7 +26,7 @@ OFTEN = 0.05
 """Clipping is reported if it affects more than this fraction of the samples with large goals."""
 
 _RECENT = 4
-"""Number of latest goals, any of which a lagging current may still follow."""
+"""Number of latest goals that a lagging current may still be following."""
 
 _BEYOND, _BEYOND_OFTEN = 0.25, 0.02
 """A current was not the commanded one if it deviates this much from all recent goals and from 0, relative to the
@@ -41,7 +41,7 @@ current.
 
 @dataclass(frozen=True)
 class CurrentFindings:
-    """What is wrong with the currents of a recording.
+    """Problems with the currents of a recording.
 
     warnings: one sentence per joint whose current was not the commanded one. disturbances: a sentence for the verdict
     if a current was neither the commanded one nor merely clipped.
@@ -73,7 +73,7 @@ def settled_current_findings(config: Config, samples: NDArray[np.void]) -> Curre
 
 
 def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Array, Array]]:
-    """Name, goals and currents of each joint that is driven by current and measures its motor's."""
+    """Name, goals and currents of each joint that is driven by current and measures its motor current."""
     return [
         (joint.name, samples["goal_current"][:, index], samples["current"][:, index])
         for index, joint in enumerate(config.joints)
@@ -82,7 +82,7 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
 
 
 def _other(name: str, goal: Array, measured: Array) -> str:
-    """Say that the current was not the commanded one; "" if it was, or was only clipped."""
+    """Describe a current that was not the commanded one; "" if it was, or was merely clipped."""
     if len(goal) < _RECENT or not goal.any():
         return ""
     recent = np.lib.stride_tricks.sliding_window_view(goal, _RECENT)
@@ -91,7 +91,7 @@ def _other(name: str, goal: Array, measured: Array) -> str:
     away = np.maximum(low - late, late - high)
     beyond = float(np.mean(away > _BEYOND * np.abs(goal).max()))
     why = (
-        "goals were changed on the way or by another program, or its current sensor is wrong. Make sure that nothing "
+        "goals were altered in transit or by another program, or its current sensor is wrong. Make sure that nothing "
         "else commands the servos, and record again."
     )
     if beyond > _BEYOND_OFTEN:
@@ -109,7 +109,7 @@ def _other(name: str, goal: Array, measured: Array) -> str:
 
 
 def _clipped(name: str, goal: Array, measured: Array, lower: str) -> str:
-    """Describe a motor that receives less current than commanded, from a sagging supply or its own current limit."""
+    """Describe a motor that receives less current than commanded because its supply sags or its servo limits it."""
     part = _short_part(goal, measured)
     if part <= OFTEN:
         return ""
@@ -136,7 +136,7 @@ def _short_part(goal: Array, measured: Array) -> float:
 
 
 def _follows_small_goals(goal: Array, measured: Array) -> float:
-    """Ratio of the measured to the commanded current while the goal is far below what the motor has carried."""
+    """Ratio of the measured to the commanded current while the goal is far below the motor's largest current."""
     least = _least(goal)
     most = np.nanquantile(np.abs(measured), 0.99)
     small = (least > _LEAST * most) & (least < _SMALL * most) & np.isfinite(measured[1:])

@@ -5,7 +5,7 @@ and i v if it is driven with current i. The resistance of the supply turns this 
 register is read only a few times a second, in steps of 0.1 V. A regression of its readings on these products over the
 whole recording nevertheless gives the drop at every sample.
 
-A voltage-driven joint receives its duty cycle times the supply voltage of that moment: its torque sags with it. A
+A voltage-driven joint receives its duty cycle times the supply voltage at that moment: its torque sags with it. A
 current-driven joint is not affected as long as its servo can still drive the current.
 """
 
@@ -26,16 +26,16 @@ STEP_V = 0.1  # of the register
 SIGNIFICANT = 6.0
 """Number of standard errors by which the drop at full load must differ from zero."""
 LEAST = {Mode.PWM: 0.005, Mode.CURRENT: 0.05}
-"""Smallest drop that is reported, relative to the voltage without load, by drive mode."""
+"""Smallest drop that is reported, relative to the no-load voltage, by drive mode."""
 _FULL_LOAD = 0.99  # quantile of the drop
 
 
 @dataclass(frozen=True)
 class Sag:
-    """A supply that sags.
+    """Sag of the supply voltage under load.
 
-    volts: voltage at each servo without load (joints,) [V]. by_square, by_product: drop per goal squared and per goal
-    times velocity of each joint (joints,). worst: drop at full load [V]. Goals are in A, or in V under PWM.
+    volts: no-load voltage at each servo (joints,) [V]. by_square, by_product: drop per goal squared and per goal times
+    velocity of each joint (joints,). worst: drop at full load [V]. Goals are in A, or in V under PWM.
     """
 
     volts: Array
@@ -45,18 +45,18 @@ class Sag:
 
     @property
     def share(self) -> float:
-        """Drop at full load relative to the voltage without load."""
+        """Drop at full load relative to the no-load voltage."""
         return self.worst / float(self.volts.min())
 
     def remaining(self, samples: NDArray[np.void]) -> Array:
-        """Voltage relative to the voltage without load (samples, joints)."""
+        """Voltage relative to the no-load voltage (samples, joints)."""
         goal, velocity = samples["goal_current"], np.nan_to_num(samples["velocity"])
         drop = goal**2 @ self.by_square + (goal * velocity) @ self.by_product
         return np.asarray(1.0 - np.maximum(drop, 0.0)[:, None] / self.volts)
 
 
 def supply_sag(config: Config, samples: NDArray[np.void]) -> Sag | None:
-    """Find a drop of the supply voltage under load in a whole recording; None if there is none worth mentioning."""
+    """The drop of the supply voltage under load in a whole recording; None if it is not worth reporting."""
     goal, velocity, volts = samples["goal_current"], samples["velocity"], samples["supply_voltage"]
     joints = goal.shape[1]
     read = np.isfinite(volts) & np.isfinite(velocity).all(axis=1)[:, None]
@@ -80,7 +80,7 @@ def supply_sag(config: Config, samples: NDArray[np.void]) -> Sag | None:
 
 
 def by_voltage(config: Config) -> NDArray[np.bool_]:
-    """Which joints are driven by voltage (joints,)."""
+    """Whether each joint is driven by voltage (joints,)."""
     return np.array([joint.drive_mode is Mode.PWM for joint in config.joints])
 
 
@@ -92,7 +92,7 @@ def torque_factor(config: Config, sag: Sag | None, samples: NDArray[np.void]) ->
 
 
 def supply_notes(config: Config, sag: Sag | None) -> tuple[str, ...]:
-    """Sentences for the verdict about a supply that sags; empty if it does not."""
+    """Sentences on supply sag for the verdict; empty without sag."""
     if sag is None:
         return ()
     found = f"The supply sags: its voltage falls by up to {sag.worst:.2g} V ({100 * sag.share:.2g} %) under load."

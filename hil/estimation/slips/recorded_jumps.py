@@ -97,7 +97,7 @@ def _jumps(recording: Recording, joint: int) -> list[tuple[float, float]]:
 
 
 def _steps(time: Array, position: Array, uneven: NDArray[np.bool_]) -> Array:
-    """The step in the middle of every window of 2 SIDE samples [rad]. Unequal intervals count where `uneven`."""
+    """The step in the middle of every window of 2 SIDE samples [rad]. `uneven`: where intervals are unequal."""
     windows = np.lib.stride_tricks.sliding_window_view
     sizes = np.correlate(position, _weights(np.arange(2.0 * SIDE)[None, :])[0], mode="valid")
     places = np.flatnonzero(uneven)
@@ -109,7 +109,7 @@ def _steps(time: Array, position: Array, uneven: NDArray[np.bool_]) -> Array:
 
 
 def _weights(time: Array) -> Array:
-    """Weights (windows, 2 SIDE) whose products with the positions at `time`, of that shape, give the step."""
+    """Weights (windows, 2 SIDE) whose products with the positions at `time` (same shape) sum to the step."""
     at = time - 0.5 * (time[:, SIDE - 1 : SIDE] + time[:, SIDE : SIDE + 1])
     at = at / (time[:, -1:] - time[:, :1])
     design = np.stack((*(at**order for order in range(ORDER + 1)), at > 0.0), axis=-1)
@@ -117,7 +117,7 @@ def _weights(time: Array) -> Array:
 
 
 def _is_step(time: Array, position: Array, noise: float) -> bool:
-    """Whether a step in the middle describes the positions much better than a bad reading, or an impact's kink."""
+    """Whether a step in the middle describes the positions much better than a bad reading or the kink of an impact."""
     at = (time - 0.5 * (time[SIDE - 1] + time[SIDE])) / (time[-1] - time[0])
     smooth = [at**order for order in range(ORDER + 1)]
 

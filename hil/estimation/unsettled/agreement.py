@@ -1,6 +1,4 @@
-"""Whether several recordings show the same arm: a change of load must not be mistaken for a missing term of the
-model.
-"""
+"""Check whether several recordings show the same arm, lest a change of load be mistaken for a missing model term."""
 
 from collections.abc import Sequence
 
@@ -39,8 +37,8 @@ def disagreement(
     worst = max(float(each.residual_over_noise.max()) for each in alone)
     differs = _differences(alone, called)
     return (
-        f"The recordings disagree: fitted separately, their residuals are at most {worst:.1f} times the noise; fitted "
-        f"together, {left:.1f} times{': ' if differs else ''}{'; '.join(differs)}. Was the load, the mounting or a "
+        f"The recordings disagree: separate fits leave residuals of at most {worst:.1f} times the noise, a common fit "
+        f"{left:.1f} times{': ' if differs else ''}{'; '.join(differs)}. Was the load, the mounting or a "
         "setting changed between the recordings? Estimate each separately.",
     )
 

@@ -57,7 +57,7 @@ def angle_scale(
 def _candidate(recordings: Sequence[Recording], estimate: ShootingEstimate, about: Array) -> _Scale | None:
     """The scale of the first joint that would imitate the spring of the estimate.
 
-    The scales of other joints change how they move the first one, which no spring imitates.
+    Scales of other joints change the effect of these joints on the first one, which no spring imitates.
     """
     value, names = estimate.parameters, list(estimate.names)
     if SPRING not in names or not value["gravity_1"] > 0.0:
@@ -88,7 +88,7 @@ def _rests_hanging(recordings: Sequence[Recording], estimate: ShootingEstimate) 
 def _without_spring(
     recordings: Sequence[Recording], estimate: ShootingEstimate, scale: _Scale, about: Array
 ) -> tuple[_Scale, ShootingEstimate] | None:
-    """The fit with this scale, without springs and with the zeros as given, if it explains the motion as well."""
+    """The fit with this scale, without springs and with the zeros as given, if it explains the motion equally well."""
     limit = AS_WELL * estimate.residual_over_noise
     if not scale.by_zero:  # a scale is not exactly a spring: what is left of the spring corrects it
         refined = _fitted(recordings, estimate, scale, about, spring=True)
@@ -115,7 +115,7 @@ def _fitted(
 
 
 def _scaled(recordings: Sequence[Recording], factor: Array, about: Array) -> list[Recording]:
-    """The recordings with angles divided by `factor` (joints,), except that those at `about` (joints,) [rad] stay."""
+    """The recordings with angles relative to `about` (joints,) [rad] divided by `factor` (joints,)."""
     centre = about[:, None]
     return [
         replace(
@@ -128,9 +128,7 @@ def _scaled(recordings: Sequence[Recording], factor: Array, about: Array) -> lis
 
 
 def _said(scale: _Scale, found: ShootingEstimate, estimate: ShootingEstimate) -> str:
-    instead = (
-        "the spring and the zero of the encoder that were fitted" if scale.by_zero else "the spring that was fitted"
-    )
+    instead = "the fitted spring and encoder zero" if scale.by_zero else "the fitted spring"
     cause = (
         ""
         if scale.by_zero

@@ -31,7 +31,7 @@ class Fitted:
 
 def causes(fitted: Fitted) -> tuple[str, ...]:
     """Sentences on the cause: a defect of whole recordings, recordings that disagree, a local defect, a clipped torque
-    or a clock that drifts; otherwise, where the residual is large.
+    or a clock that drifts. If none is found, they say where the residual is large.
     """
     recordings, names, estimate = fitted.recordings, fitted.names, fitted.estimate
     defect = likely_defect(recordings, fitted.plain, estimate, fitted.gravity > 0.0)

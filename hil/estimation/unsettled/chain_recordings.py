@@ -40,7 +40,7 @@ UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "ca
 @dataclass(frozen=True)
 class ChainEstimated:
     """An estimate from recordings. result: complete except for the fields that the caller fills in. predicted:
-    positions per recording (joints, samples) [rad]; NaN if there is none.
+    positions per recording (joints, samples) [rad]; NaN if there are none.
     """
 
     result: ShootingResult
@@ -117,7 +117,7 @@ def _described(config: RecordingConfig, joints: int) -> ArmDescription:
             "columns.position, add a [[joints]] table with that joint's name, in order from the base outwards."
         )
     if len(names) != joints:
-        raise ConfigError(f"{len(names)} [[joints]], but {joints} position columns: give one per joint.")
+        raise ConfigError(f"{len(names)} [[joints]] tables, but {joints} position columns: give one per joint.")
     try:
         return read_arm(Path(config.arm.urdf), names)
     except ArmFileError as error:

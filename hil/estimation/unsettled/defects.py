@@ -30,12 +30,12 @@ def likely_defect(
 
 
 def is_certain(defect: Defect) -> bool:
-    """Whether the defect explains so much of the residual that no other cause needs to be looked for."""
+    """Whether the defect explains so much of the residual that no other cause need be sought."""
     return defect.fit.left < WELL
 
 
 def is_other_arm(defect: Defect) -> bool:
-    """Whether one of several recordings seems to be of another arm, or of one with another load."""
+    """Whether one of several recordings seems to be of another arm, or of the arm with another load."""
     return defect.hypothesis.course.kind == "recording" and defect.hypothesis.kind in {"arm", "load"}
 
 
@@ -85,7 +85,7 @@ def _load(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple
         change = f"The load seems to differ {when}"
     else:
         change = f"The load seems to have been {'picked up' if heavier else 'put down or lost'} {when}"
-    return change, "Use only the part before or after the change, or put each part in a file of its own."
+    return change, "Use only the part before or after the change, or put each part in a separate file."
 
 
 def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
@@ -94,16 +94,16 @@ def _friction(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> t
     percent = " and ".join(f"{100.0 * change:+.2g} %" for change in each)
     match hypothesis.course.kind:
         case "decay":
-            said = f"The friction of {whose} seems to be {percent} different at the beginning and to settle {when}"
+            said = f"The friction of {whose} seems to differ by {percent} at the beginning and to settle {when}"
             return said, "Let the arm move for some minutes before you record, so that it is warm."
         case "linear":
-            said = f"The friction of {whose} seems to change {when}, by {percent} of its value at the beginning"
+            said = f"The friction of {whose} seems to change {when}, by {percent} of its initial value"
             return said, "Let the arm move for some minutes before you record, so that it is warm."
         case "recording":
             return f"The friction of {whose} seems to differ by {percent} {when}", "Estimate each recording separately."
         case _:
             said = f"The friction of {whose} seems to have changed by {percent} {when}"
-            return said, "Use only the part before or after the change, and look for what rubs."
+            return said, "Use only the part before or after the change, and check for rubbing parts."
 
 
 def _torque(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[str, str]:
@@ -139,8 +139,8 @@ def _arm(hypothesis: Hypothesis, unknowns: Sequence[float], when: str) -> tuple[
     if hypothesis.course.kind == "recording":
         return f"The arm {when} seems to be a different one, or to carry a different load", "Estimate each separately."
     return (
-        f"The arm seems to be a different one after a change {when}: load, mounting, servo or settings",
-        "Use only the part before or after the change, or put each part in a file of its own.",
+        f"The arm seems to have changed {when}: load, mounting, servo or settings",
+        "Use only the part before or after the change, or put each part in a separate file.",
     )
 
 

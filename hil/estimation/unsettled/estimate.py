@@ -41,7 +41,7 @@ START_CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the inverse dynamics that start the li
 START_WIDTH = 0.05  # rad/s
 JUMPED = (
     "A position jumped (see the warnings), so angles before and after the jump are inconsistent: use only the part "
-    "before or after it, or put each part in a file of its own."
+    "before or after it, or put each part in a separate file."
 )
 NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 
@@ -49,7 +49,7 @@ NOT_HERE = ("ripple", "cogging", "encoder", "lags")
 @dataclass(frozen=True)
 class Estimated:
     """An estimate from recordings. result: complete except for the fields that the caller fills in. predicted:
-    positions per recording (joints, samples) [rad]; NaN if there is none.
+    positions per recording (joints, samples) [rad]; NaN if there are none.
     """
 
     result: ShootingResult
@@ -59,12 +59,12 @@ class Estimated:
 
 @dataclass(frozen=True)
 class Given:
-    """What is known about the drives and encoders beforehand.
+    """Prior knowledge of the drives and encoders.
 
     torque_scale_std: relative standard deviation of the ratio of the torque constants, by parameter. zeros: whether a
     configuration defines the encoder zeros. names: names of the recordings. jumps: a sentence for each joint of a
     recording whose position jumped. torque_source: where the torques come from. origin: the angles [rad] at which the
-    columns of positions are 0, by default 0.
+    position columns are 0, by default 0.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
@@ -146,7 +146,7 @@ def estimate_any(
 def _judged(
     fitted: Fitted, given: Given, why: tuple[str, ...], held_out: NDArray[np.float64] | None, found: Doubts
 ) -> Verdict:
-    """The verdict. why: sentences on what is wrong with the recordings."""
+    """The verdict. why: sentences on defects of the recordings."""
     recordings, estimate = fitted.recordings, fitted.estimate
     conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
     ratios = ratios_of(estimate.names, estimate.value, estimate.std)
@@ -178,7 +178,7 @@ def _judged(
 
 
 def conflicts_in(estimate: ShootingEstimate, given: Given) -> tuple[Conflict, ...]:
-    """Estimated values that are far from what is known beforehand."""
+    """Estimated values that contradict prior knowledge."""
     names, value, std = [*estimate.names], [*estimate.value], [*estimate.std]
     if given.zeros:
         for zero, error in zip(estimate.zeros, estimate.zeros_std, strict=True):
@@ -193,7 +193,7 @@ def joint_names(count: int) -> tuple[str, ...]:
 
 
 def _start(recordings: Sequence[Recording]) -> NDArray[np.float64]:
-    """Base parameters by inverse dynamics, filtered as lightly as the recordings' rate and length allow."""
+    """Base parameters from inverse dynamics, filtered as lightly as the recordings' rate and length allow."""
     for cutoff in START_CUTOFFS[:-1]:
         try:
             return fit_inverse_dynamics(recordings, cutoff, START_WIDTH).value

@@ -1,7 +1,6 @@
-"""Parts of a recording that the fitted model does not explain, unlike the rest: where they are, and what they look
-like.
+"""Location and kind of the parts of a recording that the fitted model does not explain although it explains the rest.
 
-A reading that freezes, a torque that is missing, single wrong samples or a joint that hits a stop spoil an estimate.
+A reading that freezes, a missing torque, single wrong samples or a joint that hits a stop can spoil an estimate.
 The residual alone would suggest wrong units or a missing term.
 """
 
@@ -97,7 +96,7 @@ def _joints(
 
 
 def _levels(time: Array, residual: Array, window: float) -> tuple[Array, Array]:
-    """Starts [s] and RMS residuals of windows, without those that were not simulated."""
+    """Starts [s] and RMS residuals of windows, omitting those that were not simulated."""
     known = np.isfinite(residual)
     number = np.floor((time[known] - time[0]) / window).astype(int)
     if not number.size:
@@ -109,7 +108,7 @@ def _levels(time: Array, residual: Array, window: float) -> tuple[Array, Array]:
 
 
 def _constant(time: Array, values: Array) -> list[slice]:
-    """Stretches in which a value stays exactly the same for long, unless there are many."""
+    """Stretches in which a value stays exactly the same for a long time; empty if there are many."""
     edges = np.flatnonzero(np.diff(values) != 0.0) + 1
     starts, ends = np.concatenate(([0], edges)), np.concatenate((edges, [values.size]))
     long = (ends - starts >= FEWEST) & (time[ends - 1] - time[starts] >= SHORTEST)
@@ -138,7 +137,7 @@ def _silent(joint: _Joint, joints: Sequence[_Joint]) -> list[str]:
 
 
 def _spikes(joint: _Joint) -> list[str]:
-    """Single samples that are far from both neighbours, and from a smooth motion through these."""
+    """Single samples that are far from both neighbours, and from a smooth motion through them."""
     known = np.flatnonzero(np.isfinite(joint.position))
     if known.size < FEWEST:
         return []

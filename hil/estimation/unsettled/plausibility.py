@@ -1,4 +1,4 @@
-"""Detection of values that are impossible for a servo arm, for imported recordings; the usual cause is a wrong unit."""
+"""Detection of values from imported recordings that are impossible for a servo arm, usually because of a wrong unit."""
 
 from collections.abc import Sequence
 
@@ -53,7 +53,7 @@ def _torques(recordings: Sequence[Recording]) -> list[str]:
         most = max(float(np.abs(each.torque[joint]).max()) for each in recordings)
         if most > TORQUE[1]:
             found.append(
-                f"Joint {joint + 1}: its torque reaches {most:.3g} N m; few servos can deliver that: check its unit."
+                f"Joint {joint + 1}: its torque reaches {most:.3g} N m, which few servos can deliver: check its unit."
             )
         elif 0.0 < most < TORQUE[0]:
             found.append(f"Joint {joint + 1}: its torque is at most {most:.2g} N m: check its unit.")
@@ -61,8 +61,8 @@ def _torques(recordings: Sequence[Recording]) -> list[str]:
 
 
 def _pendulum(estimate: ShootingEstimate, gravity: float) -> list[str]:
-    """Check inertia * gravity / weight: a length whatever the unit of torque, and implausible if time or angle have a
-    wrong unit.
+    """Check inertia * gravity / weight, a length whatever the unit of torque; a wrong unit of time or angle makes it
+    implausible.
     """
     if gravity <= 0.0:
         return []
@@ -93,8 +93,8 @@ def _link(estimate: ShootingEstimate, gravity: float) -> list[str]:
             return []
         return [
             f"gravity_2 is {value['gravity_2']:.2g} +- {std['gravity_2']:.2g} N m, but according to coupling, link 2 "
-            f"weighs at least {least:.2g} N m: the torque does not contain gravity. Does the drive itself compensate "
-            "for gravity? Then add that torque to the column. If the arm moves in a horizontal plane, set "
+            f"weighs at least {least:.2g} N m: the torque does not contain gravity. If the drive itself compensates "
+            "for gravity, add that torque to the column. If the arm moves in a horizontal plane, set "
             "arm.gravity = 0."
         ]
     length = abs(value["coupling"] * gravity / value["gravity_2"])
@@ -111,7 +111,7 @@ def _weight(estimate: ShootingEstimate, gravity: float) -> list[str]:
     for name, value, std in zip(estimate.names, estimate.value, estimate.std, strict=True):
         if kind_of(name) == "gravity" and gravity > 0.0 and value < -SURE * std:
             found.append(
-                f"{name} is {value:.3g} N m, negative: the angle's zero is half a turn off (columns.zero), or a "
+                f"{name} is negative, {value:.3g} N m: the angle's zero is half a turn off (columns.zero), or a "
                 "sign is reversed."
             )
     return found

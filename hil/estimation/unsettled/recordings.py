@@ -35,7 +35,7 @@ MOST_RECORDINGS = 200
 
 @dataclass(frozen=True)
 class _Read:
-    """All recordings of one arm. notes: what was guessed, corrected or averaged, in sentences. doubts: contradictions
+    """All recordings of one arm. notes: sentences on what was guessed, corrected or averaged. doubts: contradictions
     among the columns.
     """
 
@@ -134,7 +134,7 @@ def _doubts(found: Iterable[Converted]) -> tuple[str, ...]:
 
 
 def _doubted(result: ShootingResult, doubts: Sequence[str]) -> ShootingResult:
-    """The result with these doubts in its verdict."""
+    """The result with these doubts added to its verdict."""
     if not doubts or result.verdict is None:
         return result
     trust = "with care" if result.verdict.trust == "yes" else result.verdict.trust
@@ -184,21 +184,21 @@ def _named(found: Estimated, read: _Read, gravity: float) -> ShootingResult:
 
 
 def _back_emf(columns: Columns, result: ShootingResult) -> list[str]:
-    """Say how much of the viscous friction of voltage-driven joints is the back-EMF."""
+    """State how much of the viscous friction of voltage-driven joints is due to back-EMF."""
     gains = columns.gains
     if columns.drive not in {"voltage", "pwm"} or gains is None:
         return []
     if columns.torque_constant is None:
-        return ["Driven by voltage: viscous friction includes the braking by back-EMF."]
+        return ["The joints are driven by voltage, so viscous friction includes braking by back-EMF."]
     parts = [
         f"joint {joint + 1} {gain * constant:.3g} of {result.parameters[f'viscous_{joint + 1}'].value:.3g} N m s/rad"
         for joint, (gain, constant) in enumerate(zip(gains, columns.torque_constant, strict=True))
     ]
-    return [f"Driven by voltage: viscous friction includes the braking by back-EMF, {', '.join(parts)}."]
+    return [f"The joints are driven by voltage, so viscous friction includes braking by back-EMF: {', '.join(parts)}."]
 
 
 def _arm(read: _Read, gravity: float) -> ArmFacts:
-    """What the recordings reveal about the joints: the limits are the observed extremes."""
+    """Describe the joints from the recordings; the limits are the observed extremes."""
     columns = read.columns
     gains = columns.gains or [1.0] * len(columns.position or ())
     joints = []
@@ -246,7 +246,7 @@ def _keep(
 
 
 def _as_toml(config: RecordingConfig, columns: Columns) -> str:
-    """A configuration with which the same files give the same result."""
+    """A configuration that reproduces the result from the same files."""
     lines = [
         "# How `hil estimate` interpreted the columns.",
         "[arm]",

@@ -64,7 +64,7 @@ def _is_clear(residual: float, given: float) -> bool:
 
 
 def _unexplained(residual: float, given: float) -> str:
-    """What a correction gains: the torque that inverse dynamics leaves unexplained with and without it."""
+    """Describe the gain of a correction: the torque that inverse dynamics leaves unexplained with and without it."""
     return f"inverse dynamics leaves {_percent(residual)} of the torque unexplained instead of {_percent(given)}"
 
 

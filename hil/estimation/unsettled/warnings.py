@@ -36,7 +36,7 @@ def doubts_of(
 ) -> Doubts:
     """Find what looks wrong in the recordings, or in how the estimate explains them.
 
-    cause_known: whether the verdict says why much of the motion is unexplained. gravity: whether it acts in the
+    cause_known: whether the verdict says why much of the motion is unexplained. gravity: whether gravity acts in the
     arm's plane.
     """
     faults, doubts, warnings = _signs(recordings), [], _rows(recordings)
@@ -71,7 +71,7 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
 
 
 def _rows(recordings: Sequence[Recording]) -> list[str]:
-    """Detect rows that are missing among equal time steps, apart from gaps."""
+    """Detect rows that are missing from regular time steps, apart from gaps."""
     steps = [np.diff(each.time)[np.diff(each.time) < each.longest_interval] / each.interval for each in recordings]
     step = np.concatenate(steps)
     whole = np.round(step)
@@ -79,7 +79,7 @@ def _rows(recordings: Sequence[Recording]) -> list[str]:
     if lost <= LOST or np.mean(np.abs(step - whole) < EQUAL) < MOSTLY:
         return []
     return [
-        f"{100 * lost:.2g} % of the rows are missing among equal time steps: the torques of these rows are unknown, "
+        f"{100 * lost:.2g} % of the rows are missing: the torques of these rows are unknown, "
         "which increases the residual. Log every row."
     ]
 

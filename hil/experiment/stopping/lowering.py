@@ -6,7 +6,7 @@ the experiment. It is aborted and torque is cut if a servo loses its torque, if 
 joint leaves the path, or if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities
 that agree with the positions.
 
-Replies may be missing for a moment, even at the beginning: joints that are not heard get the feed-forward torque alone.
+Replies may be missing for a moment, even at the beginning: joints that are not heard get only the feed-forward torque.
 """
 
 from collections import deque
@@ -35,7 +35,7 @@ LEAVES_RAD = 0.35
 """Largest accepted tracking error [rad]: a joint with a larger one does not follow its path to the rest pose."""
 
 MOST_PATHS = 4
-"""Number of paths home, the first one included, until an arm that is pushed off them is given up."""
+"""Number of paths home, including the first, that an arm may be pushed off before it is given up."""
 
 LYING_RAD = 0.06
 """If every joint is within this angle of the rest pose [rad], the arm counts as lying in it."""
@@ -46,7 +46,7 @@ that exceeds this and still speeds up although its torque opposes the motion cou
 """
 
 TOO_FAST = 0.6
-"""Velocity of such a joint, relative to its limit, at which it is not tested any more: torque is cut."""
+"""Velocity of such a joint, relative to its limit, above which torque is cut without a test."""
 
 _GROWS_S = 0.015
 _ROOM_RAD = 0.2  # beyond the position limits and the path home
@@ -170,7 +170,7 @@ class Lowering:
         return int(count)
 
     def check_time(self, seconds: float) -> None:
-        """Raise SafetyStop if lowering takes `seconds` [s] in all and that is too long."""
+        """Raise SafetyStop if lowering would take too long: `seconds` [s] in all."""
         longest = self._config.safety.lower_time
         if seconds > longest:
             raise SafetyStop(
@@ -180,7 +180,7 @@ class Lowering:
             )
 
     def goals(self, index: int, state: State) -> list[float]:
-        """Goals [A or V] of one sample, from the previous sample's state. Raises SafetyStop."""
+        """Compute the goals [A or V] of one sample from the previous sample's state. Raises SafetyStop."""
         velocity = np.array(self._recent.believed(state))
         ahead = self._position[index] - np.array(state.position), self._velocity[index] - velocity
         missing = np.array(state.missing)
@@ -204,7 +204,7 @@ class Lowering:
             self._look_at_obedience(index, state)
 
     def _look_at_distance(self, joint: int, away: float) -> None:
-        """Decide about a joint that is far off its path [rad]: one that was pushed goes home from where it is now."""
+        """Judge a joint that is `away` [rad] from its path: one that was pushed gets a new path home."""
         pushed = self._obedience.is_pushed(joint)
         self.needs_another_path = pushed and self._paths < MOST_PATHS
         if not self.needs_another_path:
@@ -213,7 +213,7 @@ class Lowering:
             raise SafetyStop(f"{title} is {away:.2f} rad off its lowering path{why}", Cause.UNEXPECTED)
 
     def _look_at_obedience(self, index: int, state: State) -> None:
-        """Raise SafetyStop for a joint whose motor turns against its goals, or that its torque does not slow down."""
+        """Raise SafetyStop for a joint whose motor turns against its goals or whose torque fails to slow it down."""
         velocity, now = np.array(self._recent.believed(state)), state.time_before_write
         turned = -1
         if self._watch is not None:
@@ -238,8 +238,8 @@ class Lowering:
             self._look_at_runaway(int(np.argmax(runs)), velocity, now)
 
     def _look_at_runaway(self, joint: int, velocity: NDArray[np.float64], now: float) -> None:
-        """Test a joint that speeds up although its torque opposes the motion. Raises SafetyStop without a model, and if
-        the joint has become so fast that its motor no longer matters.
+        """Test a joint that speeds up although its torque opposes the motion. Raises SafetyStop if there is no model,
+        or if the joint is so fast that its motor no longer matters.
         """
         share = abs(velocity[joint]) / self._config.joints[joint].velocity_limit
         if self._watch is not None and share < TOO_FAST and self._obedience.question(joint, now):
@@ -252,7 +252,7 @@ class Lowering:
         )
 
     def others_answer(self) -> None:
-        """Record that some of the servos that are not heard do answer: a silent one hides their replies."""
+        """Record that some servos that are not heard do answer: a silent one hides their replies."""
         self._guard.others_answer()
 
     def late(self, seconds: float) -> None:
@@ -261,7 +261,7 @@ class Lowering:
 
 
 def _widened(config: Config, position: np.ndarray, velocity: np.ndarray) -> Config:
-    """The limits of a lowering: widened just enough for the arm's position and velocity when it was stopped."""
+    """Return the limits for lowering, widened just enough for the arm's position and velocity when it was stopped."""
     fastest = max(_FASTER * float(np.abs(velocity).max()), 2.0 * config.safety.lower_speed) + 0.5
     joints = [
         _allowing(joint, float(row.min()), float(row.max()), max(fastest, joint.velocity_limit))

@@ -1,4 +1,4 @@
-"""How often a lowered arm is commanded, and how long its replies are awaited; both are adapted to late replies.
+"""Choose how often to command an arm that is being lowered, and how long to wait for replies, adapting to late ones.
 
 Servos hold their latest goal, so an arm can be lowered with fewer exchanges than the experiment needs. If replies come
 too late for one exchange per sample, only every second or third sample is exchanged from then on, until the end.
@@ -17,7 +17,7 @@ replies are lost instead of late, it is better to ask again soon.
 """
 
 LAST_S = 0.075
-"""Time after the latest reply at which waiting ends in any case [s]: torque must be off 25 ms later."""
+"""Time after the latest reply at which waiting always ends [s]: torque must be off 25 ms later."""
 
 MARGIN_S = 0.002
 """Time between the end of an exchange and the next goals [s]."""
@@ -41,14 +41,14 @@ class Pace:
     def patience(self, unheard: float, *, are_late: bool) -> float:
         """How long the next exchange may wait for replies [s].
 
-        unheard: time since the latest reply of all servos [s]. are_late: whether replies have just been too late.
+        unheard: time since the latest reply of all servos [s]. are_late: whether recent replies were too late.
         """
         if not are_late and not self._was_late:
             return self._usual
         return max(min(max(self._least, LONGEST_S), LAST_S - unheard), LONGER_S)
 
     def took(self, seconds: float, *, missed: bool) -> None:
-        """Process an exchange that took `seconds` [s]. missed: whether replies were missing in the end."""
+        """Process an exchange that took `seconds` [s]. missed: whether replies were still missing at the end."""
         if missed:
             return
         usual, self._longest = self._usual, max(self._longest, seconds)

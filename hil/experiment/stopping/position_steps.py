@@ -18,7 +18,7 @@ BENDS_RAD_S2 = 200.0
 """Largest joint acceleration assumed while an arm is lowered [rad/s^2]; it determines how uncertain predictions are."""
 
 MOST_STEPS = 6
-"""Largest number of steps of one joint that are corrected; a single false reading causes two."""
+"""Largest number of corrected steps per joint; a single false reading causes two."""
 
 
 class _Seen(NamedTuple):
@@ -39,7 +39,7 @@ class PositionSteps:
         self._steps = [0] * len(self._seen)
 
     def corrected(self, state: State) -> State:
-        """Return an exchange whose positions continue the motion so far [rad]."""
+        """Return the exchange with positions that continue the motion so far [rad]."""
         position, at = list(state.position), state.time_before_write
         for joint, is_missing in enumerate(state.missing):
             if not is_missing:
@@ -58,7 +58,7 @@ class PositionSteps:
 
 
 def _is_step(seen: _Seen, position: float, now: _Seen) -> bool:
-    """Whether a position is out of reach for a joint that moved at its velocities, and for one that stood still."""
+    """Whether a joint could reach a position neither by moving at its velocities nor by standing still."""
     seconds = now.time - seen.time
     way = 0.5 * seconds * (seen.velocity + now.velocity)
     unsure = STEP_RAD + 0.5 * BENDS_RAD_S2 * seconds**2

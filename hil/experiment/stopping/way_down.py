@@ -1,4 +1,4 @@
-"""The way down: exchanges with a spatial arm from the stop until it lies in its rest pose.
+"""Exchanges with a spatial arm from the stop until it lies in its rest pose.
 
 `hil.experiment.stopping.lowering` computes the goals and checks the replies; this module sends, receives and records
 them in time.
@@ -116,7 +116,7 @@ class WayDown:
         self._told(error, f"The arm {done}.")
 
     def _is_silent_too_long(self, latest: State, whole: State) -> bool:
-        """Whether the replies that are missing now have been missing for longer than a lowering may bridge.
+        """Whether replies have been missing for longer than lowering can do without them.
 
         At most one packet is sent to find out, since each one feeds the watchdog of a servo that has another ID now.
         """
@@ -167,7 +167,7 @@ class WayDown:
         return state
 
     def _exchange(self, *, between: bool) -> State:
-        """Exchange the present goals and adapt the pace to how long that takes."""
+        """Exchange the current goals and adapt the pace to the time it takes."""
         pace, former = self._pace, self._pace.every
         now = self._clock.now()
         are_late = now - self._bus.prepared.heard.late_at < _RECENT_S
@@ -186,7 +186,7 @@ class WayDown:
         return state
 
     def _look_behind_silence(self, state: State) -> None:
-        """When no servo is heard any more, find out once whether only one is silent and hides all others."""
+        """When no servo is heard any more, check once whether a single silent servo hides all others."""
         is_silent = all(state.missing) and len(state.missing) > 1
         if is_silent and not self._was_silent and self._bus.first_hides_others(LONGER_S):
             self._lowering.others_answer()
@@ -195,7 +195,7 @@ class WayDown:
     def _between_samples(self) -> Iterator[State]:
         """Exchange the same goals until the next sample is due; yield each state.
 
-        An exchange that might delay the next sample is left out.
+        An exchange that might delay the next sample is skipped.
         """
         following = self._deadline + self._interval
         for turn in range(1, self._turns if self._pace.every == 1 else 1):
@@ -207,7 +207,7 @@ class WayDown:
                 yield self._exchange(between=True)
 
     def _look_at_alerts(self, state: State) -> None:
-        """Raise SafetyStop if a servo has raised its alert since the last exchange and some servo has no torque."""
+        """Raise SafetyStop if a servo has raised its alert since the last exchange and any servo has lost torque."""
         alerts = [bool(error & ALERT) for error in state.error]
         new = [joint for joint, now, before in zip(self._bus.joints, alerts, self._alerts, strict=True) if now > before]
         if not new:

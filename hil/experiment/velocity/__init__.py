@@ -1,1 +1,1 @@
-"""What is known of a servo's velocity reading: its bias, and by how much it lags behind the position."""
+"""Errors of a servo's velocity reading: its bias, and its lag behind the position."""

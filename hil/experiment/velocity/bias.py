@@ -1,11 +1,10 @@
-"""The bias that a servo's velocity reading may have, as far as its positions have shown it.
+"""Bounds on the bias of a servo's velocity reading, inferred from its positions.
 
-A register that is rounded downwards, say, is half a step too low on average. The position then moves away from the
-integral of the velocity in proportion to the time in motion, as a position that creeps does. A servo's bias is
-constant: the range of values that it may have is at first plus or minus half a step, and every moment of a run bounds
-it further, since position and integral cannot be farther apart than bias times time plus known errors. A creep that
-begins later leaves that range, and cannot widen it. Where twice these errors do not explain the distance, the position
-creeps.
+A register that is rounded downwards, for example, is half a step too low on average. The position then departs from the
+integral of the velocity in proportion to the time in motion, as a creeping position does. But a servo's bias is
+constant: initially it may be plus or minus half a step, and every sample of a run narrows this range, since position
+and integral cannot be farther apart than bias times time plus known errors. Creep that begins later leaves the range
+and cannot widen it. If twice these errors do not explain the distance, the position creeps.
 """
 
 from typing import Any
@@ -16,13 +15,13 @@ STEP_RAD_S = 0.025
 """Resolution of the velocity register [rad/s]."""
 
 UNSURE_RAD_S = 0.003
-"""Change of the bias that is accepted: it may depend on the motion, for a joint that sticks and slips, say [rad/s]."""
+"""Accepted change of the bias, which may depend on the motion, for example if a joint sticks and slips [rad/s]."""
 
 NOISE_RAD, NOISE_TIMES = 0.01, 3.0
-"""Smallest error that is assumed [rad], and the assumed error as a multiple of the RMS of what remains unexplained."""
+"""Smallest assumed error [rad], and the assumed error as a multiple of the RMS residual."""
 
 CERTAINLY = 2.0
-"""Multiple of the errors from which a difference is a fault."""
+"""Multiple of the errors above which a difference is a fault."""
 
 FIELDS = (("least", "f8"), ("most", "f8"))
 """The range of the bias [rad/s]."""
@@ -36,7 +35,7 @@ def begin(bias: Any) -> None:
 def look(bias: Any, apart: float, errors: float, moving: float) -> bool:
     """Process the difference after `moving` seconds of motion [rad, s]; return whether the position creeps.
 
-    If no bias in the present range explains it, the range shrinks to the nearest value.
+    If no bias in the current range explains it, the range shrinks to the nearest value.
     """
     if abs(unexplained(bias, apart, moving)) > CERTAINLY * errors:
         return True
@@ -46,7 +45,9 @@ def look(bias: Any, apart: float, errors: float, moving: float) -> bool:
 
 
 def unexplained(bias: Any, apart: float, moving: float) -> float:
-    """Return what no bias in the range explains of a difference `apart` after `moving` seconds of motion [rad, s]."""
+    """Return the part of a difference `apart` after `moving` seconds of motion [rad, s] that no bias in the range
+    explains.
+    """
     low = max(bias.least - UNSURE_RAD_S, -0.5 * STEP_RAD_S) * moving
     high = min(bias.most + UNSURE_RAD_S, 0.5 * STEP_RAD_S) * moving
     return float(apart - min(max(apart, low), high))

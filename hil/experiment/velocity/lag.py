@@ -1,13 +1,13 @@
-"""Estimates by how much a servo's velocity lags behind its position and is off scale, and detects a lag that changes.
+"""Estimate the lag and scale error of a servo's velocity relative to its position, and detect a lag that changes.
 
-Servos filter their velocities, so that any servo may have a lag. It is the slope of the difference `apart` (see
-`hil.experiment.consistency`) over the velocity less its mean in the short memory; a scale error is its slope over the
-distance covered. Both are estimated by least squares, together with a constant. An estimate is only as certain as the
-velocity has changed.
+Servos filter their velocities, so any servo may have a lag. It is the slope of the difference `apart` (see
+`hil.experiment.consistency`) over the velocity minus its mean in the short memory; a scale error is the slope over the
+distance covered. Both are estimated by least squares, together with a constant. The more the velocity has changed, the
+more certain the estimates are.
 
-Neither of them changes during a run. The lag in the last `BLOCKS` blocks of `BLOCK_S` is therefore compared with that
-in all blocks before: the difference must not exceed what their uncertainties and a filter explain, whose lag depends on
-the frequency of the motion.
+Neither error changes during a run. The lag in the last `BLOCKS` blocks of `BLOCK_S` is therefore compared with that in
+all earlier blocks: the difference must not exceed what is explained by their uncertainties and by a filter, whose lag
+depends on the frequency of the motion.
 """
 
 from typing import Any
@@ -16,26 +16,27 @@ import numba
 import numpy as np
 
 BLOCK_S, BLOCKS = 0.1, 4
-"""Duration of a block [s], and the number of blocks that are compared with the time before."""
+"""Duration of a block [s], and the number of blocks that are compared with all earlier ones."""
 
 CHANGED_S, CHANGED_SHARE = 0.005, 0.35
-"""Change of the lag that is always accepted [s], and the fraction of the former lag that it may amount to."""
+"""Accepted change of the lag: an absolute part [s], and a fraction of the former lag."""
 
 TIMES = 4.0
 NOISE_RAD, LASTS_S = 0.0015, 0.1
-"""Standard deviation of `apart` that is always assumed [rad], and the time for which its errors last [s]."""
+"""Lower bound on the standard deviation of `apart` [rad], and correlation time of its errors [s]."""
 
 LEAST_INFORMATION = 0.1
-"""Smallest integral of the squared change of velocity, without what a scale error explains [rad^2/s]."""
+"""Smallest integral of the squared change of velocity, excluding what a scale error explains [rad^2/s]."""
 
 ENOUGH_INFORMATION, ALL_INFORMATION = 0.3, 3.0
-"""That integral over the whole run from which lag and scale error are known, and after which they no longer change."""
+"""Values of that integral over the whole run at which lag and scale error become known, and at which they are frozen.
+"""
 
 SEPARATE = 0.05
-"""Fraction of that integral which must remain, or lag and scale error cannot be told apart."""
+"""Smallest fraction of that integral at which lag and scale error can be distinguished."""
 
 LONGEST_S = 0.015
-"""Longest interval between two samples between which the velocity is known well enough [s]."""
+"""Longest interval between two samples over which the velocity is known well enough [s]."""
 
 _SUMS = 10
 _LAG_2, _FAR_2, _CROSSED, _LAG_APART, _FAR_APART, _APART_2, _SECONDS, _LAG, _FAR, _APART = range(_SUMS)
@@ -46,16 +47,17 @@ LAGS = np.dtype(
         *((name, "f8") for name in ("information", "lag", "lag_std", "scale", "scale_std", "noise")),
     ]
 )
-"""Sums of products over the present block, over the latest complete ones, and over all earlier ones. oldest: row of the
-oldest complete block. information: that about the lag [rad^2/s]; then lag and scale error with their standard
-deviations [s, 1], and the RMS of what they do not explain [rad], all 0 as long as it is less than `ENOUGH_INFORMATION`.
+"""Sums of products over the current block, the latest complete blocks, and all earlier blocks. oldest: row of the
+oldest complete block. information: information about the lag [rad^2/s]. The remaining fields are lag and scale error
+with their standard deviations [s, 1], and the RMS residual [rad]; all are 0 while the information is less than
+`ENOUGH_INFORMATION`.
 """
 
 
 def add(lags: Any, change: float, far: float, apart: float, seconds: float) -> bool:
     """Process a sample, `seconds` after the previous one; return whether the lag has changed.
 
-    change: velocity less its mean [rad/s]. far, apart: distance covered, and its difference from the integral of the
+    change: velocity minus its mean [rad/s]. far, apart: distance covered, and its difference from the integral of the
     velocity [rad].
     """
     if seconds > LONGEST_S:
@@ -75,7 +77,7 @@ def add(lags: Any, change: float, far: float, apart: float, seconds: float) -> b
 
 
 def forget(lags: Any) -> None:
-    """Discard the present block: nothing is known about the motion since the previous sample."""
+    """Discard the current block: nothing is known about the motion since the previous sample."""
     for each in range(_SUMS):
         lags.block[each] = 0.0
 
@@ -105,8 +107,8 @@ def _completes_block(lags: Any) -> bool:
 
 
 def _fitted(sums: Any) -> tuple[float, float, float, float, float]:
-    """Lag [s], scale error, the information about the lag [rad^2/s], the variance of what they leave [rad^2], and the
-    information about the scale error [rad^2 s]; all 0 if the two errors cannot be told apart.
+    """Return lag [s], scale error, information about the lag [rad^2/s], residual variance [rad^2], and information
+    about the scale error [rad^2 s]; all 0 if the two errors cannot be distinguished.
     """
     seconds = max(sums[_SECONDS], 1e-9)
     lag_2 = sums[_LAG_2] - sums[_LAG] * sums[_LAG] / seconds

@@ -29,9 +29,9 @@ def friction(data: RunData) -> Section | None:
     pictures = [_curve(data, joint, name, measured_dots, simulated_dots) for joint, name in enumerate(data.names)]
     words = (
         "Dots: commanded torque minus the model's inertia and gravity torque, once for the measured motion and once "
-        "for the model's own, from positions alone. The acceleration derived from positions smooths every reversal, so "
-        "near standstill both leave the curve alike; there static friction also takes any value that holds the joint. "
-        "If the friction model is right, the two sets of dots agree.",
+        "for the model's own, from positions alone. Deriving accelerations from positions smooths every reversal, so "
+        "near standstill both sets deviate equally from the curve; there, static friction also takes any value that "
+        "holds the joint. If the friction model is right, the two sets of dots agree.",
     )
     return Section("friction", "Friction", words, pictures=tuple(pictures))
 
@@ -39,7 +39,7 @@ def friction(data: RunData) -> Section | None:
 def _left_to_friction(model: ArmModel, period: PlayedPeriod, lines: Lines, harmonics: int) -> tuple[Array, Array]:
     """Speeds [rad/s] and friction torques [N m], both (joints, dots), from the Fourier lines of a motion.
 
-    harmonics: the highest line that is used. That of the noisy motion smooths both motions alike.
+    harmonics: the highest line used; the same for both motions, so that they are smoothed equally.
     """
     samples = period.position.shape[1]
     motion = motion_of(lines, harmonics, 2 * np.pi * period.rate / samples, samples)
@@ -55,7 +55,7 @@ def _left_to_friction(model: ArmModel, period: PlayedPeriod, lines: Lines, harmo
 def _curve(
     data: RunData, joint: int, name: str, measured: tuple[Array, Array], simulated: tuple[Array, Array]
 ) -> Picture:
-    """measured, simulated: speeds and friction torques of both motions."""
+    """Draw one joint's friction. measured, simulated: speeds and friction torques of both motions."""
     fastest = float(np.abs(measured[0][joint]).max())
     # Cubes of an even grid are denser near zero speed, where the curve bends.
     at = fastest * np.linspace(-1, 1, _CURVE) ** 3

@@ -36,7 +36,7 @@ def spectra(data: RunData) -> Section | None:
 
 
 def _levels(data: RunData) -> tuple[Table, ...]:
-    """Table of the motion per line of each kind and its residual; empty for older results, which lack these values."""
+    """Table of RMS motion and residual per line, by kind of line; empty for older results, which lack these values."""
     levels = data.result.validation.line_levels_ticks
     if levels is None:
         return ()

@@ -1,4 +1,4 @@
-"""How a session ends: what its exception says about torque, and which exception is raised in the end."""
+"""End of a session: which exception is finally raised, and what it says about torque."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -10,7 +10,7 @@ from hil.drivers.torque.off import TorqueOff, signals_held_back
 from hil.errors import ExperimentError, StopRequested
 
 _LATE_CONFIRMED = "Replies were missing when torque was cut at the end of the run: check the cables and the supply."
-"""Message if every servo has answered in the end and nothing else is wrong."""
+"""Message if every servo has eventually answered and nothing else is wrong."""
 
 _TELLS_OF_TORQUE = re.compile("torque (off )?is", re.IGNORECASE)
 """Matches every sentence that says whether torque is off (see `TorqueOff`)."""
@@ -19,7 +19,7 @@ _NEVER_ON = "Torque is off on all servos, confirmed by reading it back; this com
 
 
 def end_with(bus: ServoBus, stopped: BaseException | None, left: Sequence[str], before: TorqueOff | None) -> None:
-    """Add what is left to say to the exception that ended the block, or raise another one where it does not apply.
+    """Add the remaining messages to the exception that ended the block, or raise another if it no longer applies.
 
     before: the report on torque before the settings were restored; None if this command had not switched torque on.
     """
@@ -44,13 +44,13 @@ def end_with(bus: ServoBus, stopped: BaseException | None, left: Sequence[str], 
 
 
 def _retract(stopped: BaseException, told: str) -> None:
-    """Remove a sentence about torque that no longer holds from an exception's notes."""
+    """Remove an outdated sentence about torque from an exception's notes."""
     if notes := getattr(stopped, "__notes__", None):
         notes[:] = [rest for note in notes if (rest := note.replace(told, "").strip())]
 
 
 def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
-    """The exception to raise in place of `error` if torque is off on all servos by now; None if it is not.
+    """Return the exception to raise in place of `error` if torque is now off on all servos, otherwise None.
 
     It is the exception that led to cutting torque. If there was none, and replies were only missing when torque was cut
     at the end, it is an ExperimentError. A note about the torque state is attached to it.
@@ -66,8 +66,8 @@ def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
 
 @contextmanager
 def telling_of_torque(bus: ServoBus) -> Iterator[None]:
-    """Add a note about torque to any exception that ends the block, unless it has one: a stop may come between two
-    runs.
+    """Add a note about torque to any exception that ends the block, unless it already has one: a stop may also come
+    between two runs.
     """
     try:
         yield
@@ -83,7 +83,7 @@ def telling_of_torque(bus: ServoBus) -> Iterator[None]:
 
 
 def about_torque(bus: ServoBus) -> str:
-    """A sentence about the servos' torque while no run is in progress."""
+    """Return a sentence about the servos' torque while no run is in progress."""
     if bus.torque_off_report is not None:
         return str(bus.torque_off_report)
     try:

@@ -1,7 +1,7 @@
 """Settings that a killed program left on the servos: some can be restored, others have been changed by another program.
 
-If a register holds neither the value that the killed program set nor the value before that, another program has changed
-it. It is not restored, since a person may have wanted the change, but it is reported together with its earlier value.
+If a register holds neither the value that the killed program set nor the earlier one, another program has changed it.
+It is not restored, since a person may have wanted the change, but it is reported together with its earlier value.
 """
 
 from collections.abc import Mapping
@@ -90,14 +90,14 @@ def what_is_left(kept: Kept, servo: Servo, present: Mapping[str, int]) -> Left:
 
 @dataclass(frozen=True)
 class Restored:
-    """The settings that `recover` wrote, and a sentence about changes by another program, both as text; "" if none."""
+    """The settings written by `recover`, as text, and a sentence about changes by another program; "" if none."""
 
     written: list[str] = field(default_factory=list)
     others: str = ""
 
 
 def recover(servo: Servo, port: str) -> Restored:
-    """Restore settings that a terminated program left changed. Raises the same errors as `Servo.write`.
+    """Restore settings left behind by a terminated program. Raises the same errors as `Servo.write`.
 
     The file with the earlier settings is kept as long as another program's value prevents a register from being
     restored.

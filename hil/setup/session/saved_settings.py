@@ -14,12 +14,12 @@ from hil.setup.session.killed_run import Left, left_behind, what_is_left
 from hil.setup.session.settings_file import Kept
 
 _MOST_CHECKS = 3
-"""How often the settings of all servos are read again once they have been restored."""
+"""Maximum number of times that the settings of all servos are read again after being restored."""
 
 
 @dataclass
 class SavedSettings:
-    """What the servos are restored to. Each servo has a file on disk until its settings have been restored.
+    """The settings to restore. Each servo has a file on disk until its settings have been restored.
 
     say: receives messages for the user.
     """
@@ -35,7 +35,7 @@ class SavedSettings:
     killed.
     """
     reduced: dict[Joint, dict[str, int]] = field(default_factory=dict)
-    """Goals that could only be restored as far as a lowered limit allows, with the restored values."""
+    """Goals restored only as far as a lowered limit allows, with the restored values."""
     _refused: set[Joint] = field(default_factory=set)
     """Servos whose Current Limit another program has left too low for this run; the file keeps its former value."""
 
@@ -98,8 +98,8 @@ class SavedSettings:
     def verify(self, failed: dict[Joint, DriverError]) -> None:
         """Read the settings of all servos again once the last one has been restored, and restore those that differ.
 
-        Replies that belong to earlier requests, or IDs that are swapped in between, make a servo seem restored that was
-        never reached. failed: receives the errors of the servos whose settings still differ.
+        Replies that belong to earlier requests, or IDs that are swapped in between, can make a servo that was never
+        reached seem restored. failed: receives the errors of the servos whose settings still differ.
         """
         for attempt in range(_MOST_CHECKS):
             differing = {
@@ -112,13 +112,13 @@ class SavedSettings:
             failed |= self.put_back(differing) if attempt < _MOST_CHECKS - 1 else differing
 
     def forget(self, restored: Iterable[Joint]) -> None:
-        """Remove the files of these servos; not where a goal or limit has yet to be restored."""
+        """Remove the files of these servos, except where a goal or limit has yet to be restored."""
         for joint in restored:
             if joint not in self._refused and (not self.reduced[joint] or joint in self.left):
                 settings_file.forget(self.kept[joint])
 
     def _differs(self, joint: Joint) -> DriverError | None:
-        """The error for a servo whose settings are not read as restored, or cannot be read; None if they are."""
+        """Return the error for a servo whose settings cannot be read or do not read back as restored, or None."""
         try:
             found = unlike(self.bus.drives[joint], self.wanted[joint])
         except DriverError as error:

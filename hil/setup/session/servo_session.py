@@ -132,8 +132,8 @@ class ServoSession:
     def end(self) -> list[str]:
         """Restore every servo's settings; return one message per reason for which some could not be restored.
 
-        Torque is read last of all, and cut again where another program has switched it on since; the settings are
-        restored again after that. Never raises DriverError.
+        Torque is read last, and cut again if another program has switched it on since; those servos' settings are then
+        restored again. Never raises DriverError.
         """
         saved = self.saved
         failed = saved.put_back(saved.kept)
@@ -172,7 +172,7 @@ class ServoSession:
         return True
 
     def _switched_on_by_another(self) -> Iterator[str]:
-        """Say at which servos another program switched torque on after it had been cut, unless it is still on."""
+        """Name the servos on which another program switched torque on after it was cut, unless it is still on."""
         on = [joint for joint, is_on in self._torque.items() if is_on]
         silent = [joint for joint in self._on_again if self._torque.get(joint, True) is None]
         if on or silent:

@@ -2,7 +2,8 @@
 
 There is one file per servo in the user's state folder, named after port, ID and model: however a program ends, the next
 program on that port finds the file and restores the settings. The name of a USB port may change when the cable is
-plugged in again, and may then be that of another arm: an adapter with a serial number takes the place of the port.
+plugged in again, and may then be that of another arm. An adapter with a serial number is therefore named instead of the
+port.
 """
 
 import json
@@ -25,7 +26,7 @@ class Kept:
     """Saved settings of one servo.
 
     changed: the EEPROM registers that the program sets, with their values. program: the program's process ID. adapter:
-    lasting name of the USB adapter; "" if it has none.
+    persistent name of the USB adapter; "" if it has none.
     """
 
     port: str

@@ -1,4 +1,4 @@
-"""What is not as it was before the session, although every servo's settings have been restored as far as possible."""
+"""Report what differs from before the session although every servo's settings have been restored as far as possible."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -25,7 +25,7 @@ def unrestored(
     *,
     is_ours: bool,
 ) -> list[str]:
-    """A message for each reason why a setting is not as it was.
+    """Return a message for each reason why a setting differs.
 
     failed: the errors of the servos whose settings could not be restored. before, delays: all settings, and the Return
     Delay Times [2 us], at the beginning of the session. is_ours: whether the servos may be written to.
@@ -44,7 +44,7 @@ def unrestored(
 
 
 def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
-    """Restore what an earlier run left on servos that this one did not get to; say where that is impossible."""
+    """Restore what an earlier run left on servos that this run did not reach; say where that is impossible."""
     waiting: list[tuple[Joint, str]] = []
     for joint in saved.left:
         if joint in saved.kept:
@@ -107,8 +107,8 @@ def _lowered_limits(saved: SavedSettings, settings: Settings, silent: Collection
 
 
 def _changed_meaning(saved: SavedSettings, settings: Settings, silent: Collection[Joint]) -> Iterator[str]:
-    """Say which settings that give angles or goals another meaning were changed during the session: the next start
-    takes them as they are.
+    """Say which settings that change the meaning of angles or goals were changed during the session: the next start
+    accepts them as they are.
     """
     for joint, servo in saved.bus.drives.items():
         for name in (_OFFSET, _DRIVE_MODE):

@@ -239,7 +239,7 @@ CASES: list[tuple[str, int, str]] = [
     ("record arm.toml --live", 2, "--live"),
     ("identify study.toml", 2, "Type: hil study study.toml"),
     ("identify columns.toml", 2, "Type: hil estimate FILE.csv --config columns.toml"),
-    ("study arm.toml", 2, "it describes an arm, not a study"),
+    ("study arm.toml", 2, "describes an arm, not a study"),
     ("check arm.toml extra", 2, "extra"),
     ("dry-run arm.toml --arms ten", 2, "--arms"),
     ("dry-run arm.toml --result arm.toml", 2, "is not a result file of hil"),

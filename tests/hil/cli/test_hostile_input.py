@@ -116,7 +116,7 @@ def test_a_link_to_nowhere_is_not_called_a_missing_file(tmp_path: Path) -> None:
     for name in ("config.toml", "samples.npy"):
         (tmp_path / name).touch()
     (tmp_path / "run.json").symlink_to("run.json")
-    with pytest.raises(RunFolderError, match=r"run\.json is a link that leads nowhere"):
+    with pytest.raises(RunFolderError, match=r"run\.json is a broken link"):
         RunFolder.open(tmp_path)
 
 

@@ -66,7 +66,7 @@ def test_large_percentages_and_undetermined_values_are_readable() -> None:
 
 def test_a_difference_repeats_doubtful_verdicts() -> None:
     (doubt,) = Difference("a", "b", (), (), (), trust=("yes", "with care")).doubts
-    assert doubt.startswith("b: trust this model: with care")
+    assert doubt.startswith('The report of b says "trust this model: with care"')
     assert Difference("a", "b", (), (), ()).doubts == ()
     other = Difference("a", "b", (), (), (), other_joints=("Joint 1 was ...",))
     assert other.doubts == ("Joint 1 was ...",)

@@ -157,7 +157,7 @@ def test_silence_on_a_computer_that_was_late_before_names_it_too(arm: Arm) -> No
     guard.look(at(0, STILL))
     guard.woke_up(0.0, 0.0011)
     silent = MISSING._replace(missing=(True, True))
-    with pytest.raises(SafetyStop, match="other programs keep this computer busy: this program had just been late"):
+    with pytest.raises(SafetyStop, match="other programs keep this computer busy: this program was running late"):
         for number in range(1, 30):
             guard.look(at(number, silent))
     assert number == round(400 * arm().safety.late_time), "as for missed deadlines"
@@ -522,7 +522,7 @@ def test_the_supply_is_blamed_only_if_it_cannot_drive_more_at_this_speed(
     assert stop.cause is (Cause.OUT_OF_VOLTAGE if is_supply else Cause.GOALS_CHANGED)
     assert ("its supply cannot drive more" in said) == is_supply
     assert "its current sensor is wrong" in said
-    assert ("goals are being changed on the way" in said) == (not is_supply)
+    assert ("goals are being altered in transit" in said) == (not is_supply)
     assert "carries 0.120 A instead of the commanded 0.300 A" in said
 
 

@@ -166,7 +166,7 @@ def test_check_reports_a_path_that_a_run_would_refuse() -> None:
         ((SERVO_2, SERVO_2 + "input_voltage_v = 5.0\n"), "hardware error", Level.STOP, "power-cycle"),
         (
             (SERVO_2, SERVO_2 + 'input_voltage_v = 5.0\nregisters = { "Shutdown" = 53 }\n'),
-            *("hardware error", Level.STOP, "stays without torque until rebooted"),
+            *("hardware error", Level.STOP, "torque stays off until it is rebooted"),
         ),
         ((SERVO_2, SERVO_2 + "firmware = 38\n"), "firmware", Level.OK, ""),
         ((SERVO_2, SERVO_2.replace("2048", "3000")), "pose", Level.STOP, "zero_ticks = 3000"),

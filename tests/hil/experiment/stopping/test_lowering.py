@@ -10,17 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks.spatial.remembered import remembered
 from hil.config.schema import load_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.state import State
 from hil.errors import ExperimentError, SafetyStop, StopRequested
-from hil.estimator.chain.excitation import fourier_path
 from hil.experiment.run import run_experiment
 from hil.experiment.stopping.lowering import Lowering
 from hil.experiment.stream import Progress
 from hil.fakes.protocol_fake import FakeSerial
-from hil.plan import chain_plan
 from hil.plan.chain_plan import make_chain_plan
 from hil.runs.recording import Phase, Recorder, load_samples
 from hil.runs.run_folder import RunFolder
@@ -36,14 +33,6 @@ TEXT = replaced(
     ("rate = 400.0", f"rate = {RATE}.0"),
 )
 AT_S = 6.0
-
-design_path = remembered(fourier_path.design_path)
-
-
-@pytest.fixture(autouse=True)
-def _paths_are_designed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The design of the one path of these arms takes as long as a third of a run."""
-    monkeypatch.setattr(chain_plan, "design_path", design_path)
 
 
 def play(folder: Path, text: str, signals: tuple[float, ...] = ()) -> tuple[BaseException, NDArray[np.void]]:

@@ -162,6 +162,6 @@ def test_a_servo_outside_the_arm_that_obeys_commands_to_it_is_refused(arm: Arm, 
     config = arm(SHORT, ("[fake.arm]", f"[[fake.servos]]\n{SHADOW}[fake.arm]"))
     (stop,) = [finding for finding in stops(config) if "other servos" in finding.what]
     assert "--id 3 --secondary-id 255" in stop.fix
-    with pytest.raises(WrongSetting, match=r"ID 3.*obeys torque and goals meant for joint 'elbow' \(ID 2"):
+    with pytest.raises(WrongSetting, match=r"ID 3.*obeys torque and goal commands for joint 'elbow' \(ID 2"):
         play(config, tmp_path / "run")
     assert not bench.servos[3].torque_enabled and bench.changed() == []
