@@ -25,6 +25,7 @@ RUN_BY_OTHERS = {
 SHORT = (
     ("period = 10.0 ", "period = 4.0 "),
     ("band = [0.1, 5.0]", "band = [0.25, 5.0]"),
+    ("[experiment]\n", "[experiment]\nheld_out = false\n"),
 )
 
 RUN_ELSEWHERE = {
