@@ -13,7 +13,6 @@ from hil.experiment.run import run_experiment
 from hil.runs.recording import sample_type
 from hil.runs.run_folder import RunFolder
 from tests.hil.test_pwm import by_voltage as driven_by_voltage
-from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 COUNT = 8000
@@ -79,12 +78,14 @@ def test_too_few_readings_tell_nothing(by_voltage: Config) -> None:
     assert supply_sag(by_voltage, recording(OHM)[:300]) is None
 
 
+@pytest.mark.parametrize("resistances", [(6.0,), pytest.param((5.0, 6.0, 8.0), marks=pytest.mark.slow)])
 def test_an_arm_on_a_weak_supply_is_identified_and_the_supply_is_named(
-    arm_file: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    resistances: tuple[float, ...], arm_file: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # How much of the error the correction removes differs from recording to recording: two are added up.
-    left = np.array([left_with_and_without(ohm, arm_file, tmp_path, monkeypatch) for ohm in (6.0, 8.0)]).sum(axis=0)
-    assert left[0] < 0.7 * left[1]
+    # How much of the error the correction removes differs from recording to recording: 43 to 57 % of it is left here.
+    for ohm in resistances:
+        left, left_without = left_with_and_without(ohm, arm_file, tmp_path, monkeypatch)
+        assert left < 0.7 * left_without
 
 
 def left_with_and_without(
@@ -92,8 +93,7 @@ def left_with_and_without(
 ) -> tuple[float, float]:
     """The residual beyond noise with and without the correction [encoder steps]."""
     path = driven_by_voltage(arm_file)
-    text = replaced(path.read_text(encoding="utf-8"), ("[experiment]\n", "[experiment]\nheld_out = false\n"))
-    path.write_text(f"{text}\n[fake.supply]\nresistance_ohm = {ohm}\n", encoding="utf-8")
+    path.write_text(f"{path.read_text(encoding='utf-8')}\n[fake.supply]\nresistance_ohm = {ohm}\n", encoding="utf-8")
     config = load_config(path)
     run = RunFolder.create(tmp_path / f"run-{ohm:g}", config)
     run_experiment(config, run, path, lambda _: None)
@@ -103,6 +103,5 @@ def left_with_and_without(
         without.setattr("hil.estimation.settled_period.supply_sag", lambda *_: None)
         uncorrected = estimate_run(run)
     noise = 0.29
-    print("LEFT", ohm, [max(each.fit.residual_rms_ticks) - noise for each in (result, uncorrected)])
     left, left_without = (max(each.fit.residual_rms_ticks) - noise for each in (result, uncorrected))
     return left, left_without
