@@ -184,7 +184,7 @@ def _wave(order: Harmonics, phase: Array, samples: int) -> Array:
     return np.fft.irfft(spectrum, samples)
 
 
-@lru_cache(maxsize=64)  # a search for the largest torque scales the same wave again and again
+@lru_cache(maxsize=512)  # a search for the largest torque scales the same wave again and again
 def _low_crest_phases(harmonics: tuple[int, ...], seed: int, joint: int) -> Array:
     """Return the best phases [rad] of several optimisations, from randomised Schroeder phases and from random ones."""
     order, random = np.asarray(harmonics, dtype=np.int64), np.random.default_rng((seed, joint))
@@ -218,9 +218,9 @@ def _flattened(order: Harmonics, phase: Array, samples: int, norms: tuple[int, .
 def _norm(phase: Array, order: Harmonics, samples: int, p: int) -> tuple[float, Array]:
     """Return the logarithm of the wave's L2p norm, and its gradient with respect to the phases (lines,)."""
     wave = _wave(order, phase, samples)
-    peak = float(np.abs(wave).max())
+    peak = float(max(wave.max(), -wave.min()))
     steep = (wave / peak) ** (2 * p - 1)
-    total = float(np.sum(steep * wave)) / peak
+    total = float(np.add.reduce(steep * wave)) / peak
     # The derivative with respect to a phase is -sin; its sum over time with `steep` is a Fourier line of `steep`.
     lines = np.fft.rfft(steep)[order]
     gradient = np.imag(np.exp(-1j * phase) * lines) / (peak * total)

@@ -22,7 +22,11 @@ RUN_BY_OTHERS = {
     "hil identify configs/fake_open_manipulator_x.toml": "tests/hil/estimation/test_chain_run.py",
 }
 """Commands of a quarter of a minute that other tests run on the same file."""
-SHORT = (("period = 10.0 ", "period = 5.0 "), ("band = [0.1, 5.0]", "band = [0.2, 5.0]"))
+SHORT = (
+    ("period = 10.0 ", "period = 4.0 "),
+    ("band = [0.1, 5.0]", "band = [0.25, 5.0]"),
+    ("[experiment]\n", "[experiment]\nheld_out = false\n"),
+)
 
 RUN_ELSEWHERE = {
     "sudo": "changes the machine",
@@ -54,7 +58,7 @@ def place(identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     (here / "configs").mkdir(parents=True)
     for path in (ROOT / "configs").glob("*.toml"):
         text = path.read_text(encoding="utf-8")
-        if path.stem.startswith("fake"):
+        if path.stem.startswith(("fake", "first_time")):
             text = cut_short(text)
             (here / path.stem).write_text(text, encoding="utf-8")  # takes precedence over the bundled file of that name
         (here / "configs" / path.name).write_text(text, encoding="utf-8")
@@ -96,7 +100,9 @@ def as_here(command: str) -> list[str]:
         words[0] = "hil"
     if words[:2] in (["hil", "setup"], ["hil", "init"]):
         words.append("--yes")
-    return words
+    if words[:2] == ["hil", "dry-run"]:
+        words += ["--arms", "20"]
+    return ["1" if before == "--workers" else word for before, word in zip(["", *words], words, strict=False)]
 
 
 @pytest.mark.parametrize("document", RUN_HERE, ids=lambda path: path.name)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.spatial.remembered import remembered
 from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.excitation.multisine import Multisine, design_multisine, zippered_lines
 from hil.fakes.plants.arm import Arm
@@ -62,6 +63,7 @@ def wave(seed: int, peak: Sequence[float], period: float = PERIOD) -> Multisine:
     return design_multisine(RATE, period, zippered_lines(period, BAND, len(peak)), peak, seed)
 
 
+@remembered
 def record(arm: Arm, multisine: Multisine) -> Recorded:
     """Run the multisine: one period to settle, and one that is returned."""
     constant = np.array([drive.torque_constant for drive in arm.drives])[:, None]

@@ -34,7 +34,7 @@ def mass_matrix(chain: Chain, parameters: Array, position: Array) -> Array:
     link, armature = split(chain, parameters)
     work = room(chain.joints)
     rotation, translation, axis, _ = chain.arrays
-    place(rotation, translation, axis, np.asarray(position, dtype=np.float64), work[0], work[1])
+    place(rotation, translation, axis, np.ascontiguousarray(position, dtype=np.float64), work[0], work[1])
     move(link, armature, np.zeros(chain.joints), work)
     mass: Array = work[4]
     return mass
@@ -50,7 +50,8 @@ def torque_derivatives(
     link, armature = split(chain, parameters)
     work = room(chain.joints)
     rotation, translation, axis, gravity = chain.arrays
-    q, v, a = (np.asarray(each, dtype=np.float64) for each in (position, velocity, acceleration))
+    # An array with gaps would be another type, for which all loops would be compiled again.
+    q, v, a = (np.ascontiguousarray(each, dtype=np.float64) for each in (position, velocity, acceleration))
     place(rotation, translation, axis, q, work[0], work[1])
     move(link, armature, v, work)
     accelerate(armature, gravity, v, a, work)

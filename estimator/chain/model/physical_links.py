@@ -52,7 +52,7 @@ def nearest_links(base: BaseParameters, value: Array, std: Array, described: Arr
     start = np.concatenate((*(_coordinates(row) for row in described), np.log(np.maximum(armature, LEAST_ROTOR))))
 
     def parameters(x: Array) -> Array:
-        links = np.stack([_link(row) for row in x[: 10 * joints].reshape(joints, 10)])
+        links = _links(x[: 10 * joints].reshape(joints, 10))
         return np.column_stack((links, np.exp(x[10 * joints :])))
 
     def misfit(x: Array) -> Array:
@@ -64,10 +64,10 @@ def nearest_links(base: BaseParameters, value: Array, std: Array, described: Arr
 
     def slopes(x: Array) -> Array:
         # A coordinate changes one link's parameters only, so the blocks are differentiated one by one.
-        by_x = np.zeros((TERMS * joints, x.size))
+        by_x, own_slopes = np.zeros((TERMS * joints, x.size)), _link_slopes(x[: 10 * joints].reshape(joints, 10))
         for link in range(joints):
             own = slice(10 * link, 10 * link + 10)
-            by_x[TERMS * link : TERMS * link + 10, own] = _link_slopes(x[own])
+            by_x[TERMS * link : TERMS * link + 10, own] = own_slopes[link]
             by_x[TERMS * link + 10, 10 * joints + link] = np.exp(x[10 * joints + link])
         return np.concatenate((base.grouping @ by_x / floor[:, None], np.diag(PULL / scale)))
 
@@ -78,27 +78,26 @@ def nearest_links(base: BaseParameters, value: Array, std: Array, described: Arr
     return PhysicalLinks(table[:, :-1], table[:, -1], float(np.abs(misfit(found.x)).max()))
 
 
-def _link(x: Array) -> Array:
-    """Return a link's parameters (10,) for coordinates (10,): log diagonal of U, then the elements above it."""
-    U = np.diag(np.exp(x[:4]))
+def _links(x: Array) -> Array:
+    """Return links' parameters (links, 10) for coordinates (links, 10): log diagonal of U, then the elements above."""
+    U = np.zeros((len(x), 4, 4))
+    U[:, np.arange(4), np.arange(4)] = np.exp(x[:, :4])
     for k, (row, column) in enumerate(_UPPER):
         # The last column is scaled by the root of the mass, so that these coordinates are in metres.
-        U[row, column] = x[4 + k] * (U[3, 3] if column == 3 else 1.0)
-    pseudo = U @ U.T
-    second, moment, mass = pseudo[:3, :3], pseudo[:3, 3], pseudo[3, 3]
-    inertia = np.trace(second) * np.eye(3) - second
-    return np.array([mass, *moment, *inertia[np.triu_indices(3)]])
+        U[:, row, column] = x[:, 4 + k] * (U[:, 3, 3] if column == 3 else 1.0)
+    pseudo = U @ np.swapaxes(U, 1, 2)
+    second, moment, mass = pseudo[:, :3, :3], pseudo[:, :3, 3], pseudo[:, 3, 3]
+    inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
+    above = np.triu_indices(3)
+    return np.column_stack((mass, moment, inertia[:, above[0], above[1]]))
 
 
 def _link_slopes(x: Array) -> Array:
-    """Return the derivatives of `_link` with respect to its coordinates (10, 10)."""
-    columns = []
-    for k, step in enumerate(STEP * _scales()):
-        ahead, behind = x.copy(), x.copy()
-        ahead[k] += step
-        behind[k] -= step
-        columns.append((_link(ahead) - _link(behind)) / (2.0 * step))
-    return np.column_stack(columns)
+    """Return the derivatives of each link's parameters with respect to its coordinates (links, 10, 10)."""
+    step = STEP * _scales()
+    ahead, behind = (_links((x[:, None] + sign * np.diag(step)).reshape(-1, 10)) for sign in (1.0, -1.0))
+    changed = (ahead - behind).reshape(len(x), 10, 10) / (2.0 * step)[:, None]
+    return np.swapaxes(changed, 1, 2)
 
 
 def _coordinates(link: Array) -> Array:

@@ -41,7 +41,7 @@ def test_detecting_lines_are_odd_and_leave_one_in_four_out(joints: int) -> None:
         detecting_lines(1.0, (2.0, 4.5), 2, 1)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(st.integers(0, 1000), st.integers(4, 12))
 def test_spectrum_and_peak_are_as_asked(seed: int, count: int) -> None:
     lines = (tuple(range(1, 2 * count, 2)), tuple(range(2, 2 * count + 1, 2)))

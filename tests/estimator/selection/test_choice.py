@@ -47,18 +47,23 @@ def test_the_plain_model_is_kept_where_nothing_more_is_true(
 def test_friction_is_chosen_by_what_it_predicts(
     sticking_arm: Arm, sticking_period: SettledPeriod, recorded: Recorder, wave: Wave
 ) -> None:
-    other, elsewhere = recorded(sticking_arm, wave(2, (0.8, 0.42))), Elsewhere()
-    choice = choose([sticking_period], other, "lag")
-    again = choose([sticking_period], other, "lag", executor=elsewhere)
-    assert elsewhere.submitted >= 3
-    assert [each.model for each in again.trials] == [each.model for each in choice.trials]
-    assert (again.estimate.value == choice.estimate.value).all()
+    choice = choose([sticking_period], recorded(sticking_arm, wave(2, (0.8, 0.42))), "lag")
     assert choice.estimate.model == Model(2, "stribeck", "lag")
     assert worst(choice.estimate.parameters, sticking_arm) < 0.005
     assert choice.estimate.residual_steps.max() <= 0.30
     assert choice.chosen.held_out is not None and choice.chosen.held_out.max() < 0.001
     plain = identify(sticking_period, Model(2, "coulomb", "lag"), coarse=True)
     assert plain.residual_steps.max() > 3.0 * choice.estimate.residual_steps.max()
+
+
+def test_fits_made_elsewhere_give_the_same_choice(recorded: Recorder, wave: Wave) -> None:
+    arm, elsewhere = servo_arm(STICKING, joints=1), Elsewhere()
+    period, other = (recorded(arm, wave(seed, (0.4,), 5.0)) for seed in (1, 2))
+    choice = choose([period], other, "lag")
+    again = choose([period], other, "lag", executor=elsewhere)
+    assert elsewhere.submitted >= 3
+    assert [each.model for each in again.trials] == [each.model for each in choice.trials]
+    assert (again.estimate.value == choice.estimate.value).all()
 
 
 def test_friction_that_yields_before_it_slides_is_found_out(recorded: Recorder, wave: Wave) -> None:

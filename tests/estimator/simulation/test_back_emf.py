@@ -8,7 +8,7 @@ from hil.estimator.fit.simulated_run import SimulatedRun
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
 
-RATE, SAMPLES = 400.0, 1600
+RATE, SAMPLES = 400.0, 800
 TIME = np.arange(SAMPLES) / RATE
 INERTIA, GRAVITY, VISCOUS, GENERATED, WINDING = 0.006, 0.18, 0.02, 0.24, 1.8e-3
 ARM = {

@@ -17,22 +17,22 @@ from tests.fakes.conftest import Bench, FreeInertia
 
 Make = Callable[..., Any]
 
-THERMAL = Thermal(resistance_k_w=10.0, time_s=100.0, ambient_c=25.0)
+THERMAL = Thermal(resistance_k_w=10.0, time_s=20.0, ambient_c=25.0)
 
 
 def test_motor_current_warms_the_servo_until_it_shuts_down(make_bench: Make) -> None:
     bench = make_bench({"thermal": THERMAL, "temperature_c": 25.0})
     bench.arm(goal_ticks=500)  # 1.345 A in 5.2 ohm are 9.4 W: 94 K in the end
-    bench.wait(50.0)
+    bench.wait(10.0)
     servo = bench.servo()
     assert servo.temperature_c == pytest.approx(25 + 94.1 * (1 - 2.718281828**-0.5), abs=1.0)
     assert bench.read(1, 146, 1) == round(servo.temperature_c)
     assert servo.torque_enabled
-    bench.wait(60.0)
+    bench.wait(12.0)
     assert bench.servo().hardware_error == HardwareError.OVERHEATING
     assert not bench.servo().torque_enabled
     hot = bench.servo().temperature_c
-    bench.wait(100.0)
+    bench.wait(20.0)
     assert bench.servo().temperature_c == pytest.approx(25 + (hot - 25) * 2.718281828**-1, abs=5.0)
 
 
