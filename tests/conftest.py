@@ -12,6 +12,7 @@ import serial
 from threadpoolctl import threadpool_limits
 
 from hil.config.schema import Config, load_config
+from hil.dry_run import stopping_distance
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.runs.run_folder import RunFolder
@@ -99,6 +100,12 @@ def arm_file(tmp_path: Path) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture
+def few_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dry run simulates the stops of two arms instead of sixteen: they take most of its time and have own tests."""
+    monkeypatch.setattr(stopping_distance, "_ARMS", 2)
 
 
 @pytest.fixture
