@@ -14,10 +14,8 @@ per sample. The step is bounded so that no single reply decides, and the sum is 
 weighted by the time that it represents. The commanded current is any value between the last two goals,
 because a reply may be measured before or after the motor follows the latest goal.
 
-A servo whose readings are frozen while its joint stands still shows no deviation until the goal has moved far from the
-frozen current. But a current that is controlled never stays exactly the same while its goal changes: if all three
-readings do for `FROZEN_S`, and the goal has meanwhile changed by more than sigma, they are frozen. A current of zero
-does not count, since a sensor may have a dead zone there.
+A current never stays exactly the same while its goal changes: if all three readings do for `FROZEN_S`, and the goal has
+meanwhile changed by more than sigma, they are frozen, although the goal may not yet be far from the current.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
 that it keeps for a joint is a record of the type `MEMORY`.
@@ -93,7 +91,7 @@ def look(memory: Any, goal: float, carried: float, seconds: float, stands: bool)
     else:
         memory.carried, memory.same_since_goal, memory.same_for = carried, goal, 0.0
     changed = goal - memory.same_since_goal
-    if is_frozen(memory.same_for, carried) and changed * changed * memory.per_square > 0.5:
+    if memory.same_for >= FROZEN_S and changed * changed * memory.per_square > 0.5:
         return float(memory.same_for)
     former, memory.former_goal = memory.former_goal, goal
     low, high = min(goal, former), max(goal, former)
@@ -119,11 +117,4 @@ def look(memory: Any, goal: float, carried: float, seconds: float, stands: bool)
     return -1.0
 
 
-def is_frozen(same_for: float, carried: float) -> bool:
-    """Whether a current that has been the same for this time [s], with all other readings, should have changed."""
-    return same_for >= FROZEN_S and carried != 0.0
-
-
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
-is_frozen = _inner(is_frozen)
-look = _inner(look)
+look = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(look)  # type: ignore[call-overload]
