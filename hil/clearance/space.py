@@ -13,6 +13,7 @@ from hil.clearance.shapes import Shapes
 from hil.config.chain import described_arm
 from hil.config.schema import Config
 from hil.description.arm import ArmDescription
+from hil.description.motion import rotation_about
 from hil.description.urdf import rotation_of
 
 Array = NDArray[np.float64]
@@ -149,7 +150,7 @@ class Space:
         frames = [(np.eye(3), np.zeros(3))]
         for turn, shift, around, angle in zip(rotation, translation, axis, position, strict=True):
             former, origin = frames[-1]
-            frames.append((former @ turn @ _about(around, float(angle)), origin + former @ shift))
+            frames.append((former @ turn @ rotation_about(around, float(angle)), origin + former @ shift))
         link, ends, radius, _, _ = self._arrays
         placed = [each @ frames[at][0].T + frames[at][1] for at, each in zip(link, ends, strict=True)]
         return np.array(placed).reshape(-1, 2, 3), radius
@@ -297,11 +298,3 @@ def _touched(joints: int, link: NDArray[np.int64], contacts: NDArray[np.int64]) 
         ends = sorted((int(link[first]), int(link[second]) if second >= 0 else 0))
         touched[ends[0] : ends[1]] = True
     return touched
-
-
-def _about(axis: Array, angle: float) -> Array:
-    """Rotation matrix about an axis."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turned: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
-    return turned

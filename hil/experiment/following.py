@@ -108,7 +108,7 @@ def look(memory: Any, goal: float, carried: float, seconds: float, stands: bool)
     else:
         memory.carried, memory.same_since_goal, memory.same_for = carried, goal, 0.0
     changed = goal - memory.same_since_goal
-    if is_frozen(memory.same_for, carried) and changed * changed * memory.per_square > 2.0:
+    if memory.same_for >= FROZEN_S and carried != 0.0 and changed * changed * memory.per_square > 2.0:
         return float(memory.same_for)
     former, memory.former_goal = memory.former_goal, goal
     low, high = min(goal, former), max(goal, former)
@@ -137,11 +137,4 @@ def look(memory: Any, goal: float, carried: float, seconds: float, stands: bool)
     return -1.0
 
 
-def is_frozen(same_for: float, carried: float) -> bool:
-    """Whether a current that has been the same for this time [s], with all other readings, should have changed."""
-    return same_for >= FROZEN_S and carried != 0.0
-
-
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
-is_frozen = _inner(is_frozen)
-look = _inner(look)
+look = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(look)  # type: ignore[call-overload]

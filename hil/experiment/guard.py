@@ -428,8 +428,8 @@ class Guard:
                 f"Its goal register reads {held:.3f} {unit}, which matches what it carries: another program is "
                 "commanding it, or goals are being altered or lost in transit."
             )
-        same_for = float(self._joints[index]["following"]["same_for"])
-        if following.is_frozen(same_for, carried):
+        same_for = self._joints[index]["following"]["same_for"]
+        if carried and same_for >= following.FROZEN_S:
             return (
                 f"All its readings have been exactly the same for {1e3 * same_for:.0f} ms: they are frozen, or its "
                 "current is limited. Check the servo and whether a device between adapter and servo repeats replies."

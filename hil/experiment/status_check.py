@@ -38,7 +38,7 @@ _HELD_BEFORE = 4
 
 
 WHY_LOST = "Goals are being lost in transit, or the servo refuses them: check its cable and limits."
-"""Advice about lost goals where nothing that was heard explains them."""
+"""Advice if nothing that was heard explains lost goals."""
 
 
 class StatusCheck:
@@ -135,11 +135,13 @@ class StatusCheck:
         self._missed[joint] += 1
         if self._missed[joint] < _GOALS_MISSED and not is_repeated:
             return None
-        if former is not None and missed_at == self._cycles - 1 and self._is_late_by_one(joint, former, status.goal):
-            return Cause.STALE, (
-                "returns stale data: it holds the goal that it seemed to have missed one cycle before, so its replies "
-                "are a cycle late. Check the adapter, its latency and its cable."
-            )
+        if former is not None and missed_at == self._cycles - 1:
+            half = self._half_tick[joint]
+            if abs(status.goal - self._goals[-2][joint]) < half <= abs(status.goal - former):
+                return Cause.STALE, (
+                    "returns stale data: it holds the goal that it seemed to have missed one cycle before, so its "
+                    "replies are a cycle late. Check the adapter, its latency and its cable."
+                )
         unit = self._unit[joint]
         held = f"it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent"
         if self._is_foreign[joint] or is_repeated:
@@ -149,10 +151,6 @@ class StatusCheck:
                 "corrupted on the bus (check the adapter and the cable)."
             )
         return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {WHY_LOST}"
-
-    def _is_late_by_one(self, joint: int, former: float, held: float) -> bool:
-        """Whether a servo that held the goal `former` in the cycle before now holds the goal sent then."""
-        return abs(held - self._goals[-2][joint]) < self._half_tick[joint] <= abs(held - former)
 
     def _never_sent(self, joint: int, held: float) -> bool:
         """Whether the goal that is held differs from every goal sent to any joint since a status last matched.

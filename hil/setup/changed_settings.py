@@ -59,8 +59,8 @@ def settings_now(bus: ServoBus) -> Settings:
     """Read the settings that determine how servos move and what they report.
 
     Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
-    to an earlier request. If the two readings differ, the value is unknown and omitted. If even the ID read last is not
-    the servo's, replies are late, and a value that was read twice may be that of another register.
+    to an earlier request. If the two readings differ, the value is unknown and omitted. So are all values of a servo
+    whose ID is read wrongly: its replies are late, and equal values may be those of other registers.
     """
     found: dict[tuple[Joint, str], int] = {}
     for joint, servo in bus.drives.items():

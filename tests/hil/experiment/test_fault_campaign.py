@@ -113,6 +113,7 @@ TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
     [
         (Kind.PUSHED, "state", UNLIKE_ANY, JUMP),
         (Kind.WEAK, "state", NO_TORQUE, CONTRADICTION),
+        (Kind.HOMING_MOVED, "state", "Check whether another program is changing its settings.", TWICE),
         (Kind.LOWERED_LIMIT, "state", "its Current Limit is 236, but current_limit = 1.2 A needs 447", CONTRADICTION),
         (Kind.DEAF, "state", "does not accept goals: some are lost. Goals are being lost in transit.", CONTRADICTION),
         (Kind.GOAL_FIGHT, "state", "Another program is commanding it.", "stands still. Something is blocking it."),
