@@ -1,4 +1,4 @@
-"""The method of Zhu et al. on their own arm, which no other module needs: as printed, and by maximum likelihood on the same Fourier coefficients.
+"""The method of Zhu et al. on their own arm: as printed, and by maximum likelihood on the same Fourier coefficients.
 
 Zhu, Man, Cao, Zheng, Wang, "Parameter Estimation for Robotic Manipulator Systems", Machines 10 (2022) 392. Numbers in
 parentheses are its equations; docs/paper.md explains them and lists the misprints.
