@@ -142,7 +142,7 @@ class Goal:
         information = rows.T @ rows
         information[np.diag_indices_from(information)] += 1.0
         covariance = linalg.inv(information)[: self.base.count, : self.base.count]
-        wrong = np.einsum("jsa,ab,jsb->j", self._others, covariance, self._others)
+        wrong = np.sum(self._products * covariance, axis=(1, 2))
         return float(np.max(np.sqrt(wrong) / self._level))
 
     @property
@@ -202,8 +202,10 @@ class Goal:
         return level
 
     @cached_property
-    def _others(self) -> Array:
-        """Regressor for the other motions, in units of the prior's standard deviations (joints, samples, base
-        parameters).
+    def _products(self) -> Array:
+        """Regressor for the other motions, in units of the prior's standard deviations, multiplied by itself and summed
+        over the samples (joints, base parameters, base parameters).
         """
-        return self._motions * self.prior.std
+        others = self._motions * self.prior.std
+        products: Array = np.swapaxes(others, 1, 2) @ others
+        return products
