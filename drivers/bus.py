@@ -355,9 +355,9 @@ class ServoBus(TorqueSwitch):
 
     @property
     def commanded_by_another(self) -> str:
-        """Sentence on a value recently read back that this program did not write; "" if there is none.
+        """Sentence about a recently read-back value that this program did not write; "" if there is none.
 
-        One such value does not prove another master: a servo that misses writes holds an older goal.
+        One such value does not prove that there is another master: a servo that misses writes holds an older goal.
         """
         seen = self.prepared.sighted
         if seen is None:

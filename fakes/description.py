@@ -137,7 +137,7 @@ class FakeArm(Described):
     def _a_servo_for_each_joint(self) -> Self:
         ids = [servo.id for servo in self.servos]
         if sum(each is not None for each in (self.arm, self.chain, self.plant)) != 1:
-            raise ValueError('give exactly one of the table arm, the table chain and plant = "module:factory"')
+            raise ValueError('give exactly one of these: the table arm, the table chain, or plant = "module:factory"')
         count = max(self.joints) + 1
         if set(self.joints) != set(range(count)):
             moved = ", ".join(str(joint + 1) for joint in self.joints)

@@ -1,9 +1,8 @@
 """Checks of a servo's status registers: is torque on, is the watchdog armed, was the goal accepted, is the reply
 recent?
 
-None of this is visible in position and velocity, and it is visible in the current only if the servo has a motor current
-sensor. The registers are read back several times per 0.1 s (hil.drivers.bus), so each of these faults is detected
-within 0.1 s.
+None of this shows in position or velocity; it shows in the current only if the servo has a motor current sensor. The
+registers are read back several times per 0.1 s (hil.drivers.bus), so each of these faults is detected within 0.1 s.
 """
 
 from collections import deque
@@ -92,7 +91,7 @@ class StatusCheck:
         """
         if status.hardware_error and not (self._bears_errors and status.torque):
             error = describe_error(HardwareError(status.hardware_error))
-            return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then power-cycle it."
+            return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then power-cycle the servo."
         if status.torque is False:
             return Cause.TORQUE_OFF, (
                 "has lost its torque: Torque Enable reads 0 although this program switched it on. It was rebooted, its "

@@ -96,7 +96,7 @@ class Search:
         return with_stabiliser(self.config, self.belief, self.springs)
 
     def first_run(self) -> tuple[Config, Amplitude]:
-        """Configuration and amplitude of the first run, without running it. Raises NoSafeTorque."""
+        """Return the configuration and amplitude of the first run, but do not run it. Raises NoSafeTorque."""
         return self._pilot_amplitude(pilot_config(self.held, self.options), 0)
 
     def find(self) -> tuple[Config, Amplitude]:
