@@ -136,9 +136,8 @@ def test_the_run_folder_estimates_again_with_the_torque_that_was_found(in_steps:
 
 def test_an_inverted_arm_is_identified_with_a_stabiliser(tmp_path: Path) -> None:
     text = (CONFIGS / "fake_inverted.toml").read_text(encoding="utf-8")
-    (tmp_path / "arm.toml").write_text(
-        replaced(text, ("rate = 400.0 ", "rate = 200.0 "), ("period = 10.0 ", "period = 6.0 ")), encoding="utf-8"
-    )
+    text = replaced(text, ("rate = 400.0 ", "rate = 200.0 "), ("period = 10.0 ", "period = 6.0 "))
+    (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
     config = load_config(tmp_path / "arm.toml")
     run = RunFolder.create(tmp_path / "run", config)
     run_experiment(config, run, config.path, lambda _: None)
