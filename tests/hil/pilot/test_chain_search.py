@@ -488,7 +488,7 @@ def test_a_search_that_has_simulated_enough_tries_the_least_amplitude_only(monke
 
 
 def test_a_search_is_bounded_and_a_refusal_says_that_it_ended_early(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = chain_config(leg())
+    config = chain_config(leg(("rate = 100.0", "rate = 400.0")))  # so fast that no higher rate is advised
     said: list[str] = []
     search = search_of(config, ChainBelief.prior(config), said)
     monkeypatch.setattr(search, "_largest", lambda *_: (None, "shank hits floor", 0.0))
