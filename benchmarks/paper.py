@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.machine import machine
-from hil.estimator.baselines.paper import (
+from benchmarks.paper_equations import (
     AMPLITUDES,
     FUNDAMENTAL,
     NOISE,

@@ -19,6 +19,7 @@ from hil.drivers.preparation.prepare import (
     overruled,
     prepare_servo,
 )
+from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, VOLTAGE_UNIT, Mode, with_article
 from hil.drivers.state import NAN, SETTINGS, Converter, State, fold, read_back_spans, spans
@@ -39,12 +40,11 @@ class BusConfig:
     url: device or pyserial URL.
     one_write: send Sync Write and group read in one write; False if `hil check` finds that an arm needs two.
     fast_sync_read: use Fast Sync Read if the firmware of every servo supports it.
-    slow_every: number of samples between two slow reads, which alternately read the servo clock (Realtime Tick) and
-    voltage and temperature.
+    slow_every: number of samples between two slow reads, which alternate between the servo clock (Realtime Tick) and
+    voltage plus temperature.
     watchdog_required: reject firmware without Bus Watchdog.
-    take_over: what to do if torque is already on: if true, let the arm sink slowly and cut torque; if false, refuse to
-    start.
-    interval: time between two samples [s]; 0 without a fixed rate, in which case the servos' status is not read.
+    take_over: if torque is already on, let the arm sink slowly and cut torque instead of refusing to start.
+    interval: time between two samples [s]; 0 if the rate is not fixed, in which case the servos' status is not read.
     """
 
     url: str
@@ -190,16 +190,22 @@ class ServoBus(TorqueSwitch):
         if self.config.take_over:
             let_sink(self._servos, self.port.clock)
         refuse_held(self._servos)
+        for servo in self._servos.values():
+            if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED and servo.read("Torque Enable"):
+                servo.write("Torque Enable", 0)  # so that any torque found from now on is another program's
 
     def prepare(self) -> None:
         """Set every servo's mode with torque off, and prepare the exchange.
 
-        Raises ServoFault, BusShared if another master is heard, and WrongSetting if a register rules out an experiment
-        and only the user may change it.
+        Torque must have been found off (`release_held`). Raises ServoFault, BusShared if another master is heard or
+        has switched torque on since, and WrongSetting if a register rules out an experiment and only the user may
+        change it.
         """
         check_quiet(self.port)
         ids = {drive.id for drive in self._drives}
         for joint, servo in self._servos.items():
+            if servo.read("Torque Enable"):
+                self.refuse_switched_on()
             prepare_servo(joint, servo, ids - {joint.id})
         self._measured = tuple(
             joint.within_turn(servo.read("Present Position")) for joint, servo in self._servos.items()
@@ -263,6 +269,7 @@ class ServoBus(TorqueSwitch):
             status_every=status_every,
             interval=self.config.interval / every,
             patience=patience,
+            beside=read_back_spans(modes, tables),
         )
 
     @property
@@ -348,9 +355,9 @@ class ServoBus(TorqueSwitch):
 
     @property
     def commanded_by_another(self) -> str:
-        """Sentence on a servo that held a value not written by this program when last read back; "" if there is none.
+        """Sentence about a recently read-back value that this program did not write; "" if there is none.
 
-        One such value does not prove another master: a servo that misses writes holds an older goal.
+        One such value does not prove that there is another master: a servo that misses writes holds an older goal.
         """
         seen = self.prepared.sighted
         if seen is None:
@@ -371,7 +378,7 @@ class ServoBus(TorqueSwitch):
         self.prepared.read_status_next()
 
     def check_alerts(self, state: State) -> None:
-        """Read the hardware error of every servo with its alert bit set; raises ServoFault, which names all of them."""
+        """Read the hardware error of every servo whose alert bit is set; raises one ServoFault for all of them."""
         raised = [joint for joint, error in zip(self.joints, state.error, strict=True) if error & ALERT]
         faults = [text for joint in raised if (text := self._faults(joint))]
         if faults:

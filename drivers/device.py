@@ -58,9 +58,9 @@ def true_baud(descriptor: int) -> int | None:
 
 
 def adapter_name(device: str, sysfs: Path = _SYSFS) -> str:
-    """Return a persistent name for a device's USB adapter, unchanged if it is replugged as a different device.
+    """Return a persistent name for a device's USB adapter: replugging may change the device, but not this name.
 
-    Returns "" if the adapter has no serial number, or shares it with another adapter that is plugged in.
+    Returns "" if the adapter has no serial number, or if another adapter that is plugged in has the same one.
     """
     if "://" in device:
         return ""

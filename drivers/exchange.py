@@ -44,12 +44,6 @@ AFTER_LOSS = 5
 many cycles late is recognised by its length.
 """
 
-_AGAIN_SHARE = 0.5
-_SHORT_CYCLE_S = 0.005
-"""In cycles of up to `_SHORT_CYCLE_S` [s], a lost read-back is repeated at once, which may delay the next cycle by the
-fraction `_AGAIN_SHARE` of its length. In longer ones, read-backs are rarely lost, and a delay leaves joints unobserved.
-"""
-
 _LONGEST_REPLY = 1024
 _DOUBTS = 3
 
@@ -86,6 +80,7 @@ class Exchange:
     status_every: number of cycles between two status reads; there are none if `status` is None.
     interval: time between two cycles [s], 0 if unknown; a slow cycle can wait longer for a reply than a fast one.
     patience: minimum time to wait for replies [s]; by default the longest time that wire, servos and adapter may need.
+    beside: registers that are read back between cycles; a late reply to such a read is recognised by its length, too.
     """
 
     def __init__(
@@ -103,6 +98,7 @@ class Exchange:
         status_every: int = 20,
         interval: float = 0.0,
         patience: float = 0.0,
+        beside: Sequence[Span | Sequence[Span]] = (),
     ) -> None:
         goals = (goal,) * len(ids) if isinstance(goal, Register) else tuple(goal)
         for register in goals:
@@ -123,7 +119,7 @@ class Exchange:
         self._write = self._writes[0] if len(self._writes) == 1 else None
         every = [*spans] if status is None else [*spans, status]
         self._kinds = len(every)
-        every += _of_other_lengths(every, len(self.ids))
+        every += _of_other_lengths(every, beside, len(self.ids))
         reads: list[GroupRead] = [(FastSyncRead if fast else SyncRead)(self.ids, span) for span in every]
         self.heard = Heard(self.ids, reads)
         least = max(patience, min(PATIENCE_SHARE * interval, MOST_PATIENCE_S))
@@ -153,10 +149,7 @@ class Exchange:
         """Duration of the latest cycle [s]."""
         self._usual = self._latest_plan = self._plans[0]
         self._read_back: ReadBack | None = None
-        self._longest_again = _AGAIN_SHARE * interval if interval <= _SHORT_CYCLE_S else 0.0
-        self._asked_again_at = -math.inf
-        self._damaged = False
-        """Whether anything arrived in reply to the latest read-back."""
+        self._interval = interval
         self.awaited_until = -math.inf
         """Reply deadline of the latest repeated read-back, which may delay the next cycle [s on the port's clock]."""
         self.read_back_at = math.inf
@@ -211,7 +204,7 @@ class Exchange:
 
         goal: spans that end with the goal. mode: spans that end with the settings, whose values are `modes`.
         """
-        back = self._read_back = ReadBack(self.ids, goal, mode, modes, fast=self.fast)
+        back = self._read_back = ReadBack(self.ids, goal, mode, modes, interval=self._interval, fast=self.fast)
         self._wire_s |= {read: self._port.wire_time(self._bytes(read)) for read in back.reads}
         self.heard.expect(back.reads)
         self.read_back_at = -math.inf
@@ -277,18 +270,13 @@ class Exchange:
         if before + takes > due:  # woken up late
             self.read_back_at = before + TRY_AGAIN_S
             return None
-        servos = self._ask_back(read, before, due - before)
+        servos, has_answer = self._ask_back(read, before, due - before)
         now = self._now()
         # Where nothing at all arrived, the reply may be late, and another one would be mistaken for it.
-        if (
-            None in servos
-            and self._damaged
-            and takes < self._longest_again
-            and now > self._asked_again_at + TRY_AGAIN_S
-        ):
+        if None in servos and has_answer and back.may_repeat(now, takes):
             # The packet of another master may have destroyed the reply, and the next cycle overwrites what it wrote.
-            self._asked_again_at, self.awaited_until = now, now + takes + self._wire_s[read]
-            servos = self._ask_back(read, now, self.awaited_until - now)
+            self.awaited_until = now + takes + self._wire_s[read]
+            servos, _ = self._ask_back(read, now, self.awaited_until - now)
         self.read_back_at = now
         if None in servos:
             self._expect_late()
@@ -301,8 +289,8 @@ class Exchange:
             self.read_status_next()  # it distinguishes lost goals from another master's
         return found
 
-    def _ask_back(self, read: GroupRead, start: float, timeout: float) -> list[Answer]:
-        """Send the read at `start` [s]; return the answers that arrive within `timeout` [s]."""
+    def _ask_back(self, read: GroupRead, start: float, timeout: float) -> tuple[list[Answer], bool]:
+        """Send the read at `start` [s]; return the answers that arrive in `timeout` [s], and whether anything did."""
         port = self._port
         expected = port.reply_time(timeout, len(read.request))
         if self._echoes:
@@ -312,13 +300,13 @@ class Exchange:
             received = port.ask(read.request, read.reply_size, expected, start)
         if port.overheard:
             self._overhear()
-        self._damaged = bool(received)
+        self.heard.latest = received
         servos = read.unpack(received)
         if servos is None:
             # A master that writes between two cycles is heard here, and nowhere else if the next reply is complete.
             servos = read.search(received)[0]
             self.heard.beside(received, echoes=self._echoes)
-        return servos
+        return servos, bool(received)
 
     def cycle(self, goal_ticks: Sequence[int], *, between: bool = False) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.
@@ -352,6 +340,7 @@ class Exchange:
             received = self._ask_otherwise(sent, plan, before)
         if port.overheard:
             self._overhear()
+        self.heard.latest = received
         servos = read.unpack(received)
         after = self._now()
         took = after - before
@@ -382,9 +371,9 @@ class Exchange:
     def _latest(self, read: GroupRead, servos: list[Answer], deadline: float) -> list[Answer]:
         """Handle replies that arrive sooner than the wire time allows: they may belong to an earlier request.
 
-        A duplicated reply is still in the input when the next request is sent; from then on every reply would be one
-        cycle old. If the true reply follows, it is used. If none follows, the port is not a real serial line (a pty),
-        and after a few such cases the check is switched off.
+        A duplicated reply is still in the input when the next request is sent; if it were used, every later reply
+        would be one cycle old. If the true reply follows, that one is used. If none follows, the port is not a real
+        serial line but, say, a pty, and after a few such cases the check is switched off.
         """
         received = self._port.read(read.reply_size, max(0.0, deadline - self._now()))
         if not received:
@@ -410,7 +399,7 @@ class Exchange:
         return span
 
     def _search(self, read: GroupRead, received: bytes, deadline: float) -> list[Answer]:
-        """Extract the answers, some perhaps stuffed, damaged or missing; read until all have arrived or time is up."""
+        """Extract the answers, which may be stuffed, damaged or missing; read until all have arrived or time is up."""
         while True:
             answers, over = read.search(received)
             remaining = deadline - self._now()
@@ -433,7 +422,7 @@ class Exchange:
         self._port.overheard = b""
 
     def _ask_otherwise(self, sent: bytes, plan: "_Plan", start: float) -> bytes:
-        """Return the reply, without an echo, when two writes are needed or the adapter echoes what is sent."""
+        """Return the reply without an echo; used if two writes are needed or the adapter echoes what is sent."""
         port, read = self._port, plan.read
         count = read.reply_size + (len(sent) if self._echoes else 0)
         if self.one_write:
@@ -472,9 +461,9 @@ class _Plan:
     """One of the group reads of an exchange.
 
     span: the span that a Reply reports. reply_time: how long to wait for the replies. pack_behind: packs the goals' CRC
-    and the request. wire_s: wire time of goals, request and replies [s]. soonest: time after the start of a cycle
-    before which a complete reply may belong to an earlier request [s]. is_after_loss: whether a late reply may be on
-    the wire when this read is sent, and destroy the goals.
+    and the request. wire_s: wire time of goals, request and replies [s]. soonest: a complete reply
+    that arrives sooner than this after the start of a cycle may belong to an earlier request [s]. is_after_loss:
+    whether a late reply may be on the wire when this read is sent, and may destroy the goals.
     """
 
     read: GroupRead
@@ -509,9 +498,11 @@ class _GoalWrite:
         return packet + _pack_crc(_crc(packet))
 
 
-def _of_other_lengths(spans: Sequence[Span | Sequence[Span]], servos: int) -> list[tuple[Span, ...]]:
+def _of_other_lengths(
+    spans: Sequence[Span | Sequence[Span]], beside: Sequence[Span | Sequence[Span]], servos: int
+) -> list[tuple[Span, ...]]:
     """Return variants of the usual span with extra leading bytes, such that no two spans have the same length."""
-    taken = {one_each(span, servos)[0].size for span in spans}
+    taken = {one_each(span, servos)[0].size for span in (*spans, *beside)}
     usual = one_each(spans[0], servos)
     lengths = [size for size in range(usual[0].size + 1, usual[0].size + AFTER_LOSS + len(taken)) if size not in taken]
     return [tuple(each.longer(size - each.size) for each in usual) for size in lengths[:AFTER_LOSS]]

@@ -26,7 +26,7 @@ class Joint:
 
     direction: +1 or -1, the joint's sense of rotation relative to the servo's.
     zero_ticks: Present Position at joint angle zero.
-    mode: kind of goal, a current [A] or a voltage [V]. Raises ValueError for current mode if the servo has none.
+    mode: kind of goal, a current [A] or a voltage [V]. Raises ValueError if the servo does not support this mode.
     near: approximate joint angle when the bus is opened [rad], which selects the turn; None to use Present Position
     unchanged.
     seconds: additional servos of the same model on this joint. A goal is divided equally among all servos; the measured

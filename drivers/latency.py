@@ -1,8 +1,8 @@
 """The USB adapter's latency timer: how long the adapter may hold back a reply.
 
 FTDI adapters (including the U2D2) buffer received data until 62 bytes have arrived or a timer has expired. The factory
-setting of 16 ms limits the control cycle to 60 Hz. On Linux the timer is a file of the tty in sysfs, writable by root
-only; the port's "low latency" flag also sets it to 1 ms, and any user of the port may set that flag.
+setting of 16 ms limits the control cycle to 60 Hz. On Linux the timer is set in a sysfs file of the tty that only root
+may write; the port's "low latency" flag also sets it to 1 ms, and any user of the port may set that flag.
 """
 
 from pathlib import Path

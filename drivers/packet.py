@@ -151,7 +151,7 @@ class Framer:
 
     @property
     def pending(self) -> int:
-        """Number of received bytes neither returned in a packet nor dropped as noise yet."""
+        """Number of received bytes not yet returned in a packet or dropped as noise."""
         return len(self._buffer)
 
     def reset(self) -> None:

@@ -56,7 +56,7 @@ _ALWAYS = 1 << 62
 
 _EARLY_BITS = 9.0
 """Assumed number of bits per transmitted byte. A reply counts as early if it arrives before the request can have been
-transmitted at this number of bits. The true number is ten; the difference allows for inaccurate baud rates.
+transmitted with this many bits per byte. The true number is ten; the difference allows for inaccurate baud rates.
 """
 
 _BAUD_TOLERANCE = 0.03
@@ -124,8 +124,8 @@ class ReplyTime(NamedTuple):
 class Port:
     """An open serial port. Every method but `close` raises PortLost when the device fails.
 
-    After PortLost, methods may be called again; they fail until `reopen` succeeds. `latency` is the longest time the
-    adapter may hold back a reply [s].
+    After PortLost, methods may be called again; they fail until `reopen` succeeds. `latency` is the longest time
+    that the adapter may hold back a reply [s].
     """
 
     def __init__(self, url: str, baud: int, opened: Any) -> None:
@@ -137,9 +137,11 @@ class Port:
         self.echoes = False
         """Whether the adapter echoes what it sends; detected during set-up."""
         self.overheard = b""
-        """Bytes pending before a request, which `ask` keeps apart from its reply: late replies, or replies to another
-        master.
+        """Bytes that `ask` found pending before a request and kept apart from the reply: late replies, or replies to
+        another master.
         """
+        self.strangers = 0
+        """Number of instructions of another master received during set-up work, since the count was last reset."""
         self._serial = opened
         self._timeout: float | None = opened.timeout
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()
@@ -193,8 +195,8 @@ class Port:
     def ask(self, data: bytes, count: int, expected: ReplyTime, start: float) -> bytes:
         """Write at `start` [s, on the port's clock], then read until the timeout, as the control cycle does.
 
-        Pending input is set aside first: otherwise a duplicated or late reply would be taken for this one, and every
-        later reply would be one cycle late.
+        Pending input is set aside first: otherwise a duplicated or late reply would be taken for the reply to this
+        request, and every later reply would be one cycle late.
         """
         if self.has_input():
             self.put_aside()
@@ -376,7 +378,7 @@ class DescriptorPort(Port):
             raise self._lost(error) from error
 
     def _ask_on(self, received: bytes, count: int, deadline: float, looks: int) -> bytes:
-        """Read the rest of a reply that is still incomplete after waiting for whole milliseconds."""
+        """Read the rest of a reply that is still incomplete after a wait of whole milliseconds."""
         received = self._read_on(received, count, deadline)
         self._looks = max(0, looks - 1) if len(received) == count else max(looks, _LOOKS_AFTER_LOSS)
         return received
@@ -403,7 +405,10 @@ class DescriptorPort(Port):
             raise
 
     def put_aside(self) -> None:
-        self.overheard = os.read(self._descriptor, _MOST_OVERHEARD)
+        try:
+            self.overheard = os.read(self._descriptor, _MOST_OVERHEARD)
+        except OSError as error:
+            raise self._lost(error) from error
         self.discard_input()
 
     def discard_input(self) -> None:
@@ -469,9 +474,15 @@ def _advice(error: BaseException, url: str) -> str:
     if "Permission denied" in text:
         return "Add yourself to the port's group (`sudo usermod -aG dialout $USER`), then log out and in again."
     if "exclusively lock" in text or "busy" in text:
-        return "Another program has it open; close it first. ModemManager holds new ports open for half a minute."
+        return (
+            "Another program has it open; close that program first. ModemManager holds new ports open for half a "
+            "minute."
+        )
     if "No such file" in text and "://" in url:
-        return "The file in this URL does not exist; a relative path is resolved from the file or folder that names it."
+        return (
+            "The file in this URL does not exist. A relative path in a configuration starts at that file's folder, any "
+            "other at the working directory."
+        )
     if "No such file" in text:
         return "Is the adapter plugged in? `hil scan` lists the ports that exist."
     if "ioctl" in text:

@@ -4,7 +4,7 @@ finds a reply despite preceding noise.
 
 from dynamixel_sdk import COMM_RX_CORRUPT, COMM_RX_TIMEOUT, COMM_SUCCESS, Protocol2PacketHandler
 
-from hil.drivers.packet import HEADER, MAX_LENGTH, NO_ID, Instruction, crc, unstuff
+from hil.drivers.packet import HEADER, MAX_LENGTH, NO_ID, Framer, Instruction, crc, unstuff
 from hil.drivers.port import Port
 
 PATIENCE_S = 0.018
@@ -45,8 +45,16 @@ class SdkPort:
         return self._port.baud
 
     def clearPort(self) -> None:  # noqa: N802
-        self._held = b""
-        self._port.discard_input()
+        self._held, port = b"", self._port
+        if port.has_input():
+            port.put_aside()
+            self.hear(port.overheard)
+            port.overheard = b""
+
+    def hear(self, received: bytes) -> None:
+        """Count the instructions of another master among bytes received before a request or before its reply."""
+        if received and not self._port.echoes:
+            self._port.strangers += sum(not packet.is_status for packet in Framer().feed(received))
 
     def writePort(self, packet: list[int]) -> int:  # noqa: N802
         self._sent, self._held = bytes(packet), b""
@@ -98,20 +106,22 @@ class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
         while True:
             packet, missing = _first_status(received)
             if packet:
+                port.hear(received.partition(packet)[0])
                 payload = unstuff(packet[_BEFORE_LENGTH:-2])  # the SDK's own removeStuffing gets some data wrong
                 size = (len(payload) + 2).to_bytes(2, "little")
                 return [*packet[: _BEFORE_LENGTH - 2], *size, *payload, *packet[-2:]], COMM_SUCCESS
             more = port.readPort(missing)
             received += more
             if not more and port.isPacketTimeout():
+                port.hear(received)
                 return list(received), COMM_RX_CORRUPT if received else COMM_RX_TIMEOUT
 
 
 def _first_status(received: bytes) -> tuple[bytes, int]:
     """Return the first intact status packet among the received bytes, and 0.
 
-    If there is none, return b"" and the number of bytes to read next, which never exceeds the rest of the packet that
-    has begun, so that the next one stays whole.
+    If there is none, return b"" and the number of bytes to read next: at most the rest of the packet that has begun, so
+    that the next packet stays whole.
     """
     missing = _SHORTEST - next(size for size in range(len(HEADER) - 1, -1, -1) if received.endswith(HEADER[:size]))
     at = received.find(HEADER)

@@ -101,7 +101,7 @@ class Servo:
         """Write a register and read it back. Raises the same errors as `read`, and ServoRefused if another value is
         read back.
 
-        attempts: maximum number of attempts at the write, and then at the read; by default, as in all set-up work.
+        attempts: maximum number of attempts at the write, and then at the read; the default is that of all set-up work.
         """
         self._write_and_read_back(register, value, attempts, despite_error=False)
 
@@ -181,8 +181,8 @@ class Servo:
             text = self._sdk.getTxRxResult(result).removeprefix("[TxRxResult] ").rstrip("!. ").lower()
             raise WrongReply(
                 f"{self.title}: {what} failed: the reply is corrupted or does not match the request ({text}). Check "
-                f"its cable and supply, and for a second servo with ID {self.id}. Replies may also have come too late "
-                "because other programs keep this computer busy; if so, close them and try again."
+                f"its cable and supply, and look for a second servo with ID {self.id}. Replies may also have come too "
+                "late because other programs keep this computer busy; if so, close them and try again."
             )
         refused = error & ~ALERT
         if refused:

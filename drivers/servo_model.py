@@ -46,7 +46,7 @@ FULL_PWM_TICKS = 885
 
 LEAST_SUPPLY = 0.6
 """A voltage across a motor counts as the full supply voltage if it is at least this fraction of the lowest published
-one: supplies sag, and resistance and no-load speed differ by tens of percent from servo to servo.
+supply voltage: supplies sag, and resistance and no-load speed differ by tens of percent from servo to servo.
 """
 
 LEAST_OF_MEASURED = 0.75
@@ -91,7 +91,7 @@ class Published(NamedTuple):
     """A published torque constant: the median, lowest and highest of the figures.
 
     It is uncertain even where the figures agree: the stall torque is a servo's peak torque, friction included, and an
-    individual servo can differ from it by tens of percent. If it matters, measure the constant with a known weight.
+    individual servo's can differ by tens of percent. If it matters, measure the constant with a known weight.
     """
 
     value: float

@@ -22,9 +22,9 @@ class Turns:
         self._status_every = self._until_status = status_every
         self._slow = 0
         self.usual = 0
-        """Number of planned cycles with the usual span not yet counted."""
+        """Number of planned cycles with the usual span that are not yet counted."""
         self.between = 0
-        """Number of cycles between two samples not yet counted."""
+        """Number of cycles between two samples that are not yet counted."""
 
     def count(self, left: int) -> None:
         """Count the cycles run so far. left: number of planned cycles not yet run (-1: one more was run)."""
@@ -56,6 +56,6 @@ class Turns:
             self._until_status = min(self._until_status, 1)
 
     def plan(self) -> int:
-        """Return the minimum number of cycles needed to read the usual span; cycles between samples may increase it."""
+        """Return the minimum number of cycles before another span is due; cycles between samples may increase it."""
         self.usual = max(0, min(self._until_slow, self._until_status) - 1)
         return self.usual

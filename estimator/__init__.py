@@ -1,1 +1,1 @@
-"""Mathematics without input or output: excitation, arm models, Fourier analysis, estimators, uncertainty."""
+"""Pure computation, without input or output: excitation, arm models, Fourier analysis, estimators, uncertainty."""

@@ -32,8 +32,8 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
 def only_version(dispatcher: Any) -> Any:
     """Return the machine code of a compiled function that has been called with arguments of one set of types.
 
-    Calling it skips the lookup of the argument types, which takes 0.1 us per array, as long as a small loop itself. Use
-    it only where the arguments' types never change. Without a compiler (NUMBA_DISABLE_JIT), and if there are several
+    Calling it skips the lookup of the argument types, which takes 0.1 us per array, as long as a small loop. Use it
+    only where the arguments' types never change. Without a compiler (NUMBA_DISABLE_JIT), and if there are several
     versions, the function is returned unchanged.
     """
     versions = list(getattr(dispatcher, "overloads", {}).values())
@@ -84,7 +84,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
 
 
 def _used(function: FunctionType) -> Iterator[tuple[str, Any]]:
-    """Yield the names and values of the globals and attributes of the package's modules that the function may use.
+    """Yield the names and values of the package's globals and module attributes that the function may use.
 
     Libraries are left out: numba's cache depends on its version, and it implements numpy's functions itself.
     """

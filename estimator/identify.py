@@ -45,7 +45,7 @@ class Estimate(FittedParameters):
     outliers: int = 0
     """Number of samples excluded or downweighted because they are far from their neighbours or from the model."""
     correlation_time: float = 1.0
-    """Number of samples over which the residual is correlated; 1 for white noise. `covariance` takes it into account.
+    """Number of samples over which the residual is correlated; 1 for white noise. `covariance` takes this into account.
     """
     at_bound: tuple[str, ...] = ()
     """Parameters at a bound although the data favour values beyond it; empty unless this affects base parameters."""

@@ -250,8 +250,6 @@ class SelectionOptions:
 
     keep_ratio: float = 0.98
     """A richer model is kept only if its error is below this fraction of the error of the best model so far."""
-    explained_error: float = 1.05
-    """RMS prediction error in units of the noise below which no further term is tried."""
     explained_residual: float = 1.02
     """RMS residual in units of the noise below which no further term is tried."""
     near_residual: float = 5.0

@@ -5,7 +5,7 @@ from collections.abc import Callable
 __all__ = ["Tell", "counted"]
 
 Tell = Callable[[int, int], None]
-"""Called with the number of steps done and their total."""
+"""Called with the number of steps done and the total."""
 
 
 def counted(tell: Tell | None, total: int) -> Callable[[], None]:

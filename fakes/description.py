@@ -137,7 +137,7 @@ class FakeArm(Described):
     def _a_servo_for_each_joint(self) -> Self:
         ids = [servo.id for servo in self.servos]
         if sum(each is not None for each in (self.arm, self.chain, self.plant)) != 1:
-            raise ValueError('give exactly one of the table arm, the table chain and plant = "module:factory"')
+            raise ValueError('give exactly one of these: the table arm, the table chain, or plant = "module:factory"')
         count = max(self.joints) + 1
         if set(self.joints) != set(range(count)):
             moved = ", ".join(str(joint + 1) for joint in self.joints)
@@ -192,8 +192,8 @@ def beside(values: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def found_beside(folder: Path, name: str) -> Path:
-    """Return the file that a TOML file in `folder` refers to as `name`, or its namesake in `folder` if it does not
-    exist.
+    """Return the file that a TOML file in `folder` refers to as `name` or, if that does not exist, its namesake in
+    `folder`.
     """
     named = folder / name
     return named if named.is_file() else named if not (folder / named.name).is_file() else folder / named.name

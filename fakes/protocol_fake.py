@@ -189,7 +189,7 @@ class FakeSerial(SerialBase):
 def open_fake(
     description: FakeArm, clock: Clock | None = None, *, baud: int = 1_000_000, timeout_s: float | None = 0.1
 ) -> FakeSerial:
-    """Return an open port to the described arm, with `clock` as its time (by default a new `VirtualClock`)."""
+    """Return an open port to the described arm, which runs on `clock` (by default a new `VirtualClock`)."""
     port = FakeSerial(None, description=description, clock=clock, baudrate=baud, timeout=timeout_s)
     port.open()
     return port

@@ -246,7 +246,7 @@ def _baud_of(master: int) -> int:
 
 
 def _wake_up_in_time() -> None:
-    """Request timers with microsecond resolution and real-time scheduling from Linux, for the serving thread.
+    """Ask Linux for microsecond timers and real-time scheduling of the serving thread.
 
     Without them, each wait ends about 50 us late, and on a busy computer the servos would fall silent for many
     milliseconds, unlike real ones.

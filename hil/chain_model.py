@@ -19,7 +19,7 @@ _INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2)
 class Geometry:
     """Joint geometry, for all joints in order.
 
-    rotation, translation: pose of the joint's frame relative to the previous link's frame at angle zero: (joints, 3, 3)
+    rotation, translation: pose of the joint's frame relative to the previous link's frame at angle zero, (joints, 3, 3)
     and (joints, 3) [m]. axis: joint axis in its own frame (joints, 3). gravity: gravity in the frame of the base as
     configured, before any identified tilt (3,) [m/s^2].
     """

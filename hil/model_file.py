@@ -66,7 +66,7 @@ def _no_result(folder: Path) -> str:
 
 
 def read_result(path: Path) -> Result:
-    """Read the result of a run folder or of a result.json. Raises ResultError."""
+    """Read the result in a run folder or a result.json. Raises ResultError."""
     try:
         return result_from_json(_read(path))
     except FormError as error:
@@ -163,7 +163,7 @@ def _check_terms(values: dict[str, float], joints: int, path: Path) -> None:
         raise ResultError(f"{path} is damaged: it lacks {', '.join(missing)}. Run hil estimate again.")
     if unknown:
         raise ResultError(
-            f"{path} has {', '.join(unknown)}, which this version of hil does not know; it was written by a newer one."
+            f"{path} has {', '.join(unknown)}, which this version of hil does not know; a newer one wrote this file."
         )
     bad = [name for name, value in values.items() if not math.isfinite(value)]
     if bad:

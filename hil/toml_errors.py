@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from hil.unit_hints import allowed_by, in_other_units, unit_of
 
 UNSAID = "~"
-"""Prefix of alternatives that pydantic adds to a location although they do not appear in the file."""
+"""Prefix of the alternatives' names that pydantic adds to a location although the file does not contain them."""
 
 _EXPECTED = {
     "float_type": "must be a number",
@@ -199,7 +199,9 @@ def _meant(value: object, expected: str) -> str:
 
 
 def meant_name(given: str, names: Sequence[str]) -> str:
-    """Return the intended name: the same except for case, spaces and dashes, or the most similar one; "" if none is."""
+    """Return the intended name: the same except for case, spaces and dashes, or the most similar one; "" if none is
+    similar.
+    """
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
     near = difflib.get_close_matches(re.sub(r"[^a-z0-9]", "", given.lower()), list(plain), n=1, cutoff=0.75)
     return plain[near[0]] if near else ""

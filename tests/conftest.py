@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.spatial.remembered import remembered
 from hil.config.schema import Config, load_config
+from hil.dry_run import stopping_distance
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
 from hil.plan import chain_plan, plan
@@ -110,6 +111,12 @@ def arm_file(tmp_path: Path) -> Callable[..., Path]:
         return path
 
     return write
+
+
+@pytest.fixture
+def few_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dry run simulates the stops of two arms instead of sixteen: they take most of its time and have own tests."""
+    monkeypatch.setattr(stopping_distance, "_ARMS", 2)
 
 
 @pytest.fixture

@@ -123,7 +123,7 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.FACTORY_RESET: frozenset({SILENCE, REBOOT, TORQUE}),
     Kind.SHADOWED: _OTHER_GOALS,
     Kind.THROTTLED: _BY_MOTOR,
-    Kind.HOMING_MOVED: _FORGED | {LIMIT, POSE, SETTING},
+    Kind.HOMING_MOVED: _FORGED | {LIMIT, POSE, SETTING, STRANGER},  # only another program writes it
     Kind.SLIP: _BY_HAND,
     Kind.OBSTACLE: _BY_HAND,
     Kind.SNAG: _BY_HAND,

@@ -26,10 +26,10 @@ from benchmarks.fault_campaign.attack import (
 )
 from benchmarks.fault_campaign.draw import HARMLESS, SHIFTED, UNHEARD, WORDS, Drawn, causes_of
 from benchmarks.fault_campaign.middle import Traffic
-from benchmarks.fault_campaign.twin import Heard, has_healthy_twin
+from benchmarks.fault_campaign.twin import Heard, has_healthy_twin, may_be_wired_otherwise
 from benchmarks.fault_campaign.witness import STEP_S
 from hil.config.schema import Config
-from hil.drivers.packet import Framer, Packet
+from hil.drivers.packet import Framer, Instruction, Packet
 from hil.fakes.bus.faults import FaultKind
 
 BOUND_MS = 100.0
@@ -65,6 +65,10 @@ DRIVES_MS = 15
 DRIVES_SHARE, DRIVES_TICKS, DRIVES_S = 1.2, 5, 0.01
 """Ratio to the largest goal of the undisturbed run, and smallest change of a position that counts as a visible motion
 [ticks], within this time [s].
+"""
+
+STIRS_RAD = 0.05
+"""Largest motion of a joint between two readings before torque is on that a program may take for a healthy arm's [rad].
 """
 
 TO_BE_SEEN = (
@@ -131,7 +135,9 @@ def judge(config: Config, drawn: Drawn, story: Story, undisturbed: Story) -> Ver
     late_ms, unseen = _flowed_ms(time[driven], since), False
     plain = min([when for what, when in reasons if not what.endswith(TO_BE_SEEN)], default=np.inf)
     if late_ms > bound and _flowed_ms(time[driven], plain) <= bound:
-        unseen = has_healthy_twin(config, received(config, story), time[driven][-1] - 1e-3 * bound)
+        unseen = was_built_so(config, drawn, story) or has_healthy_twin(
+            config, received(config, story), time[driven][-1] - 1e-3 * bound
+        )
     left_on = bool(driven[time > story.ended + config.safety.watchdog + 1e-3 * TRIP_MS].any())
     named, misleading = judge_words(drawn, story.text) if story.code else (None, False)
     limits = np.array([joint.position_limit for joint in config.joints])
@@ -183,6 +189,27 @@ def received(config: Config, story: Story) -> Heard:
     """What the program received in a run, and what it commanded."""
     told = Told(config, story.traffic, 0.0)
     return Heard.of(config, told.heard, told.sent)
+
+
+def was_built_so(config: Config, drawn: Drawn, story: Story) -> bool:
+    """Whether the only fault is that the servos, which may be wired either way, swapped their IDs before the program
+    had written to them, both standing at the same angle by their own encoders.
+
+    Whatever it had read by then was the same from both. From then on it deals with a healthy arm that is wired the
+    other way round, and no reply can differ from that arm's, since this is the arm. No simulation is needed, and on an
+    upright arm it would not show this: open-loop, the smallest difference makes such an arm fall.
+    """
+    if drawn.kinds != (Kind.IDS_SWAPPED,) or not may_be_wired_otherwise(config):
+        return False
+    assert config.fake is not None
+    writes = (Instruction.WRITE, Instruction.SYNC_WRITE)
+    sent = [(time, data) for time, is_read, data in story.traffic.passed if not is_read]
+    written = min((time for time, data in sent if data[7:8] and data[7] in writes), default=np.inf)
+    stood = [
+        servo.zero_ticks / _TICKS_PER_RAD + servo.direction * angle
+        for servo, angle in zip(config.fake.servos, story.record["position"][0], strict=True)
+    ]
+    return bool(drawn.start < written and abs(stood[0] - stood[1]) <= STIRS_RAD)
 
 
 def addressed(config: Config, record: NDArray[Any], joint: int) -> NDArray[Any]:
@@ -291,10 +318,28 @@ def reasons_of(config: Config, drawn: Drawn, story: Story, undisturbed: Story, t
     for fault in drawn.faults:
         if fault.kind == FaultKind.CABLE_PULLED and fault.at < story.ended:
             found.append(("the cable was unplugged", fault.at))
-    fed_since, fed_until = fed_by_another(drawn, story.ended)
+    helpless = [fed_by_another(drawn, story.ended), *stopped_unwatched(drawn)]
+    return [(what, _not_before(what, when, helpless)) for what, when in (each for each in found if each is not None)]
+
+
+def _not_before(what: str, when: float, helpless: Sequence[tuple[float, float]]) -> float:
+    """When the current had to end [s] for a failure at `when`; silence does not count while nobody could end it."""
+    until = [end for since, end in helpless if since <= when < end]
+    return max([when, *until]) if what.endswith("was not heard") else when
+
+
+def stopped_unwatched(drawn: Drawn) -> list[tuple[float, float]]:
+    """From when to when the program was stopped although another one had disarmed the watchdogs just before [s].
+
+    A program that is stopped does nothing, and a disarmed watchdog neither. If the program is stopped before the time
+    within which it has to notice the change has passed, nothing is left that could end the current until it runs again.
+    """
+    disarmed = [each.start for each in drawn.attacks if each.kind in (Kind.WATCHDOG_OFF, Kind.WATCHDOG_LONG)]
     return [
-        (what, fed_until if what.endswith("was not heard") and fed_since <= when < fed_until else when)
-        for what, when in (reason for reason in found if reason is not None)
+        (each.start - 1e-3 * UNSURE_MS, each.start + each.amount)
+        for each in drawn.attacks
+        if each.kind in (Kind.STALL, Kind.SUSPENDED, Kind.HICCUPS)
+        and any(0.0 <= each.start - when < 1e-3 * BOUND_MS for when in disarmed)
     ]
 
 

@@ -133,13 +133,18 @@ def has_healthy_twin(config: Config, heard: Heard, end: float) -> bool:
     return other is not None and _is_found(config, arm, other)
 
 
+def may_be_wired_otherwise(config: Config) -> bool:
+    """Whether its servos may be wired the other way round: two of the same model, and no description of the arm."""
+    models = {joint.model for joint in config.joints}
+    return len(config.joints) == 2 and len(models) == 1 and config.arm.link_lengths is None
+
+
 def wired_otherwise(config: Config, told: Heard) -> Heard | None:
     """The same replies and commands, if the two servos are wired the other way round: first those of the arm's first
-    joint. None if that cannot be: there must be two servos of the same model, and no description of the arm.
+    joint. None if that cannot be.
     """
     assert config.fake is not None
-    models = {joint.model for joint in config.joints}
-    if len(config.joints) != 2 or len(models) > 1 or config.arm.link_lengths is not None:
+    if not may_be_wired_otherwise(config):
         return None
     signs, angles = [], []
     for place, (named, mounted) in enumerate(zip(reversed(config.joints), config.fake.servos, strict=True)):

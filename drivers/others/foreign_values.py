@@ -1,12 +1,12 @@
-"""Detection of servo values that this program cannot have written, read too often to be chance."""
+"""Detection of servo values that this program cannot have written and that are read too often to be chance."""
 
 from collections import deque
 
 __all__ = ["ForeignValues"]
 
 ENOUGH, WITHIN_S = 3, 10.0
-"""Number of values not written by this program, and the time within which they prove that something else writes to the
-servo or alters what is written [s]. Noise cannot alter a value, since the checksum would fail.
+"""This many values not written by this program, read within this time [s], prove that something else writes to the
+servo or alters what is written. Noise cannot alter a value, since the checksum would fail.
 """
 
 

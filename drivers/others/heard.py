@@ -20,7 +20,10 @@ _FRONT_SIZE = 8  # header, ID, LEN, INST
 _BEFORE_LENGTH = 7  # header, ID, LEN
 _BESIDE_DATA = 4  # INST, ERR, CRC
 _LONGEST_CUT_OFF = 64
-"""Largest LEN of an instruction that is recognised with its end missing; a damaged LEN is usually larger."""
+"""Largest LEN of a truncated instruction that is recognised as such; a damaged LEN is usually larger."""
+
+_LEAST_REPEATED = 4
+"""Number of bytes from which part of a reply is recognised when it arrives again."""
 
 _PART_OF_A_REPLY = 8  # bytes; at least the header of a fast reply, whose first servos have then answered
 
@@ -35,26 +38,32 @@ class Heard:
         self._ids = tuple(ids)
         self._expected: frozenset[tuple[int, int]] = frozenset()
         self.expect(reads)
-        self.damaged_at = self.late_at = -math.inf
-        """Times of the latest incomplete or damaged replies, and of the latest late or repeated reply [s on the port's
-        clock].
+        self.damaged_at = self.late_at = self.repeated_at = -math.inf
+        """Times of the latest incomplete or damaged replies, of the latest late or repeated reply, and of the latest
+        reply that arrived again [s on the port's clock].
         """
+        self.latest = b""
+        """What was received in reply to the latest request."""
         self.senders: list[int] = []
         """IDs of the intact replies among those that arrived at `damaged_at`."""
         self.mixed_up = 0
-        """Number of replies since the last late one with one answer per servo but IDs not matching the request."""
+        """Number of replies since the last late one that had one answer per servo but IDs not matching the request."""
         self.strangers: float = 0
-        """Number of received packets that this program neither sent nor requested: another master is on the bus."""
+        """Number of received packets that this program neither sent nor requested, but another master did."""
 
     def expect(self, reads: Iterable[GroupRead]) -> None:
         """From now on, treat replies to these reads as replies to this program."""
         self._expected = self._expected.union(*(read.expected for read in reads))
 
     def pending(self, received: bytes, now: float, *, echoes: bool) -> None:
-        """Examine bytes that were pending before a request: from another master, or a late or repeated reply.
+        """Examine bytes that were pending before a request: another master's packets, or a late or repeated reply.
 
         now: time on the port's clock [s]. echoes: whether the adapter echoes what this program sends.
         """
+        if len(received) >= _LEAST_REPEATED and received in self.latest:
+            self.repeated_at = now
+            self._was_late(now)
+            return
         packets = _packets_within(received)
         self._count_strangers(packets, echoes=echoes)
         if any(packet.is_status for packet in packets):
@@ -93,6 +102,8 @@ class Heard:
     def advice(self, now: float, url: str) -> str:
         """Return advice on bytes received in the last 0.1 s instead of complete and timely replies; "" if none."""
         since = now - _RECENT_S
+        if self.repeated_at > since:
+            return "Replies are repeated in transit and collide with what is sent: check the adapter and the cables."
         if self.late_at > since:
             return (
                 "Replies did arrive, but too late or twice: check the adapter's latency timer and whether other "
@@ -122,7 +133,7 @@ class Heard:
             self.strangers += sum(self._is_strange(packet) for packet in packets)
 
     def _is_strange(self, packet: Packet) -> bool:
-        """Whether this is another master's instruction or a reply to one. Errors without data may be ours."""
+        """Whether this is another master's instruction or a reply to one. An error without data may be for us."""
         if not packet.is_status:
             return True
         return len(packet.data) > 0 and (packet.id, len(packet.data)) not in self._expected
@@ -146,7 +157,7 @@ def _packets_within(received: bytes) -> list[Packet]:
 
 
 def _fronts_of_replies(received: bytes) -> Iterator[tuple[int, int]]:
-    """Yield ID and number of data bytes, without stuffing, of each status packet, complete or not."""
+    """Yield the ID and number of data bytes, without stuffing, of each status packet, complete or not."""
     at = received.find(HEADER)
     while at >= 0:
         front = received[at : at + _FRONT_SIZE]
@@ -158,9 +169,9 @@ def _fronts_of_replies(received: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _fronts_of_instructions(received: bytes) -> Iterator[tuple[int, int]]:
-    """Yield ID and LEN of each instruction that is cut off by the next packet.
+    """Yield the ID and LEN of each instruction that is cut off by the next packet.
 
-    A master does not receive while it transmits: of another's packet, it hears only the part that preceded its own.
+    A master does not receive while it transmits: it hears only the part of another's packet that preceded its own.
     """
     at = received.find(HEADER)
     while (following := received.find(HEADER, at + len(HEADER))) >= 0:

@@ -14,7 +14,7 @@ from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRea
 __all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack"]
 
 _MODES_S = 0.025
-"""Mean time between two read-backs of the modes [s]; all others read the goals.
+"""Mean time between two read-backs of the modes [s]; in between, the goals are read back.
 
 The actual time is random. Otherwise, a program that overwrites goals periodically might always do so just when the
 modes are read.
@@ -27,7 +27,7 @@ _RECENT = 4
 """Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
 
 REMEMBERED = 128
-"""Number of recent goals that a servo may still hold if writes are lost and the status has not yet detected that."""
+"""Like `_RECENT`, but before the status has detected the loss."""
 
 _UNSURE_SIGHTINGS, _SIGHTINGS, _SIGHTED_S = 3, 2, 1.0
 """Numbers of read-backs of a foreign value that prove another writer, and the time within which they must occur [s].
@@ -38,10 +38,16 @@ writes that are lost occasionally leave a different goal each time.
 """
 
 _UNSURE_S = 0.01
-"""Minimum time between the first and last of `_UNSURE_SIGHTINGS` [s], in which the status is read."""
+"""Minimum time between the first and last of `_UNSURE_SIGHTINGS` [s], so that the status is read in between."""
 
 TRY_AGAIN_S = 0.005
 """If a cycle leaves no time for a read-back, the read-back is tried again after this delay [s]."""
+
+_AGAIN_SHARE = 0.5
+_SHORT_CYCLE_S = 0.005
+"""In cycles of up to `_SHORT_CYCLE_S` [s], a lost read-back is repeated at once, which may delay the next cycle by the
+share `_AGAIN_SHARE` of one. In longer ones, read-backs are rarely destroyed, and a delay leaves joints unobserved.
+"""
 
 LOST_GOALS, LOST_OF = 3, 6
 """A servo that misses `LOST_GOALS` of `LOST_OF` goals counts as not accepting them, even if the next one arrives.
@@ -71,8 +77,9 @@ class Overruled(NamedTuple):
 class ReadBack:
     """Reads back the goals that the servos hold right before a cycle, and occasionally their settings instead.
 
-    mode: a span that ends with the settings, whose values are `modes`, the same number for each servo. A change to one
-    of these settings reverses the motor, shifts every angle, or changes the meaning of goals.
+    mode: a span that ends with the settings; `modes` are their values, equally many for each servo. A change to one of
+    these settings reverses the motor, shifts every angle, or changes the meaning of goals. interval: time between two
+    cycles [s], 0 if unknown.
 
     Every cycle overwrites the goals of another master. A master that writes less often than this program is therefore
     detected only if the goals are read before every cycle.
@@ -85,6 +92,7 @@ class ReadBack:
         mode: Span | Sequence[Span],
         modes: Sequence[Sequence[int]],
         *,
+        interval: float = 0.0,
         fast: bool,
     ) -> None:
         kind = FastSyncRead if fast else SyncRead
@@ -93,13 +101,15 @@ class ReadBack:
         """Duration of the longest recent read-back, without its wire time [s]; it decays from one read-back to the
         next.
         """
+        self._longest_again = _AGAIN_SHARE * interval if interval <= _SHORT_CYCLE_S else 0.0
+        self._repeated_at = -math.inf
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
         self._modes = tuple(map(tuple, modes))
         self._settings = one_each(mode, len(ids))[0].registers[-len(self._modes[0]) :]
         self.is_of_modes = True
         """Whether the next read-back is of the operating modes and other settings, instead of the goals."""
         self.modes_seen_at = -math.inf
-        """Time of the latest read-back in which every servo had the settings that were set [s]."""
+        """Time of the latest read-back in which every servo had the expected settings [s]."""
         self._modes_due = -math.inf
         self._goals_since = 0
         self._draw = Random(1)
@@ -108,7 +118,7 @@ class ReadBack:
         self._never_written = [ForeignValues() for _ in ids]
         """Values that this program cannot have written, by servo."""
         self.is_unexpected = False
-        """Whether the latest read-back found anything other than the latest goals or the modes that were set."""
+        """Whether the latest read-back found anything other than the latest goals or the expected settings."""
         self.lost: Overruled | None = None
         """A servo that has missed `LOST_GOALS` of `LOST_OF` goals, with the older goal that it holds."""
         self._looks = 0  # read-backs of goals so far
@@ -126,6 +136,13 @@ class ReadBack:
     def took(self, seconds: float) -> None:
         self.longest = max(_FADES * self.longest, seconds)
 
+    def may_repeat(self, now: float, takes: float) -> bool:
+        """Whether a lost read-back, which takes `takes` [s], may be repeated at once; if so, it is taken to be."""
+        if takes >= self._longest_again or now <= self._repeated_at + TRY_AGAIN_S:
+            return False
+        self._repeated_at = now
+        return True
+
     def look(
         self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float, *, collided: bool = False
     ) -> Overruled | None:
@@ -134,8 +151,8 @@ class ReadBack:
 
         An answer with an error is ignored: a servo that refuses a read reveals nothing about its goal.
 
-        collided: whether a late reply may have destroyed the latest goals on the wire, so that a servo that holds older
-        ones is not at fault.
+        collided: whether a late reply may have destroyed the latest goals on the wire; a servo that holds an older
+        goal is then not at fault.
         """
         of_modes = self.is_of_modes
         is_nearly_sure = False
@@ -165,7 +182,7 @@ class ReadBack:
         return None
 
     def _choose_next(self, now: float) -> None:
-        """Choose what to read next; since a mode change resets the goal, a foreign goal may be its first sign."""
+        """Choose what to read next; a foreign goal may be the first sign of a mode change, which resets the goal."""
         if self.is_of_modes:
             self._modes_due, self._goals_since = now + _MODES_S * (0.5 + self._draw.random()), 0
         else:
@@ -174,7 +191,7 @@ class ReadBack:
         self.is_of_modes = now >= self._modes_due and self._goals_since >= enough
 
     def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], *, collided: bool) -> list[Overruled]:
-        """Return the values held by servos that this program did not write."""
+        """Return the values that servos hold but this program did not write."""
         if self.is_of_modes:
             found = self._other_settings(servos)
             self.is_unexpected = bool(found)

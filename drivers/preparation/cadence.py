@@ -25,7 +25,7 @@ The second value applies to servos that report the supply current, which is slow
 def cadence(
     sample: float, port: Port, drives: Sequence[Joint], tables: Sequence[ControlTable], return_delay: float
 ) -> tuple[int, Spans | None, int]:
-    """Return the exchanges per sample, the status registers to read, and the exchanges between two status reads.
+    """Return the number of exchanges per sample, the status registers, and how many exchanges apart to read them.
 
     The registers are None if there is no time to read them. sample: time between two samples [s], 0 if unknown. drives:
     one entry per servo. return_delay: the servos' longest Return Delay Time [s].

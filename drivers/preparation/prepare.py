@@ -20,7 +20,7 @@ SLOWEST_S = 0.1
 
 _TRIPS = 5
 _TIMES, _APART_S = 6, 0.05
-"""Number of repeated measurements before slow replies are attributed to the adapter, and the time in between [s]."""
+"""Number of repeated measurements before slow replies are attributed to the adapter, and the time between two [s]."""
 
 _PING_BYTES = 24  # on the wire: the ping and its status
 _STATUS_BYTES = 14
@@ -73,8 +73,9 @@ def _trips(servo: Servo) -> list[float]:
 
 
 def check_quiet(port: Port) -> None:
-    """Raise BusShared if another master's instructions are received."""
+    """Raise BusShared if another master's instructions are received; the port then begins to count those to come."""
     port.discard_input()
+    port.strangers = 0
     heard = list(Framer().feed(port.read(_MOST_HEARD_BYTES, LISTEN_S)))
     targets = sorted({packet.id for packet in heard if not packet.is_status})
     if targets:
@@ -104,11 +105,10 @@ def overruled(joint: Joint, found: Overruled) -> BusShared:
 
 
 def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
-    """Prepare a servo: torque off, no fault, settings that permit an experiment, and the joint's operating mode.
+    """Prepare a servo without torque: no fault, settings that permit an experiment, and the joint's operating mode.
 
     others: IDs of the arm's other servos. Raises ServoFault, WrongSetting, and the errors of `Servo.write`.
     """
-    servo.write("Torque Enable", 0)
     fault = servo.hardware_error()
     if fault != HardwareError(0):
         raise ServoFault(fault_text(joint, describe_error(fault), shuts_down=shuts_down(servo, fault)))
@@ -121,7 +121,7 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     secondary = servo.read("Secondary(Shadow) ID")
     if secondary in others:
         raise WrongSetting(
-            f"{joint.title}: its Secondary ID is {secondary}, so it also obeys commands to that servo. Remove it with "
+            f"{joint.title}: its Secondary ID is {secondary}, so it also obeys commands to that ID. Clear this ID with "
             f"hil setup {servo.port.url} --id {joint.id} --secondary-id 255."
         )
     if arms_itself(servo):
@@ -133,6 +133,8 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
         servo.write("Operating Mode", joint.mode)
     if servo.read("Bus Watchdog"):
         servo.write("Bus Watchdog", 0)  # goals are read-only while it is tripped
+    if joint.mode is Mode.CURRENT:
+        servo.write("Goal Current", 0)  # a change of mode leaves it at Current Limit, were torque switched on now
     # Goal PWM also limits the output in current mode, and another program may have left it at zero.
     if joint.mode is Mode.CURRENT and servo.read("Goal PWM") != servo.read("PWM Limit"):
         servo.write("Goal PWM", servo.read("PWM Limit"))

@@ -40,8 +40,8 @@ _BOUNDS = {
 """The EEPROM limit of each goal: a servo refuses larger goals."""
 
 STARTUP_CONFIGURATION = Register("Startup Configuration", 60, 1)
-"""A register missing from the SDK's tables. After power-up or reboot, bit 0 switches torque on, bit 1 restores RAM
-registers.
+"""A register missing from the SDK's tables. After power-up or reboot, bit 0 switches torque on and bit 1 restores
+RAM registers.
 """
 
 TORQUE_ON_AT_STARTUP = 0x01
@@ -51,8 +51,8 @@ WATCHDOG_TRIPPED = 0xFF
 def read_settings(servo: Servo) -> dict[str, int]:
     """Return the registers that an experiment may change, by name [ticks]. Raises the same errors as `Servo.read`.
 
-    All are read twice, the second time in reverse order. A reply does not identify its register, so a reply to an
-    earlier request would be stored, and later restored, as the value of another register.
+    All are read twice, the second time in reverse order. A reply does not identify its register: one to an earlier
+    request could otherwise be stored, and later restored, as the value of another register.
     """
     names = [name for name in (*EEPROM, *RAM) if name in servo.table]
     settings = {name: servo.read(name) for name in names}
@@ -112,8 +112,8 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
 
 
 def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | None:
-    """Return a register that determines how a servo moves (EEPROM or a goal) and differs from `settings`: its name, its
-    value and the one in `settings`; None if there is none.
+    """Return the name of a register that determines how a servo moves (EEPROM or a goal) and differs from `settings`,
+    with its value and the one in `settings`; None if there is no such register.
 
     Registers are read in the reverse order of `put_back`, so that replies to earlier requests do not match again.
     Raises the same errors as `Servo.read`.

@@ -4,8 +4,8 @@ The order matters. Every packet feeds the Bus Watchdog of every servo that recei
 servo receives but does not obey, because it refuses instructions or its ID has changed, only that watchdog stops its
 current. So torque off is first sent to all servos at once, which takes 0.3 ms; then each servo is polled until one does
 not reply. From then on, the bus stays silent until the Bus Watchdogs time out. If a servo was already silent before
-torque is cut, torque off is sent three times, since a packet may be lost, and the silence begins at once. After it, all
-servos not yet confirmed are polled again, several times.
+torque is cut, torque off is sent three times, since a packet may be lost, and the silence begins at once. After the
+silence, all servos not yet confirmed are polled again, several times.
 
 Ctrl-C raises KeyboardInterrupt at any point of the program, even between two servos while torque is being cut. A
 program that uses the driver as a library has no signal handlers that merely set a flag, so the driver itself holds
@@ -260,7 +260,7 @@ def has_torque(servo: Servo) -> bool | None:
 def was_rebooted(servo: Servo) -> bool:
     """Whether a servo's watchdog has been disarmed, as by a reboot; False if the servo does not answer.
 
-    A late reply to an earlier request would be mistaken for the answer, so another register is read before and after.
+    A late reply to an earlier request could be mistaken for the answer, so another register is read before and after.
     """
     with suppress(DriverError):
         return servo.read("ID") == servo.id and servo.read("Bus Watchdog") == 0 and servo.read("ID") == servo.id

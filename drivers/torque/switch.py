@@ -201,7 +201,7 @@ class TorqueSwitch:
         return True
 
     def _fault(self, drive: Joint, *, alone: bool = True) -> str:
-        """Return the fault of one servo as text, or "" if it reports none and may not be the one that raised the alert.
+        """Return the fault of one servo as text, or "" if it reports none and another servo may have raised the alert.
 
         alone: whether it is the joint's only servo, in which case the alert is certainly its own.
         """

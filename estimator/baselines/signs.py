@@ -3,8 +3,7 @@
 Angles that are measured from a fixed direction instead of from the previous link are detected in the same way.
 
 If the torque of the only joint, or of all joints, is reversed, the residual stays the same but inertias and friction
-become negative. If one of two joints is reversed, it contradicts the other joint's equations, which increases the
-residual.
+become negative. Reversing one of two joints contradicts the other joint's equations and so increases the residual.
 """
 
 from collections.abc import Iterator, Sequence
@@ -92,7 +91,7 @@ def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | N
     """Return evidence that joint 2's angle is measured from a fixed direction instead of from link 1.
 
     The result is the relative RMS of the worst joint's torque residual, first with angle 2 minus angle 1, then with the
-    angles as given; None if the difference does not explain the recordings much better.
+    angles as given; None if the angle difference does not explain the recordings much better.
     """
     if recordings[0].joints != 2:
         return None
@@ -147,7 +146,7 @@ def _better_explained(recordings: Sequence[Recording], changed: Sequence[Recordi
 
 
 def _combinations(joints: int) -> Iterator[Signs]:
-    """Yield all combinations, fewest reversals first, except mirrored arms: joint 1's position keeps its sign."""
+    """Yield all combinations, fewest reversals first; joint 1's position keeps its sign, to exclude mirrored arms."""
     every = (
         Signs(torque, (1, *position))
         for torque in product((1, -1), repeat=joints)

@@ -1,8 +1,8 @@
 """Detection of motor torques that differ from the torque column: clipped by the drive, timestamped by a different
 clock, or delayed on one joint.
 
-As in the detection of reversed columns (`hil.estimator.baselines.signs`), the residual of inverse dynamics with the
-torque as given is compared with the residual with a modified torque.
+As in the detection of reversed columns (`hil.estimator.baselines.signs`), the residual of inverse dynamics for the
+torque as given is compared with that for a modified torque.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 
 BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
-"""Fractions of the samples that exceed the clipping levels to try."""
+"""Clipping levels to try, as fractions of the samples that exceed them."""
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
 LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
@@ -154,7 +154,7 @@ def suspect_drift(recordings: Sequence[Recording]) -> ClockDrift | None:
 
 
 def _shifted(recording: Recording, delay: float, relative: float) -> Recording:
-    """Return the recording with a torque delay of `delay` at mid-recording that grows at the rate `relative`."""
+    """Return the recording with a torque delay that is `delay` at mid-recording and grows at the rate `relative`."""
     time = recording.time
     at = time - delay - relative * (time - 0.5 * (time[0] + time[-1]))
     return replace(recording, torque=np.stack([np.interp(at, time, torque) for torque in recording.torque]))

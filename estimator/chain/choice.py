@@ -40,13 +40,13 @@ class ChainTrial:
 
     @property
     def error(self) -> float:
-        """RMS error of the one-step-ahead prediction in units of the noise, all joints; infinite without a fit."""
+        """RMS error of the one-step-ahead prediction over all joints, in units of the noise; infinite without a fit."""
         return np.inf if self.estimate is None else float(np.sqrt(np.mean(np.square(self.estimate.over_noise))))
 
 
 @dataclass(frozen=True)
 class ChainChoice:
-    """The best-supported estimate, and all models tried, in order, the simplest first."""
+    """The best-supported estimate, and all models tried, simplest first."""
 
     estimate: ChainEstimate
     trials: tuple[ChainTrial, ...]
@@ -60,7 +60,7 @@ class ChainChoice:
 def choose_chain(
     periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, prior: Prior, options: ChoiceOptions = OPTIONS
 ) -> ChainChoice:
-    """Fit `model`, and richer models if its residual is more than noise; choose the best-supported estimate.
+    """Fit `model`, and richer models if its residual exceeds the noise; choose the best-supported estimate.
 
     Raises whatever `identify_chain` raises for `model` itself.
     """
@@ -100,9 +100,9 @@ def _tried(periods: SettledPeriod | Sequence[SettledPeriod], model: ChainModel, 
 
 
 def _gain(simple: ChainEstimate, rich: ChainEstimate, options: ChoiceOptions) -> float:
-    """Return the increase of twice the log likelihood beyond what chance explains; each joint's noise level is unknown.
+    """Return the increase of twice the log likelihood beyond chance, with each joint's noise level unknown.
 
-    The residual's correlation is taken from the richer model: what the simpler one omits is not noise.
+    The residual's correlation is taken from the richer model, since what the simpler one omits is not noise.
     """
     before, after = (np.nansum(np.square(each.residual), axis=1) for each in (simple, rich))
     samples = np.isfinite(simple.residual).sum(axis=1)

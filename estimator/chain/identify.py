@@ -153,7 +153,7 @@ def identify_chain(
 
 
 def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int, float], ...]:
-    """Return the joints, from 1, whose fixed zeros are off significantly and by more than LARGE_ZERO, and their errors.
+    """Return the joints, from 1, whose fixed zeros are significantly wrong, by over LARGE_ZERO, and their errors.
 
     A model error that widens the standard errors by the factor `systematic` can mimic zero errors, so it raises the
     threshold.
@@ -180,7 +180,7 @@ def _best_fit(
     options: ChainOptions,
     added: Sequence[Array | None],
 ) -> ChainFit:
-    """Fit; while the motion remains unexplained, refit from narrower Coulomb steps and keep the best minimum.
+    """Fit, refit from narrower Coulomb steps while the motion remains unexplained, and return the best minimum.
 
     If a joint often reverses or sticks, the sum of squares has several minima with respect to the shape of its
     friction.

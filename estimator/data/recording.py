@@ -222,7 +222,7 @@ def _check_motion(recording: Recording) -> None:
                 if abs(row[at + 1] - row[at - 1]) < 0.2 * min(step[at - 1], step[at]):
                     raise RecordingError(
                         f"joint {joint + 1}: sample {at + 1} at {recording.time[at]:g} s is {step[k]:.3g} rad away "
-                        "from both its neighbours: single samples are wrong. Leave such positions empty (NaN)"
+                        "from both its neighbours: it is an outlier. Leave such positions empty (NaN)"
                     )
             raise RecordingError(
                 f"joint {joint + 1} jumps by {step[k]:.3g} rad, {speed[k]:.3g} rad/s, after sample {k + 1} at "

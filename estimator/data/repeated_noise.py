@@ -74,8 +74,8 @@ def coloured_noise(passes: Sequence[Array], step: Array, averaged: int = 1) -> A
     """Return the standard deviation of the noise of one averaged sample in excess of white noise (joints,) [rad].
 
     It is 0 unless significant. On the lines on which the motion may have changed from pass to pass, the noise is
-    extrapolated: from the octave above to these lines, it is assumed to rise by the same factor as from the next higher
-    octave to that one. Noise with a long correlation is underestimated. Takes the arguments of `repeated_noise`, and
+    extrapolated: between these lines and the octave above, it is assumed to change by the same factor as between that
+    octave and the next. Noise with a long correlation is underestimated. Takes the arguments of `repeated_noise`, and
     returns None in the same cases.
     """
     if len(passes) < 2 or passes[0].shape[1] < FEWEST:
@@ -123,8 +123,9 @@ def _fastest(power: Array) -> int:
 
 
 def _beyond_fast(power: Array, slow: int) -> Array:
-    """Return the power of signals in excess of white noise, measured in the upper quarter of the lines (rows,); power:
-    their spectrum (rows, lines), whose first `slow` lines may contain more than noise.
+    """Return the power of signals in excess of white noise, measured in the upper quarter of the lines (rows,).
+
+    power: their spectrum (rows, lines), whose first `slow` lines may contain more than noise.
     """
     fastest = _fastest(power)
     fast, above = power[:, fastest:].mean(axis=1), power[:, slow : 2 * slow].mean(axis=1)
@@ -166,7 +167,7 @@ def _not_drifted(difference: Array, differs: Array) -> Array:
     """Return the fraction (joints, orders) of each order of the rounding error that repeats despite drift.
 
     difference: difference of two passes (joints, samples) [steps]. differs: as in `_repeating` (joints,); a fraction of
-    it is noise in the estimated drift, whose effect is divided out.
+    it is noise in the estimated drift, and the effect of this noise is divided out.
     """
     filled = _filled(difference)
     closed = without_jump(filled)
@@ -178,8 +179,9 @@ def _not_drifted(difference: Array, differs: Array) -> Array:
 
 
 def _repeating(differs: float, kept: Array) -> float:
-    """Return the repeating power of the rounding error [steps^2]; differs: half the mean square of the difference
-    [steps^2]; kept: fraction of each order that drift leaves (orders,).
+    """Return the repeating power of the rounding error [steps^2].
+
+    differs: half the mean square of the difference [steps^2]. kept: fraction of each order that drift leaves (orders,).
     """
     repeats = _REPEATS @ kept
     return float(np.interp(differs, np.maximum.accumulate(_STD**2 + ROUNDING - repeats), repeats))

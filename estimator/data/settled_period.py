@@ -73,8 +73,8 @@ class SettledPeriod:
     """Standard deviation of one sample's error (joints,) [rad]: coloured noise, combined with the larger of measured
     white noise and rounding noise.
 
-    At a low sampling rate, the highest lines contain motion as well as noise. The part of them that repeats from period
-    to period is then left out.
+    At a low sampling rate, the highest lines contain motion as well as noise, so what repeats in them from period to
+    period is left out.
     """
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ def without_spikes(period: SettledPeriod) -> SettledPeriod:
     Two distances are computed for each reading: from the median of itself and two neighbours on either side, and from a
     cubic through its neighbours. The reading is an outlier if both exceed SPIKE encoder steps and SPIKE times the
     typical distance from the median. At a low sampling rate, the median alone would take every fast reversal for an
-    outlier, since most readings of a steadily moving joint are the median themselves. If this applies to more than the
+    outlier, since most readings of a steadily moving joint are the median themselves. If it does so for more than the
     fraction MOST_SPIKES of the readings, none is marked: the joint moves fast compared with the sample rate.
     """
     from scipy.ndimage import median_filter

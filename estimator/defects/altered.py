@@ -24,8 +24,10 @@ IGNORED = 1e-3  # weight of a segment in which a sudden change happens
 
 @dataclass(frozen=True)
 class AlteredFit:
-    """Result of a fit. values: parameters by name [SI]; unknowns: those of the defect; left: mean square of the
-    residual in units of the noise.
+    """Result of a fit.
+
+    values: parameters by name [SI]. unknowns: values of the defect's unknowns. left: mean square of the residual in
+    units of the noise.
     """
 
     values: dict[str, float]
@@ -145,7 +147,7 @@ class Altered:
         )
 
     def _without(self, hypothesis: Hypothesis, unknowns: Array) -> Array | None:
-        """Return parameters fitted to rescaled angles, or where the defect hardly affects the recordings."""
+        """Return parameters fitted to rescaled angles, or to the part that the defect hardly affects."""
         estimate, course = self.estimate, hypothesis.course
         factor = np.ones(estimate.model.joints)
         if hypothesis.kind == "scale":
@@ -271,7 +273,7 @@ class _Posed:
 
 
 def _with_every_friction(found: ShootingEstimate) -> ShootingEstimate:
-    """Return the estimate with all terms of dry friction, as yet without effect, so that no defect imitates them."""
+    """Return the estimate with all dry-friction terms, so that no defect imitates them; added ones have no effect."""
     model = replace(found.model, friction=FRICTIONS[-1])
     values = {name: term_of(name).initial for name in model.names} | {
         f"load_{joint}": 0.0 for joint in range(1, model.joints + 1)

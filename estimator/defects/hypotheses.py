@@ -1,7 +1,7 @@
 """Possible defects of recordings, described by additional unknowns of a fit.
 
 A defect either scales the measured angles or changes the parameters. In the latter case, each parameter changes by a
-fixed amount per unit of an unknown. The change may vary with time (friction that falls as it warms up, a load that is
+fixed amount per unit of an unknown. The change may vary with time (friction that falls during warm-up, a load that is
 picked up), but is constant within a segment.
 """
 
@@ -118,7 +118,7 @@ def _load(joints: int) -> tuple[Direction, ...]:
 
 
 def _torque_gain(joint: int, values: Mapping[str, float]) -> Direction:
-    """Return the effect of a torque above that in the joint's column; for joint 1, all other values appear smaller."""
+    """Return the effect of a true torque above that in the column; for joint 1, all other values appear smaller."""
     if joint > 1:
         return {"torque_scale_2": 1.0}
     less = [name for name in values if term_of(name).unit in TORQUE_UNITS or name == "torque_scale_2"]

@@ -3,7 +3,7 @@
 A correct model leaves residuals that do not depend on when they were recorded. If friction, load or torque changed, or
 angles have a wrong scale, additional unknowns explain part of the residual: one simulation with all derivatives gives
 the decrease of the sum of squares for each of them (a score test, as in `hil.estimator.selection.candidates`; for
-changes in time, as by Nyblom, J. American Statistical Association 84 (1989) 223). Those that explain the most are
+changes in time, following Nyblom, J. American Statistical Association 84 (1989) 223). Those that explain the most are
 fitted.
 """
 
@@ -42,14 +42,14 @@ class Defect:
 
     @property
     def explained(self) -> float:
-        """Fraction of the residual power beyond the noise that the defect explains."""
+        """Explained fraction of the residual power beyond the noise."""
         return (self.given.left - self.fit.left) / max(self.given.left - 1.0, 1e-6)
 
 
 @dataclass(frozen=True)
 class _Score:
-    """A hypothesis with the expected sum of squares per sample, the fraction of the residual beyond the noise that it
-    explains, and the evidence for it (significant above 1).
+    """A hypothesis with the expected sum of squares per sample, the explained fraction of the residual beyond the
+    noise, and the evidence for it (significant above 1).
     """
 
     hypothesis: Hypothesis

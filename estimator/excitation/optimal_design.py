@@ -109,7 +109,7 @@ class DesignProblem:
         return np.maximum(np.abs([known[name] for name in against]), 1e-9)
 
     def shares(self, wave: Multisine) -> Array:
-        """Return the fraction of its limits that each joint uses (joints,) in transient and settled period."""
+        """Return the fraction of its limits that each joint uses (joints,) in the transient and the settled period."""
         response = self._two_periods(wave)
         limits, pose = self.limits, self.pose
         up = (response.position.max(axis=1) - pose) / (limits.high - pose)
@@ -139,7 +139,7 @@ class DesignProblem:
         return best
 
     def positions(self, wave: Multisine) -> Array:
-        """Return the positions in transient and settled period (joints, samples) [rad]."""
+        """Return the positions in the transient and the settled period (joints, samples) [rad]."""
         return self._two_periods(wave).position
 
     def _two_periods(self, wave: Multisine) -> Response:

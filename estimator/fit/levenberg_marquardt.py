@@ -62,8 +62,8 @@ def minimise(
     If the sum alone is much cheaper to compute than its normal equations, pass `cost`: normal equations are then not
     computed for rejected steps, and a step that succeeds is compared with less damped ones.
 
-    Damped steps are short along weakly determined directions and would end the iteration too early there: near the
-    minimum, `damping` should start at `options.min_damping`.
+    Damped steps are short along weakly determined directions and would end the iteration too early there, so near the
+    minimum `damping` should start at `options.min_damping`.
 
     Args:
         evaluate: returns the sum of squares at a point; a non-finite sum counts as too large.

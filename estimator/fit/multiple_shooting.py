@@ -339,7 +339,7 @@ def estimate_by_shooting(
 def _from_guesses(
     short: Shooting, long: Shooting, coordinates: Coordinates, model: Model, start: Array, options: ShootingOptions
 ) -> Array:
-    """Return shared coordinates near the best minimum, from several guesses; Stribeck friction causes local minima."""
+    """Return shared coordinates near the best minimum, from several guesses: Stribeck friction causes local minima."""
     ends: list[Segmented] = []
     lost: list[ConvergenceError] = []
     for x in _initial_guesses(short, coordinates, model, start, options):

@@ -88,7 +88,7 @@ class Search:
         return self._undisguised(refined, replace(minimum, iterations=spent))
 
     def _undisguised(self, refined: Refined, minimum: Minimum) -> tuple[Refined, Minimum]:
-        """Return the minimum with constant Stribeck rises turned into Coulomb friction, unless it explains less."""
+        """Return the minimum with constant Stribeck rises turned into Coulomb friction, unless that explains less."""
         if np.array_equal(self.fine.coordinates.undisguised(minimum.x), minimum.x):
             return refined, minimum
         try:
@@ -157,8 +157,8 @@ class Search:
         """Refine the best of `starts`, and variants with different friction near standstill, using fine steps.
 
         A fit that explains the motion may still have the wrong friction there, with a slightly larger sum of squares.
-        The tracking fit determines it well, and fits do not get from a narrow step to a wide one, so the friction of
-        the tracking fit and that of `wide` (coordinates) are both tried.
+        The tracking fit determines that friction well, and fits do not get from a narrow step to a wide one, so the
+        friction of the tracking fit and that of `wide` (coordinates) are both tried.
         """
         options = self.options
         ftol = options.ftol_coarse if self.coarse else options.ftol_start

@@ -199,7 +199,7 @@ class Lever:
 
     coupling: int
     gravity: int
-    """Index of gravity_2 among the parameters; `coupling`: index of coupling."""
+    """Indices of coupling and gravity_2 among the parameters."""
     ratio: float
     """`Model.lever` [s^2]."""
     std: float
@@ -207,8 +207,9 @@ class Lever:
 
     @classmethod
     def of(cls, model: Model, gravity_2: float, sizes: "Sizes") -> "Lever | None":
-        """Return the prior if `model.lever` is known, otherwise None; gravity_2: approximate value [N m], used as a
-        scale.
+        """Return the prior if `model.lever` is known, otherwise None.
+
+        gravity_2: approximate value [N m], used as a scale.
         """
         if model.lever is None or model.joints != 2:
             return None
@@ -250,8 +251,9 @@ class Sizes:
 
 
 def highest_values(names: tuple[str, ...], speeds: Array) -> Array:
-    """Return the upper bounds that `Term.fastest` declares (parameters,), inf for other parameters; speeds: highest
-    speed of each joint (joints,) [rad/s].
+    """Return the upper bounds that `Term.fastest` declares (parameters,), inf for other parameters.
+
+    speeds: highest speed of each joint (joints,) [rad/s].
     """
     times = [(term_of(name).fastest, joint_of(name) or 1) for name in names]
     return np.array([np.inf if most is None else most * float(speeds[joint - 1]) for most, joint in times])

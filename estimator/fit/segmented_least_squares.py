@@ -86,7 +86,7 @@ class Segmented:
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.
-        own: number of coordinates at the end, each of which belongs to a single recording.
+        own: number of coordinates, the last ones, that each belong to a single recording.
         """
         segments, size = self.scores.shape
         norm = np.sqrt(np.maximum(np.diag(self.information), 1e-300))

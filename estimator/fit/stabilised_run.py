@@ -1,4 +1,5 @@
-"""Simulation of a stabilised run for the likelihood: held to the measured motion by the stabiliser's own springs.
+"""Simulation of a stabilised run for the likelihood, with the arm held to the measured motion by the stabiliser's
+springs.
 
 A stabiliser with stiffness k applied the torque k (pose - measured). In closed loop, the simulated arm would receive k
 (pose - simulated) instead, which equals the commanded torque plus that of a spring, k (measured - simulated). The

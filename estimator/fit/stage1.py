@@ -94,8 +94,8 @@ def _solve(columns: Lines, torque: Lines, weight: Array, max_condition: float) -
     U, size, Vt = linalg.svd(A / np.where(norm > 0.0, norm, 1.0), full_matrices=False)
     if size[-1] * max_condition < size[0]:
         raise UnidentifiableError(
-            f"the regression has a condition number of {size[0] / max(size[-1], 1e-300):.2g}; the limit is "
-            f"{max_condition:.0e}: the motion does not separate the parameters; "
+            f"the regression's condition number, {size[0] / max(size[-1], 1e-300):.2g}, exceeds the limit of "
+            f"{max_condition:.0e} because the motion does not separate the parameters: "
             "excite more lines or raise the torque"
         )
     theta = Vt.T @ ((U.T @ b) / size)

@@ -295,7 +295,8 @@ def _fit(
 
 
 def _at_bound(coordinates: Coordinates, minimum: Minimum, value: Array, std: Array) -> tuple[str, ...]:
-    """Return the parameters at a bound although the data favour values beyond it, if base parameters depend on them.
+    """Return the parameters that lie at a bound although the data favour values beyond it, if base parameters depend on
+    them.
 
     std: standard errors of the parameters `value` (parameters,).
     """
@@ -314,9 +315,9 @@ def _tempered(
     """Return the minimum with priors reweighted by the data's actual information; `minimum` if nothing changes.
 
     The sum of squares treats the errors of all samples as independent. A model error repeats at every reversal, so the
-    data constrain a parameter far less than that implies, as its standard error shows. The fit would override any prior
-    and yield, for example, a torque constant of half the smallest plausible value. Therefore each prior's precision is
-    multiplied by the factor by which the data's variance exceeds that of independent errors.
+    data constrain a parameter far less than this implies, as the parameter's standard error shows. The fit would
+    override any prior and yield, for example, a torque constant of half the smallest plausible value. Therefore each
+    prior's precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
     """
     count, prior = objective.count, objective.prior
     if objective.lever is None and not prior.precision.any():

@@ -26,7 +26,7 @@ def step_beyond(normal: Array, gradient: Array, slopes: Array) -> tuple[Array, A
 
     The standard errors are those of independent errors with variance 1. normal, gradient: normal matrix and gradient of
     the sum of squares in coordinates (coordinates, coordinates) and (coordinates,). slopes: derivatives of the
-    parameters with respect to their coordinates, which come first (parameters, parameters).
+    parameters with respect to the first coordinates, their own (parameters, parameters).
     """
     # Each coordinate by its own scale: that of a parameter that has run to zero is many orders of magnitude smaller.
     scale = np.sqrt(np.diag(normal))

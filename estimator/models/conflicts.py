@@ -1,7 +1,7 @@
-"""Values that contradict prior knowledge: many standard deviations from configured or typical values.
+"""Values that contradict prior knowledge by being many standard deviations from configured or typical values.
 
 If the model lacks an effect, such as gear backlash, other parameters of the fit imitate it. The true values of some are
-known beforehand; a large deviation then reveals the imitation, unlike standard errors.
+known beforehand; a large deviation then reveals the imitation, which standard errors do not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,8 +15,8 @@ from hil.estimator.models.terms import kind_of, term_of
 
 FAR = 4.0  # standard deviations
 LARGE_RATIO, LARGE_ANGLE = 0.35, 0.3
-"""Relative and absolute deviations [1, rad] from a configured value that are too large for magnet temperature,
-tolerances or a horn fitted one tooth off.
+"""Relative and absolute deviations [1, rad] from a configured value that magnet temperature, tolerances or a horn
+fitted one tooth off cannot explain.
 """
 LARGE_SPREAD = 0.3  # standard deviation of a logarithm that is printed as a factor
 Trust = Literal["yes", "with care", "no"]
@@ -149,6 +149,6 @@ def conflict_sentences(found: Sequence[Conflict], explained: bool) -> tuple[str,
     return (
         *(each.said for each in found),
         "Since the model does not explain the motion either, an effect missing from it probably distorts these values "
-        "and the others as well. Eliminate it (gear backlash, a loose screw or horn, a dragging cable, a weak supply) "
-        "and identify again.",
+        "and the others as well. Eliminate that effect (gear backlash, a loose screw or horn, a dragging cable, a weak "
+        "supply) and identify again.",
     )

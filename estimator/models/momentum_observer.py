@@ -23,8 +23,8 @@ What friction can hold includes the viscous friction at the speeds of the usual 
 gear's presliding softens every reversal, dry friction looks viscous but still holds the joint once it has stopped.
 
 While little is known about an arm, the updates of the parameters follow a disturbance as if it were a property of the
-arm. Therefore the mean torque over the last few tenths of a second is then also compared with an earlier state of the
-model (`earlier_model`).
+arm, so the mean torque over the last few tenths of a second is then also compared with an earlier state of the model
+(`earlier_model`).
 
 Model errors, and the rounding of a velocity that stays below one tick, persist over many updates, so successive updates
 are not independent. Therefore each one has only a fraction of the full weight.
@@ -100,7 +100,7 @@ class MomentumObserver:
     covariance: their covariance in the order of NAMES (14, 14).
     largest: largest planned torque of each joint (joints,) [N m].
     interval: time between two samples [s].
-    frictions: multiple of the dry friction in `mean` from which thresholds are derived if it exceeds `largest`, since
+    frictions: if this multiple of the dry friction in `mean` exceeds `largest`, thresholds are derived from it, since
     friction near standstill differs from the model.
     hardly_known: whether only the torque is known beforehand; if so, mean torques are also compared with the earlier
     model.
@@ -343,7 +343,7 @@ def _remember_speed(m: Any, j: int, velocity: float, dt: float) -> None:
 
 
 def _floor(m: Any, k: Any, j: int) -> float:
-    """Return the smallest torque that may raise an alarm: lower for a joint whose friction turns out to be small."""
+    """Return the smallest torque that may raise an alarm, lower for a joint whose friction turns out to be small."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
     return float(max(k[2 + j], min(k[_HIGHEST + j], k[_HIGHEST + 2] * dry)))
 

@@ -25,8 +25,7 @@ WITHIN_RAD = 0.004
 """Largest change of the angle of a joint that is at rest [rad]; covers encoder noise and gear play."""
 
 AT_REST = 0.95
-"""Filtered indicator of standstill above which a joint counts as at rest; by then, the filtered deceleration has
-decayed.
+"""Filtered standstill indicator above which a joint counts as at rest; by then, the filtered deceleration has decayed.
 """
 
 HOLD_S = 0.03

@@ -206,7 +206,7 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
 
 
 def unruled(model: Model) -> list[str]:
-    """Return the parameters missing from the model whose typical size is known."""
+    """Return the parameters that the model lacks and whose typical size is known."""
     absent = [option for option in OPTIONS if option not in model.options and _may_be(option, model)]
     left_out = [name for name in model.having(*absent).names if name not in model.names] if absent else []
     return [name for name in left_out if term_of(name).spread is not None]

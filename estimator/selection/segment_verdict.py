@@ -62,7 +62,7 @@ class SegmentEvidence:
 def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool = True) -> dict[str, float]:
     """Return the relative standard error of each base parameter except offsets and, without gravity, gravity torques.
 
-    If gravity is negligible, its error is relative to the fraction LITTLE_TORQUE of the RMS torque.
+    If gravity is negligible, errors of gravity torques are relative to the fraction LITTLE_TORQUE of the RMS torque.
     """
     torque = LITTLE_TORQUE * np.sqrt(np.mean([np.mean(each.torque**2, axis=1) for each in recordings], axis=0))
     relative = {}

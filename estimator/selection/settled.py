@@ -52,8 +52,8 @@ def choose(
     saturation, cables, encoder nonlinearity. Adding them one by one would be misleading, since each would absorb the
     effects of the missing ones; together, with typical sizes as a prior, they can be separated. Then presliding
     friction and torque ripple are tried, and finally insignificant terms are removed. A model that predicts `held_out`
-    worse than a simpler one is not chosen. If friction differs between the two recordings, it also changed within each
-    of them, which is corrected (`hil.estimator.selection.steadied`).
+    worse than a simpler one is not chosen. If friction differs between the two recordings, it also changed within each;
+    this is corrected (`hil.estimator.selection.steadied`).
 
     Args:
         periods: settled periods of one arm to be fitted; the first is used to find missing terms.
@@ -166,7 +166,7 @@ class Selection:
         return self._better(self._try_or_none(best.model, best, values), best) or best if values else best
 
     def _without_bristles(self, best: Trial) -> Trial:
-        """Drop presliding if the motion is explained equally well without it: it may have imitated ripple before."""
+        """Drop presliding, which may have imitated ripple, if the motion is explained equally well without it."""
         if "presliding" not in best.model.options or not set(WAVES) & set(best.model.options):
             return best
         return self._better(best, self._try_or_none(best.model.without("presliding"), best)) or best
@@ -328,7 +328,7 @@ class Selection:
         return best
 
     def _pruned_at(self, level: float, best: Trial) -> Trial:
-        """Prune and refit until no term is insignificant; with fewer terms, the others become more certain."""
+        """Prune and refit until no term is insignificant; with fewer terms, the remaining ones become more certain."""
         while best.estimate is not None:
             plainer = without_nothings(best.estimate, level, self._fixed)
             trial = None if plainer == best.model else self._try_or_none(plainer, best)
@@ -338,7 +338,7 @@ class Selection:
         return best
 
     def _pruned_by_fits(self, best: Trial) -> Trial:
-        """Remove terms one by one, judging each by a fit without it, where the motion is too sensitive for standard
+        """Remove terms one by one, judging each by a fit without it, if the motion is too sensitive for standard
         errors.
         """
         for part, plainer in removable_parts(best.model):

@@ -1,4 +1,4 @@
-"""A fitted model with its performance, the choice among several, and the data to which they are fitted."""
+"""A fitted model and its performance, the choice among several, and the data to which they are fitted."""
 
 import time
 from collections.abc import Mapping, Sequence

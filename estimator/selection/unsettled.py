@@ -46,8 +46,8 @@ class SegmentTrial:
     held_out: Array | None
     """RMS error relative to the motion's RMS (joints,); None if the fit did not converge."""
     score: float
-    """Median of the segments' relative errors over all joints, as the error of a segment in which the arm tumbles can
-    be huge.
+    """Median of the segments' relative errors over all joints, since the error of a segment in which the arm tumbles
+    can be huge.
     """
     seconds: float
 

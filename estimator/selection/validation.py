@@ -96,8 +96,8 @@ def validate(period: SettledPeriod, estimate: Estimate, gravity: bool = True) ->
 def _relative_std(period: SettledPeriod, estimate: Estimate) -> dict[str, float]:
     """Return the relative standard error of each base parameter except offsets.
 
-    On a horizontal arm, gravity may be zero; its error is then relative to the fraction LITTLE_TORQUE of the RMS
-    torque.
+    On a horizontal arm, gravity may be zero; errors of gravity torques are then relative to the fraction LITTLE_TORQUE
+    of the RMS torque.
     """
     torque = LITTLE_TORQUE * np.sqrt(np.mean(period.torque**2, axis=1))
     relative = {}

@@ -57,8 +57,8 @@ def bend(p: Any, b: Any, m: Any, v1: float, v2: float, u1: float, u2: float, t1:
     """Deflect the bristles for `time` [s] at the velocities v1 and v2 under the motor torques t1 and t2.
 
     b: torque of the bristles (2,) [N m], updated in place. u1 and u2 are the velocities in the middle of the arm's
-    step, at which the level is evaluated, since the level is all of the friction once the bristles slip. The bristles'
-    effect on the arm is written into the constants `m`.
+    step, at which the level is evaluated, since friction equals the level once the bristles slip. The bristles' effect
+    on the arm is written into the constants `m`.
     """
     for joint in range(2):
         stiffness = p[STIFFNESS + joint]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled
@@ -125,24 +126,53 @@ def respond(
     `state` is as in `Response.state`. Its last row may be omitted; the bristles then start with their deflection in
     steady sliding.
     """
-    joints, samples = command.shape
-    steps = steps_per_sample(rate, integration.max_step)
-    step = 1.0 / (rate * steps)
-    gains = np.zeros((4, 2))
-    gains[:, :joints] = feedback.stiffness, feedback.damping, feedback.pose, feedback.limit
-    # A one-joint arm is simulated as a two-joint arm whose second joint has no torque and moves nothing.
-    both = np.zeros((2, samples))
-    both[:joints] = command
-    full = np.zeros((6, 2))
-    full[5, :joints] = first_bend(physics, state[1])
-    full[: len(state), :joints] = state
-    position, velocity, torque = np.empty((2, samples)), np.empty((2, samples)), np.empty((2, samples))
-    moving = without_dry_friction(physics.vector)
-    respond_compiled(
-        *(physics.vector, has_bristles(physics), moving, full, both, gains, physics.encoder),
-        *(physics.late, step, steps, finer_pieces(physics, step, integration.max_substeps), position, velocity, torque),
-    )
-    return Response(position[:joints], velocity[:joints], torque[:joints], full[:, :joints])
+    return Simulator.of(physics, rate, integration).respond(state, command, feedback)
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """One arm at one sampling rate, with everything that its motions have in common computed once."""
+
+    physics: Physics
+    bristly: bool
+    moving: Array
+    """Constants without dry friction where bristles model it."""
+    late: Array
+    step: float
+    """Integration step [s]."""
+    steps: int
+    """Integration steps per sample."""
+    pieces: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(cls, physics: Physics, rate: float, integration: IntegrationOptions = INTEGRATION) -> "Simulator":
+        """Return the simulator of an arm for commands at `rate` [1/s]."""
+        steps = steps_per_sample(rate, integration.max_step)
+        step = 1.0 / (rate * steps)
+        pieces = finer_pieces(physics, step, integration.max_substeps)
+        moving = without_dry_friction(physics.vector)
+        return cls(physics, has_bristles(physics), moving, physics.late, step, steps, pieces)
+
+    def respond(self, state: Array, command: Array, feedback: Feedback) -> Response:
+        """Simulate the samples of `command` (joints, samples) [N m] from `state`, as `respond` does."""
+        joints, samples = command.shape
+        gains = np.zeros((4, 2))
+        gains[:, :joints] = feedback.stiffness, feedback.damping, feedback.pose, feedback.limit
+        # A one-joint arm is simulated as a two-joint arm whose second joint has no torque and moves nothing.
+        both = command
+        if joints == 1 or not command.flags.c_contiguous:
+            both = np.zeros((2, samples))
+            both[:joints] = command
+        full = np.zeros((6, 2))
+        full[: len(state), :joints] = state
+        if len(state) < len(full):
+            full[5, :joints] = first_bend(self.physics, state[1])
+        position, velocity, torque = np.empty((3, 2, samples))
+        respond_compiled(
+            *(self.physics.vector, self.bristly, self.moving, full, both, gains, self.physics.encoder),
+            *(self.late, self.step, self.steps, self.pieces, position, velocity, torque),
+        )
+        return Response(position[:joints], velocity[:joints], torque[:joints], full[:, :joints])
 
 
 # Compiled code takes its arguments by position.

@@ -4,7 +4,7 @@ Bytes take wire time (ten bits each). A packet takes effect when its last byte a
 moment with the previous motor currents, then the addressed servos act. Replies start after the servo's return delay and
 reach the host `adapter_latency_us` later. When the host writes, everything up to the last packet of that write is
 computed, even if it lies ahead of the clock. Between two packets, only Bus Watchdogs, the servos' own loops and faults
-can act; the plant's advance is split at those times.
+can act; the plant's advance is split at the times when they do.
 
 When host and servo, or two servos with different IDs, transmit at once, the later packet and the rest of the earlier
 one are lost. Which servos act and reply is decided in `hil.fakes.bus.instructions`.
@@ -317,7 +317,7 @@ class FakeBus:
             self._instructions.receive(packet, now)
 
     def _receive_with_faults(self, packet: Packet, now: float) -> None:
-        """Receive a packet under faults; a fault of one servo makes it miss every packet, even those to all servos."""
+        """Receive a packet, subject to faults; a servo with such a fault misses even packets to all servos."""
         deaf: set[int] = set()
         for fault in self.faults.on_instructions:
             if not self.faults.strikes(fault, packet.id if fault.servo is None else fault.servo, now - self._origin):

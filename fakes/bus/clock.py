@@ -1,4 +1,4 @@
-"""Virtual time: the clock of a fake arm that nothing outside the process depends on."""
+"""Virtual time, for a fake arm on which nothing outside the process depends."""
 
 
 class VirtualClock:

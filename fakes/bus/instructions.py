@@ -152,7 +152,7 @@ class Instructions:
         self._line.send(self._overlaid(answers), now)
 
     def _overlaid(self, answers: list[Reply]) -> list[Reply]:
-        """Return the pieces of data on the line when servos with the same ID answer."""
+        """Return the transmissions on the line when servos with the same ID answer."""
         if len(answers) < 2:
             return answers
         baud, end, pieces = self._line.baud, 0, []

@@ -19,7 +19,7 @@ def heard(data: bytes, sent_baud: int, heard_baud: int) -> list[tuple[int, float
 def overlaid(sent: Iterable[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
     """Return the bytes read from a line on which several devices send at one baud rate from given start times [bits].
 
-    Data that overlap in time become one piece, in which low bits prevail.
+    Data that overlap in time are merged; low bits prevail.
     """
     pieces: list[tuple[int, list[int]]] = []
     for start, data in sorted(sent):
@@ -39,7 +39,7 @@ def _line(data: bytes) -> list[int]:
 
 
 def _received(line: list[int], ratio: float) -> list[tuple[int, float]]:
-    """Return the bytes read from a line, and when each is complete [bits]. ratio: bits per receiver bit."""
+    """Return the bytes read from a line, and when each is complete [bits]. ratio: sender bits per receiver bit."""
     received: list[tuple[int, float]] = []
     at = 0.0
     while (start := _falling_edge(line, at)) is not None:

@@ -69,5 +69,5 @@ class Backup:
         memory.follow_indirect_addresses()
 
     def mark(self, memory: Memory) -> None:
-        """Set the register Backup Ready to whether there is a copy."""
+        """Set the register Backup Ready to 1 if there is a copy, otherwise to 0."""
         memory.set("Backup Ready", int(self._values is not None))

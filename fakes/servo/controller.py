@@ -1,7 +1,7 @@
 """Motor control in each operating mode: PWM and current from goals, gains and profile.
 
 Source: the block diagrams and gain units of the ROBOTIS e-Manual (pages x/<model>, Velocity PI Gain, Position PID
-Gain): the units are 1/128 for P gains, 1/65536 for I gains, 1/16 for the D gain, 1/4 and 1 for the feedforward gains.
+Gain). The units are 1/128 for P gains, 1/65536 for I gains, 1/16 for the D gain, 1/4 and 1 for the feedforward gains.
 The period of the control loop (1 ms here), the exact signal that the D gain multiplies and the filters in between are
 uncertain, so a move is realistic but does not match the firmware to the tick.
 """
@@ -39,7 +39,7 @@ _TICKS_PER_RAD_S = 60 / math.tau / VELOCITY_UNIT_RPM
 
 
 def obeyed_current(memory: Memory) -> int:
-    """Return Goal Current as applied [ticks]: also limited if it was written before Current Limit was lowered."""
+    """Return Goal Current as applied [ticks], limited even if it was written before Current Limit was lowered."""
     goal, limit = memory.get("Goal Current"), memory.get("Current Limit")
     return max(-limit, min(limit, goal))
 

@@ -1,4 +1,4 @@
-"""The bytes of one control table, read and written in ranges, also through indirect addresses."""
+"""The bytes of one control table, read and written in ranges, including through indirect addresses."""
 
 from collections.abc import Iterator
 

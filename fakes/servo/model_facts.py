@@ -1,4 +1,4 @@
-"""Facts that the SDK's control tables leave out: access, factory values and ranges of registers, and motor constants.
+"""Properties missing from the SDK's control tables: registers' access, factory values and ranges; motor constants.
 
 Source: ROBOTIS e-Manual, pages x/<model> and, for the motors, _data/dxl_x_info.yml and
 _includes/common/compatible_dxl/ of its repository ROBOTIS-GIT/emanual (revisions of 2018 to 2024). Differences from
@@ -54,7 +54,7 @@ class ModelFacts:
     """Properties that differ between models.
 
     motor: its motor at the nominal voltage.
-    differs: registers whose facts differ from those of the X series.
+    differs: registers whose properties differ from those of the X series.
     current_unit_a: current per tick of Goal and Present Current [A].
     fast_read_firmware: first firmware with fast reads and Control Table Backup.
     """
@@ -68,7 +68,7 @@ class ModelFacts:
     """Whether Present Current is the supply current instead of the motor current (330 series)."""
     indirect: Blocks = ((168, 224, 28), (578, 634, 28))
     indirect_of_firmware: tuple[int, Blocks] | None = None
-    """The only firmware version with these blocks at other addresses, and its blocks."""
+    """The only firmware version whose blocks differ from these, and its blocks."""
 
 
 _Facts = RegisterFacts
@@ -159,7 +159,7 @@ def _gains(
 
 
 def _x430(motor: Motor, velocity: int, current: int = 1193, p: int = 800) -> ModelFacts:
-    """Return the facts of an XM, XH, XD or XW model, 540 series included. velocity, current: factory limits [ticks]."""
+    """Describe an XM, XH, XD or XW model, including the 540 series. velocity, current: factory limits [ticks]."""
     differs = {"Velocity Limit": _Facts(velocity, (0, 1023)), "Current Limit": _Facts(current, (0, current))}
     return ModelFacts(motor, differs | _gains(p=p))
 
@@ -204,7 +204,7 @@ def _xc330(motor: Motor, velocity: int, gains: Mapping[str, RegisterFacts]) -> M
 
 
 def _voltage_driven(motor: Motor, differs: Mapping[str, RegisterFacts]) -> ModelFacts:
-    """Return the facts of a model without a current sensor."""
+    """Describe a model without a current sensor."""
     return ModelFacts(motor, differs, current_unit_a=0.0, operating_modes=frozenset({1, 3, 4, 16}))
 
 
@@ -282,4 +282,4 @@ OTHER_SERIES: Mapping[str, Mapping[str, RegisterFacts]] = {
         "Punch": _Facts(32, _STRENGTH),
     }
 }
-"""Registers of models outside the X series, where their e-Manual pages describe them."""
+"""Registers of models outside the X series, as far as their e-Manual pages describe them."""

@@ -173,7 +173,7 @@ class Present:
         return current
 
     def _measure_other(self, now: float, position: float) -> None:
-        """Update the position of a model of another series, in ticks of an X-series encoder, if it has the register."""
+        """Update Realtime Tick and Present Position (in ticks of an X-series encoder) of a model of another series."""
         register = self._model.registers.get("Present Position")
         if register is not None and register.size == 4:
             self._memory.store(register, round(self.ticks(position)))

@@ -1,13 +1,13 @@
 """One fake servo: a control table as a state machine, independent of bus and plant (see `hil.fakes.bus.bus`).
 
 The behaviour follows the ROBOTIS e-Manual (protocol2 and x/<model> pages). Where the manual is silent, the fake chooses
-the behaviour that demands more of a client: see "Conformance" in docs/fake-bus.md, and:
+the behaviour that demands more of a client: see "Conformance" in docs/fake-bus.md. Moreover:
 
 - A write must begin and end on register boundaries. One that begins or ends inside a writable register causes a Data
   Length error; other violations cause an Access error. A read may begin inside a register; undefined bytes between two
   registers read as 0. A read that begins or ends at an undefined address causes an Access error.
 - When the Bus Watchdog trips, Goal Current, Goal PWM and Goal Velocity become 0, Goal Position becomes Present
-  Position, and torque stays enabled. While tripped, only 0 may be written to it.
+  Position, and torque stays enabled. The watchdog's register then accepts only 0.
 - At power-up, and after a change of Operating Mode, Goal Current and Goal PWM equal their limits: if a client enables
   torque in current mode without first writing a goal, full current flows. Goal Velocity is 0.
 
@@ -161,7 +161,7 @@ class EmulatedServo(Powered):
         self.power_up(now, self._angle, boot_s)
 
     def hears(self, now: float, baud: int) -> bool:
-        """Return whether the servo receives a packet at this baud rate that ends at `now` [s]."""
+        """Return whether the servo receives a packet that is sent at this baud rate and ends at `now` [s]."""
         return self.baud == baud and self.connected and now >= self.ready_at
 
     def trip_watchdog(self) -> None:

@@ -131,7 +131,7 @@ def _earlier(config: Config, shown: Path, path: Path) -> Result:
     if config.is_chain or not config.experiment.pilot:
         why = "this arm is spatial" if config.is_chain else "this file gives peak_torque, so no pilot runs"
         raise ConfigError(
-            f"{shown}: an earlier run can only replace the prior of a planar arm's pilot (experiment.pilot = true), "
+            f"{shown}: an earlier run can replace the prior only in a planar arm's pilot (experiment.pilot = true), "
             f"but {why}."
         )
     return earlier_result(config, path)

@@ -17,7 +17,7 @@ Stage = Literal["experiment", "estimation", "simulation", "check"]
 
 @dataclass(frozen=True)
 class Progress:
-    """One progress report; sent about 20 times a second while the arm moves, and whenever there is a message.
+    """One progress report, sent about 20 times a second while the arm moves, and whenever there is a message.
 
     stage: what the call is doing. message: a sentence for the user; empty if there is nothing new to say. stream: while
     the arm moves, the number of samples taken, the phase, and the latest state of every joint.

@@ -46,7 +46,7 @@ def near_by_design(space: Space) -> Iterator[str]:
 
 
 def _same_direction(config: Config, joint: JointConfig) -> str:
-    """Warn that both servos of a joint are configured to turn the same way, which is rarely right; otherwise ""."""
+    """Warn if both servos of a joint are set to turn the same way, which is rarely right; otherwise return ""."""
     if len(joint.ids) == 1 or len(set(joint.directions)) > 1:
         return ""
     (first, second), sign = joint.ids, joint.direction
@@ -73,7 +73,7 @@ def _how_to_compare(config: Config) -> str:
 
 
 def _weak(joint: JointConfig) -> str:
-    """Warn that a joint's limit allows less torque than the typical friction of its servos; otherwise ""."""
+    """Warn if a joint's limit allows less torque than the typical friction of its servos; otherwise return ""."""
     friction = len(joint.ids) * servo_prior(joint.joint.servo).coulomb.median
     torque = joint.goal_limit * joint.torque_per_goal
     if torque > friction:

@@ -39,7 +39,7 @@ def mesh_corners(name: str, urdf: Path) -> Array:
         raise UnreadMesh("there is no such file in the URDF's folder or any folder above it")
     read = {".stl": _stl, ".obj": _obj}.get(path.suffix.lower())
     if read is None:
-        raise UnreadMesh("only STL and OBJ files can be read; convert it")
+        raise UnreadMesh("only STL and OBJ files can be read; convert the file")
     try:
         is_small = path.stat().st_size <= MOST_BYTES
         found = read(path.read_bytes()) if is_small else None

@@ -188,7 +188,7 @@ def _around(here: list[Placed], arm: ArmDescription, link: int) -> tuple[list[Ca
 
 
 def _placed(arm: ArmDescription) -> list[Placed]:
-    """For each link of a URDF: the moving link it is fixed to, its frame and its element. Empty for other formats."""
+    """For each link of a URDF: element, frame, and the moving link to which it is fixed. Empty for other formats."""
     if b"<robot" not in arm.path.read_bytes():
         return []
     root = parse_urdf(arm.path)

@@ -13,6 +13,7 @@ from hil.clearance.shapes import Shapes
 from hil.config.chain import described_arm
 from hil.config.schema import Config
 from hil.description.arm import ArmDescription
+from hil.description.motion import rotation_about
 from hil.description.urdf import rotation_of
 
 Array = NDArray[np.float64]
@@ -24,7 +25,7 @@ design.
 
 NEAR_SHARE, NEAR_SHARE_OF_OTHERS = 0.75, 0.98
 """Two capsules that are closer than BUILT_NEAR in at least this fraction of random poses are near each other by design:
-they must not touch, but need no margin. First value: if exactly one link lies between them; second: if more do.
+they must not touch, but need no margin. The first value applies if one link lies between them, the second if more do.
 """
 
 BUILT_NEAR = 0.02  # m beyond the margin
@@ -149,7 +150,7 @@ class Space:
         frames = [(np.eye(3), np.zeros(3))]
         for turn, shift, around, angle in zip(rotation, translation, axis, position, strict=True):
             former, origin = frames[-1]
-            frames.append((former @ turn @ _about(around, float(angle)), origin + former @ shift))
+            frames.append((former @ turn @ rotation_about(around, float(angle)), origin + former @ shift))
         link, ends, radius, _, _ = self._arrays
         placed = [each @ frames[at][0].T + frames[at][1] for at, each in zip(link, ends, strict=True)]
         return np.array(placed).reshape(-1, 2, 3), radius
@@ -297,11 +298,3 @@ def _touched(joints: int, link: NDArray[np.int64], contacts: NDArray[np.int64]) 
         ends = sorted((int(link[first]), int(link[second]) if second >= 0 else 0))
         touched[ends[0] : ends[1]] = True
     return touched
-
-
-def _about(axis: Array, angle: float) -> Array:
-    """Rotation matrix about an axis."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turned: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
-    return turned

@@ -1,7 +1,7 @@
 """The `hil` command: its subcommands in the order in which the help lists them, and its error handling.
 
-The modules imported here only define the arguments of the subcommands; the modules that do the work are imported inside
-the commands, so that `hil --help` responds immediately.
+The modules imported here only define the arguments of the subcommands; those that do the work are imported inside the
+commands, so that `hil --help` responds immediately.
 """
 
 import os
@@ -97,12 +97,12 @@ for _name, (_command, _example) in COMMANDS.items():
 
 @cache
 def _built() -> Callable[[], object]:
-    """Return the Click command; without the cache, Typer would spend 10 ms rebuilding it in every call of `main`."""
+    """Return the Click command, cached because Typer takes 10 ms to build it."""
     return typer.main.get_command(app)
 
 
 def _one_blas_thread() -> None:
-    """Limit BLAS to one thread unless the user chose a number; BLAS reads it when numpy is first imported.
+    """Limit BLAS to one thread unless the user chose a number. BLAS reads the number when numpy is first imported.
 
     hil's matrices are small. On two busy cores, two spinning threads took 91 ms for a singular value decomposition that
     takes one thread 1 ms.
@@ -112,7 +112,7 @@ def _one_blas_thread() -> None:
 
 
 def main() -> NoReturn:
-    """Run the command line; an expected error becomes a message on standard error and an exit code."""
+    """Run the command line; turn an expected error into a message on standard error and an exit code."""
     _one_blas_thread()
     try:
         with _code_as_asked():

@@ -1,6 +1,6 @@
 """The subcommands that work on the servos of a bus: scan, check, pose, setup.
 
-The modules that do the work are imported inside the commands, so that `hil --help` responds immediately.
+The modules that do the work are imported inside the commands, as in hil.cli.app.
 """
 
 import json

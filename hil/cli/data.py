@@ -14,7 +14,7 @@ from hil.cli.options import Json, RunPath
 
 def compare(
     run: RunPath,
-    mujoco: Annotated[bool, typer.Option("--mujoco", help="Include mujoco.sysid; needs the extra `peers`.")] = False,
+    mujoco: Annotated[bool, typer.Option("--mujoco", help="Include mujoco.sysid; needs the `peers` extra.")] = False,
     json_only: Json = False,
 ) -> None:
     """Apply other methods to a run's recording: RLS, EKF, UKF, IDIM-LS, Zhu et al. (docs/paper.md), mujoco.sysid.

@@ -26,7 +26,7 @@ def dry_run(
     ] = False,
     json_only: Json = False,
 ) -> None:
-    """Simulate the experiment on arms like yours; exit code 1 if it might exceed a limit."""
+    """Simulate the experiment on arms like yours; the exit code is 1 if a limit might be exceeded."""
     from hil.api.dry_run import dry_run as simulate
     from hil.cli.terminal import Terminal
     from hil.dry_run.chain_summary import ChainDryRun, print_chain_dry_run
@@ -39,7 +39,7 @@ def dry_run(
     if picture is not None and not picture.absolute().parent.is_dir():
         raise typer.BadParameter(f"--picture {picture}: the folder {picture.parent} does not exist. Create it first.")
     if picture is not None and picture.suffix not in (".png", ".svg", ".html"):
-        raise typer.BadParameter(f"--picture {picture}: its name must end in .png, .svg or .html.")
+        raise typer.BadParameter(f"--picture {picture}: the file name must end in .png, .svg or .html.")
     with Terminal(quiet=json_only).following(config) as follow:
         rehearsal = simulate(config, result=result, arms=arms, servos=servos, on_progress=follow)
     if picture is not None and picture.suffix == ".html":

@@ -3,10 +3,10 @@
 import errno
 
 _OF_THE_MACHINE = frozenset({errno.EMFILE, errno.ENFILE})
-"""Operating-system errors that no input causes: too many open files."""
+"""Operating-system errors that do not depend on the input: too many open files."""
 
 _OF_A_PATH = frozenset({errno.ENAMETOOLONG, errno.EACCES})
-"""Errors that even a check whether a file exists may raise."""
+"""Errors that even checking whether a file exists may raise."""
 _LONGEST = 80  # characters of a path in their message
 
 

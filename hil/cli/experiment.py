@@ -1,6 +1,6 @@
 """The subcommands that identify, record and estimate.
 
-The modules that do the work are imported inside the commands, so that `hil --help` responds immediately.
+The modules that do the work are imported inside the commands, as in hil.cli.app.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,7 @@ TakeOver = Annotated[
 ]
 StartFrom = Annotated[
     Path | None,
-    typer.Option("--from", metavar="RUN", help="Earlier run of the same arm: its result replaces the pilot's prior."),
+    typer.Option("--from", metavar="RUN", help="Earlier run of the same arm, whose result replaces the prior."),
 ]
 Live = Annotated[
     str,
@@ -39,7 +39,7 @@ Recordings = Annotated[
     list[Path],
     typer.Argument(
         metavar="RUN | FILE ..",
-        help="Run folder; or recordings of one arm: CSV, Parquet, MCAP, LeRobot dataset, ROS 2 bag.",
+        help="Run folder, or recordings of one arm (CSV, Parquet, MCAP, LeRobot dataset, ROS 2 bag).",
     ),
 ]
 ArmPath = Annotated[

@@ -48,7 +48,7 @@ def list_faults() -> None:
 
 
 def move_by_hand(device: Path, moves: list[str], release: list[int]) -> None:
-    """Move or release joints of the fake arm served at `device`. They only move while torque is off. Raises
+    """Move or release joints of the fake arm served at `device`. They move only while torque is off. Raises
     ConfigError.
     """
     try:
@@ -123,10 +123,10 @@ def _load(config: Path, faults: list[str], moves: list[str], seed: int | None) -
     ids = [servo.id for servo in fake.servos]
     for text, fault in zip(faults, added, strict=True):
         if fault.servo is not None and fault.servo not in ids:
-            raise ConfigError(f'fault "{text}": servo = {fault.servo}: the IDs in {config} are {ids}')
+            raise ConfigError(f'fault "{text}": servo = {fault.servo}, but the IDs in {config} are {ids}')
     for text, move in zip(moves, moved, strict=True):
         if move.servo not in ids:
-            raise ConfigError(f'move "{text}": servo = {move.servo}: the IDs in {config} are {ids}')
+            raise ConfigError(f'move "{text}": servo = {move.servo}, but the IDs in {config} are {ids}')
     return fake.model_copy(
         update={
             "faults": fake.faults + added,

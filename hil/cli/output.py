@@ -1,4 +1,4 @@
-"""Handle failures of standard output: its reader has closed the pipe, or the disk is full. Results are saved first."""
+"""Handle a closed pipe or a full disk on standard output. Results are saved first."""
 
 import errno
 import os

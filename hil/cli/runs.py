@@ -83,7 +83,7 @@ def diff(
     before: Annotated[Path, typer.Argument(metavar="RUN", help="Earlier run (or result.json, or exported TOML).")],
     after: Annotated[Path, typer.Argument(metavar="RUN", help="Later run of the same arm.")],
     png: Annotated[
-        Path | None, typer.Option("--png", metavar="FILE", help="Plot the differences; needs the extra `png`.")
+        Path | None, typer.Option("--png", metavar="FILE", help="Plot the differences; needs the `png` extra.")
     ] = None,
     json_only: Json = False,
 ) -> None:
@@ -134,7 +134,7 @@ def _print_difference(difference: "Difference") -> None:
 
 
 def _would_show(detectable: "Mapping[str, float]") -> list[str]:
-    """Describe the smallest change in each friction term, taken alone, that two such runs would reveal [%, by name]."""
+    """Describe the smallest change in each friction term alone that two runs like these would reveal [%, by name]."""
     least = [f"{name} {percent:.2g} %" for name, percent in detectable.items() if percent <= _WHOLE]
     never = [name for name, percent in detectable.items() if percent > _WHOLE]
     lines = []

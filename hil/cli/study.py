@@ -45,7 +45,7 @@ def study(
         from hil.study.run import run_study
     except ImportError as error:
         raise MissingExtra(
-            f"hil study needs the extra `study` ({error.name} is missing): pip install 'hil[study]'."
+            f"hil study needs the `study` extra ({error.name} is missing): pip install 'hil[study]'."
         ) from error
     checked = load_study(study_path)
     folder = out or Path("studies") / study_path.stem

@@ -1,4 +1,4 @@
-"""Requirements on the configuration of a spatial arm, and its description read from a URDF."""
+"""Requirements on the configuration of a spatial arm, and the arm's description read from a URDF."""
 
 import math
 from collections.abc import Iterator
@@ -57,9 +57,9 @@ def doubted_limits(config: "Config") -> Iterator[str]:
         if described.limits is None or described.limits == (0.0, 0.0):  # the latter means that limits are missing
             continue
         lower, upper = described.limits
-        where = f'{arm.path.name}: joint "{joint.name}": its limits are [{lower:g}, {upper:g}] rad'
+        where = f'{arm.path.name}: the limits of joint "{joint.name}" are [{lower:g}, {upper:g}] rad'
         if lower >= upper:
-            wrong = ": they are equal" if lower == upper else ": the lower limit must come first"
+            wrong = ", but they are equal" if lower == upper else ", but the lower limit must come first"
             yield f"{where}{wrong}. They are ignored; correct them."
             continue
         if max(-lower, upper) > _MOST_TURNED_RAD:

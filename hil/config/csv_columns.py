@@ -1,4 +1,4 @@
-"""Description of a recording made elsewhere: its columns, their units, and a few facts about the arm.
+"""Description of a recording made elsewhere: its columns, their units, and some properties of the arm.
 
 The TOML file of an experiment can be used, or a shorter one; tables that only the bus needs are ignored.
 
@@ -100,7 +100,7 @@ class Columns(_Table):
 
     @property
     def drive(self) -> Literal["torque", "current", "voltage", "pwm"] | None:
-        """Kind of the columns that describe how the joints were driven; None if there are no such columns."""
+        """Kind of column that describes how the joints were driven; None if there are no such columns."""
         kinds: tuple[Literal["torque", "current", "voltage", "pwm"], ...] = ("torque", "current", "voltage", "pwm")
         return next((kind for kind in kinds if getattr(self, kind) is not None), None)
 
@@ -118,7 +118,7 @@ class Columns(_Table):
     def _consistent(self) -> Self:
         drives = [kind for kind in ("torque", "current", "voltage", "pwm") if getattr(self, kind) is not None]
         if len(drives) > 1:
-            raise ValueError(f"columns: {' and '.join(drives)} are both given: give only one of them")
+            raise ValueError(f"columns: {' and '.join(drives)} are both given; give only one of them")
         if self.time is not None and self.rate is not None:
             raise ValueError("columns: give either time or rate, not both")
         if self.current is not None and self.torque_constant is None:
@@ -189,8 +189,8 @@ class RecordingConfig(BaseModel):
         count = len(self.columns.position or ())
         if count > PLANAR and self.arm.urdf is None:
             raise ValueError(
-                f"columns.position: {count} joints need arm.urdf, which gives the geometry, and one [[joints]] table "
-                "with its name for each; without a URDF, an arm has one or two joints"
+                f"columns.position: {count} joints need arm.urdf, which gives the geometry, and a [[joints]] table "
+                "with a name for each joint; without a URDF, an arm has one or two joints"
             )
         return self
 

@@ -52,7 +52,7 @@ class ExperimentConfig(Table):
         if abs(samples - round(samples)) > 1e-9 * samples:
             nearest = max(1, round(samples))
             raise ValueError(
-                f"rate * period = {samples:g}: must be a whole number of samples; nearest valid value: "
+                f"rate * period = {samples:g} must be a whole number of samples; the nearest valid value is "
                 f"period = {nearest / self.rate:.12g}"
             )
         if (self.band is None) == (self.lines is None):

@@ -108,9 +108,7 @@ class JointConfig(Table):
                 raise ValueError(f"{name} is missing; {mode} mode needs it")
         for name, value in zip(names[not pwm], values[not pwm], strict=True):
             if value is not None:
-                raise ValueError(
-                    f"{name} = {value:g}: it has no meaning in {mode} mode; use {' and '.join(names[pwm])}"
-                )
+                raise ValueError(f"{name} = {value:g} has no meaning in {mode} mode; use {' and '.join(names[pwm])}")
         return self
 
     @property

@@ -371,7 +371,7 @@ def parse_config(text: str, path: Path, *, recorded: bool = False) -> Config:
 
 
 def _without_lengths(path: Path, values: dict[str, Any]) -> Config:
-    """The configuration, without arm.link_lengths if the arm is spatial; only planar arms have them."""
+    """The configuration, without arm.link_lengths if the arm is spatial; only planar arms have this key."""
     lengths = {key: value for key, value in values["arm"].items() if key != "link_lengths"}
     with suppress(ValidationError):
         spatial = Config(path=path, **{**values, "arm": lengths})

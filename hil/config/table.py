@@ -9,7 +9,7 @@ from hil.toml_errors import UNSAID
 
 
 class Table(BaseModel):
-    """Base class of all tables: frozen; unknown keys, wrong types, infinity and NaN are errors."""
+    """Base class of all tables, which are frozen and reject unknown keys, wrong types, infinity and NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 

@@ -44,7 +44,7 @@ class Body:
         centre = (self.mass * self.centre + other.mass * other.centre) / mass
         inertia = np.zeros((3, 3))
         for body in (self, other):
-            inertia += body.inertia + body.mass * _steiner(body.centre - centre)
+            inertia += body.inertia + body.mass * steiner(body.centre - centre)
         return Body(mass, centre, inertia)
 
     @property
@@ -53,7 +53,7 @@ class Body:
 
         The inertia is in the order xx, xy, xz, yy, yz, zz.
         """
-        about = self.inertia + self.mass * _steiner(self.centre)
+        about = self.inertia + self.mass * steiner(self.centre)
         upper = [about[row, column] for row in range(3) for column in range(row, 3)]
         return np.array([self.mass, *(self.mass * self.centre), *upper])
 
@@ -132,7 +132,7 @@ class ArmDescription:
         return rotation, translation, axis
 
 
-def _steiner(offset: Array) -> Array:
+def steiner(offset: Array) -> Array:
     """Inertia (3, 3) [m^2] that a unit mass at this offset (3,) [m] adds (parallel-axis theorem)."""
     shifted: Array = np.dot(offset, offset) * np.eye(3) - np.outer(offset, offset)
     return shifted

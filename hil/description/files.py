@@ -12,7 +12,7 @@ _MJCF = re.compile(r"<mujoco[\s>]")
 
 
 def read_arm(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
-    """Read the arm formed by these joints, from the base outwards; by default, by all rotating joints. Raises
+    """Read the arm formed by these joints, from the base outwards; the default is all rotating joints. Raises
     ArmFileError.
     """
     return read_mjcf(path, joints) if is_mjcf(path) else read_urdf(path, joints)

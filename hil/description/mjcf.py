@@ -25,7 +25,7 @@ USUAL_GRAVITY = (0.0, 0.0, -9.81)
 
 
 def read_mjcf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
-    """Read the arm formed by these joints, from the base outwards; by default, by all hinges. The base is MuJoCo's
+    """Read the arm formed by these joints, from the base outwards; the default is all hinges. The base is MuJoCo's
     world.
 
     Raises ArmFileError for the same reasons as `hil.description.urdf.read_urdf`, and if MuJoCo is not installed.
@@ -245,8 +245,8 @@ class _Tree:
         return number.get(body, 0), rotation, translation - self._pivot(body)
 
     def rigid(self, body: int, chosen: set[int]) -> tuple[Body, list[str], list[str]]:
-        """A body in the frame of its joint, merged with everything fixed to it; the names of the merged bodies; and the
-        names of the joints held.
+        """Merge a body with everything fixed to it, in the frame of its joint. Also returns the names of the merged
+        bodies and of the joints held.
         """
         merged, fixed, held = self._merged(body, chosen)
         return merged.moved(np.eye(3), -self._pivot(body)), fixed, held

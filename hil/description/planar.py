@@ -38,7 +38,7 @@ def _first_link(arm: ArmDescription, offsets: list[Array]) -> Array:
 
 
 def _level(axis: Array, link: Array, down: Array) -> bool:
-    """Whether the part of `link` normal to `axis` is also normal to `down`, and positive rotation about the axis
+    """Whether the component of `link` normal to `axis` is also normal to `down`, and positive rotation about the axis
     lifts it.
     """
     across = link - axis * float(axis @ link)

@@ -35,7 +35,7 @@ class _Joint:
 
 
 def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
-    """Read the arm formed by these joints, in order from the base; by default, by all rotating joints.
+    """Read the arm formed by these joints, in order from the base; the default is all rotating joints.
 
     Raises ArmFileError for anything that is not a URDF of a serial arm: loops; joints that do not exist, do not form
     one branch, are prismatic or mimic others; links without mass; axes that are not unit vectors; units that are not
@@ -94,7 +94,7 @@ def parse_urdf(path: Path) -> ET.Element:
     except ET.ParseError as error:
         raise ArmFileError(f"{path} is not XML: {error}") from error
     if root.tag != "robot":
-        raise ArmFileError(f"{path}: its root is <{root.tag}>, not <robot>: it is not a URDF")
+        raise ArmFileError(f"{path} is not a URDF: its root is <{root.tag}>, not <robot>")
     if "<xacro:" in text:
         raise ArmFileError(
             f"{path} contains xacro macros: expand them into another file first (xacro {path.name} > "
@@ -126,8 +126,8 @@ def _without_inertia(root: ET.Element, links: Container[str | None]) -> Iterator
             continue
         if float(mass.get("value", "nan")) > 0.0:
             yield (
-                f'link "{element.get("name")}": it has a mass but no <inertia>, so it counts as a point '
-                "mass; this is used only as an initial guess"
+                f'link "{element.get("name")}" has a mass but no <inertia>, so it counts as a point '
+                "mass, which is used only as an initial guess"
             )
 
 
@@ -152,7 +152,7 @@ def _body(element: ET.Element | None, where: str, path: Path) -> Body:
 
 
 def _check_shapes(link: ET.Element, where: str, path: Path) -> None:
-    """Raise ArmFileError for a wrong size or origin in a link's collision geometry, or visual if it has none."""
+    """Raise ArmFileError for a wrong size or origin in a link's collision (otherwise visual) geometry."""
     for element in link.findall("collision") or link.findall("visual"):
         _origin(element, where, path)
         for shape in element.find("geometry") or ():
@@ -160,12 +160,12 @@ def _check_shapes(link: ET.Element, where: str, path: Path) -> None:
                 _three(shape, "scale", where, path)
             for key in _LENGTHS.get(shape.tag, ()):
                 if shape.get(key) is None:
-                    raise ArmFileError(f"{path}: {where}: a {shape.tag} of its geometry has no {key}")
+                    raise ArmFileError(f"{path}: {where}: a {shape.tag} in its geometry has no {key}")
                 lengths = _three(shape, key, where, path) if key == "size" else [_number(shape, key, where, path)]
                 if min(lengths) < 0.0:
                     raise ArmFileError(
-                        f'{path}: {where}: a {shape.tag} of its geometry has {key}="{shape.get(key)}": lengths [m] '
-                        "cannot be negative"
+                        f'{path}: {where}: a {shape.tag} in its geometry has {key}="{shape.get(key)}", but lengths '
+                        "[m] cannot be negative"
                     )
 
 
@@ -194,7 +194,7 @@ def _joints(root: ET.Element, bodies: dict[str, Body], path: Path) -> dict[str, 
         moved[ends["child"]] = name
         kind = element.get("type", "")
         if kind not in (*MOVABLE, "fixed"):
-            raise ArmFileError(f"{path}: {where}: type {kind!r}: must be revolute, continuous, prismatic or fixed")
+            raise ArmFileError(f"{path}: {where} has type {kind!r}, not revolute, continuous, prismatic or fixed")
         rotation, translation = _origin(element, where, path)
         mimic = element.find("mimic")
         tree[name] = _Joint(
@@ -215,7 +215,7 @@ def _root_link(bodies: dict[str, Body], tree: dict[str, _Joint], path: Path) -> 
     children = {joint.child for joint in tree.values()}
     roots = [name for name in bodies if name not in children]
     if not roots:
-        raise ArmFileError(f"{path}: every link is some joint's child: the links form a loop; one must be the base")
+        raise ArmFileError(f"{path}: every link is a joint's child, so the links form a loop; one must be the base")
     if len(roots) > 1:
         raise ArmFileError(
             f"{path}: links {', '.join(roots)} have no parent joint: only one base link is allowed; attach the others "

@@ -1,4 +1,4 @@
-"""Search by dry runs for the largest torque per joint that keeps the risk of exceeding a limit acceptably low."""
+"""Use dry runs to find the largest torque per joint that keeps the risk of exceeding a limit acceptably low."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -196,7 +196,9 @@ def _polished(
 
 
 def _reached(config: Config, prediction: Prediction, share: float) -> Array:
-    """Fraction of its allowed range that each joint uses (joints,): the worst arm's or the predicted one if larger."""
+    """Fraction of its allowed range that each joint uses (joints,): the worst arm's, or the predicted one if that is
+    larger.
+    """
     deviations = NormalDist().inv_cdf(1 - config.safety.limit_chance / (2 * GUARDED))
     foreseen = prediction.share_at(deviations)[:GUARDED].max(axis=0)
     counted = prediction.shares[:, :GUARDED].max(axis=(0, 1))

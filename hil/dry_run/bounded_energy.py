@@ -6,6 +6,7 @@ simulated.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -34,11 +35,15 @@ class Boundary:
     high: Array
     least: float
 
+    @cached_property
+    def _constants(self) -> dict[str, float]:
+        return _by_name(self.physics)
+
     def holds(self, position: Array, velocity: Array) -> bool:
         """Whether an unpowered arm at `position` with `velocity` (joints,) [rad, rad/s] stays within its limits."""
         if not np.isfinite(self.least) or (position <= self.low).any() or (position >= self.high).any():
             return False
-        constants = _by_name(self.physics)
+        constants = self._constants
         energy = _kinetic(constants, position, velocity) + float(_potential(constants, position[:, None])[0])
         return energy < self.least
 

@@ -121,7 +121,7 @@ def simulated_seconds(plan: Plan) -> float:
 
 
 def loop_of(config: Config, segment: PathSegment, rate: float, stops: Array | None = None) -> Loop:
-    """Commands and feedback of the control loop during a segment. stops: on which side each joint lies on its own
+    """Commands and feedback of the control loop during a segment. stops: the side on which each joint lies on its own
     stop, as in `Loop`.
     """
     assert config.stabiliser is not None  # checked with the configuration

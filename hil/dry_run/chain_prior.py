@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config, PriorConfig
+from hil.description.arm import steiner
 from hil.drivers.servo_model import Mode
 from hil.drivers.servo_prior import servo_prior
 from hil.estimator.chain.model.dynamics import TERMS
@@ -56,14 +57,14 @@ def _links(random: np.random.Generator, described: Array, count: int, spread: fl
     for joint, row in enumerate(described):
         mass, moment = row[0], row[1:4]
         centre = moment / mass
-        about = _matrix(row[4:10]) - mass * _steiner(centre)
+        about = _matrix(row[4:10]) - mass * steiner(centre)
         factors = _log_normal(random, np.ones(2), np.array([spread, INERTIA_SPREAD]), count)
         shifts = CENTRE_STD * random.standard_normal((count, 3))
         shifts[0] = 0.0
         for arm in range(count):
             heavy, spread_out = factors[arm]
             at = centre + shifts[arm]
-            inertia = heavy * (max(spread_out, LEAST_INERTIA) * about + mass * _steiner(at))
+            inertia = heavy * (max(spread_out, LEAST_INERTIA) * about + mass * steiner(at))
             upper = [inertia[r, c] for r in range(3) for c in range(r, 3)]
             drawn[arm, joint] = [heavy * mass, *(heavy * mass * at), *upper]
     return drawn
@@ -106,8 +107,3 @@ def _log_normal(random: np.random.Generator, median: Array, spread: Array, count
 def _matrix(upper: Array) -> Array:
     xx, xy, xz, yy, yz, zz = upper
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-
-
-def _steiner(offset: Array) -> Array:
-    shifted: Array = np.dot(offset, offset) * np.eye(3) - np.outer(offset, offset)
-    return shifted

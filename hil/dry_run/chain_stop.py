@@ -33,7 +33,7 @@ LAID_DOWN = 0.95
 class Fall:
     """The hardest of the simulated falls.
 
-    moment: time in the path at which it starts [s]. hits: names of the colliding parts; None if nothing does within
+    moment: time in the path at which it starts [s]. hits: names of the colliding parts; None if nothing collides within
     FALL_S. seconds: duration [s]. height: largest descent [m]. speed: largest speed at its end [m/s]. beyond: largest
     overshoot of each joint beyond its limits in any fall (joints,) [rad].
     """

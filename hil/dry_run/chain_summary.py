@@ -52,11 +52,11 @@ class ChainDryRun:
         return tuple(float(value) for value in self.prediction.median[QUANTITIES.index("torque")])
 
     def is_safe(self, config: Config) -> bool:
-        """Whether every arm keeps its clearance and the guard is unlikely to stop it."""
+        """Whether every arm keeps its clearance and the guard is unlikely to stop any of them."""
         return not self.why_not(config)
 
     def why_not(self, config: Config) -> str:
-        """Explain why the motion, or a stop of it, is not safe; "" if both are safe."""
+        """Explain why the motion, or a stop during it, is not safe; "" if both are safe."""
         return self.doubt(config) if self.refused is None else self.refused
 
     def doubt(self, config: Config) -> str:

@@ -33,9 +33,9 @@ _MOST_COUPLING = 0.95  # relative to sqrt(inertia_1 inertia_2)
 class Ensemble:
     """An ensemble of possible arms.
 
-    physics: parameters of each arm. torque_scale: ratio of actual to commanded torque (arms, joints), because the
-    torque constant is uncertain too; 1 for arms drawn from a result, because its parameters are in units of the
-    commanded torque. source: "prior" or "result".
+    physics: parameters of each arm. torque_scale: ratio of actual to commanded torque (arms, joints), as uncertain as
+    the torque constant; 1 for arms drawn from a result, whose parameters are in units of the commanded torque. source:
+    "prior" or "result".
     """
 
     physics: tuple[Physics, ...]
@@ -118,7 +118,7 @@ def result_draws(result: Result, count: int, farther: float = 1.0, seed: int = 0
 
 
 def _draws(random: np.random.Generator, mean: Array, covariance: Array, count: int) -> Array:
-    """Draw from a normal distribution (count, parameters), scaled because parameters differ by orders of magnitude."""
+    """Draw (count, parameters) from a normal distribution, scaling parameters that differ by orders of magnitude."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-30))
     correlation = covariance / np.outer(scale, scale)
     size, axes = np.linalg.eigh(0.5 * (correlation + correlation.T))

@@ -26,7 +26,7 @@ from hil.dry_run.bounded_energy import Boundary, boundary
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import scaled_feedback
 from hil.estimator.models.parameters import CONSTANTS, Physics
-from hil.estimator.simulation.closed_loop import Feedback, Response, respond, resting
+from hil.estimator.simulation.closed_loop import Feedback, Response, Simulator, respond, resting
 from hil.estimator.simulation.many_arms import COARSE
 from hil.estimator.threads import thread_count
 from hil.plan.brake import GETS_FASTER, NOTICED_AFTER, braking_gains
@@ -255,7 +255,10 @@ class _Stops:
         nothing = np.zeros_like(constants)
         self._none = Feedback.none(len(config.joints))
         self._brake = Feedback(nothing, np.array(braking_gains(config)) * constants, nothing, self._clamp)
-        self._off: _Piece = (nothing, self._none, round(LONGEST_S * rate))
+        off_for = round(LONGEST_S * rate)
+        self._off: _Piece = (nothing, self._none, off_for)
+        judged = [sample for after in _JUDGED_AFTER_S if 0 < (sample := round(after * rate)) < off_for]
+        self._off_parts = np.diff([0, *judged, off_for]).tolist()
         self._braking = round(config.safety.damp_time * rate)
         self._heard_for = round(config.safety.watchdog * rate) + 1
         self._missed_for = math.ceil(missing_limit(config).seconds * rate) + _REACTION
@@ -264,10 +267,10 @@ class _Stops:
         """The largest overshoot beyond a limit (joints,) [rad]."""
         reached = np.zeros_like(scale)
         limits = {jammed: self._boundary(physics, jammed) for jammed in {start.jammed for start in starts}}
+        arms = {jammed: Simulator.of(each.physics, self._rate, COARSE) for jammed, each in limits.items()}
         for start in starts:
             for pieces in commands(start):
-                state = start.state
-                for moved in self._moved(limits[start.jammed], scale, state, pieces):
+                for moved in self._moved(arms[start.jammed], limits[start.jammed], scale, start.state, pieces):
                     low, high = moved.position.min(axis=1), moved.position.max(axis=1)
                     reached = np.maximum(reached, np.maximum(self._low - low, high - self._high))
         return reached
@@ -275,16 +278,18 @@ class _Stops:
     def _boundary(self, physics: Physics, jammed: int | None) -> Boundary:
         return boundary(physics if jammed is None else _held(physics, jammed), self._low, self._high)
 
-    def _moved(self, limits: Boundary, scale: Array, state: Array, pieces: list[_Piece]) -> Iterator[Response]:
+    def _moved(
+        self, arm: Simulator, limits: Boundary, scale: Array, state: Array, pieces: list[_Piece]
+    ) -> Iterator[Response]:
         """Yield the motion from `state`, piece by piece, as long as the arm may still leave its limits."""
         for piece in pieces:
             command, feedback, count = piece
-            held = np.repeat((command * scale)[:, None], count, axis=1)
             off = piece is self._off
-            at = [round(after * self._rate) for after in _JUDGED_AFTER_S if off]
-            for part in np.split(held, [sample for sample in at if 0 < sample < count], axis=1):
-                torque = np.ascontiguousarray(part)
-                moved = respond(limits.physics, state, torque, self._rate, scaled_feedback(feedback, scale), COARSE)
+            torque, felt = (command * scale)[:, None], scaled_feedback(feedback, scale)
+            for samples in self._off_parts if off else (count,):
+                held = np.empty((len(torque), samples))
+                held[:] = torque
+                moved = arm.respond(state, held, felt)
                 state = moved.state
                 yield moved
                 if off and limits.holds(state[0], state[1]):

@@ -42,8 +42,8 @@ class DryRun:
 
     source: "prior" or "result". arms: number of simulated arms. asked: prediction for the configured
     experiment.peak_torque, None if not configured. largest: the largest safe torque with its prediction; None if no
-    torque is safe for all arms, so that only a pilot can find one. servos: messages from reading the servos. first: the
-    first run of the pilot, None if the torque is configured.
+    torque is safe for all arms, in which case only a pilot can find one. servos: messages from reading the servos.
+    first: the first run of the pilot, None if the torque is configured.
     """
 
     source: str
@@ -220,7 +220,7 @@ def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> 
     if largest is None:
         return [
             *lines,
-            "No torque is yet known to be safe for every arm in the whole experiment; the pilot will find one.",
+            "No torque is yet known to be safe for every arm throughout the experiment; the pilot will find one.",
             f"SAFE: {starts}{closer}. The guard would stop and brake {chance} of the simulated arms at these limits, "
             "and the pilot also learns from such stops.",
         ]

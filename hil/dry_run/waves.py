@@ -31,7 +31,7 @@ def roomy_plan(config: Config, physics: Physics) -> Plan:
 
 
 def roomy_plans(config: Config, physics: Physics, count: int) -> list[Plan]:
-    """Return up to `count` plans like `roomy_plan`, best first. They differ in the variant of the first multisine."""
+    """Return up to `count` plans, best first: `roomy_plan` with different variants of the first multisine."""
     problem = design_problem(config, physics, ())
     plan = with_peaks(config, _torque_limits(config))
     first, *others = [_variants(config, problem, segment) for segment in plan.segments]

@@ -12,7 +12,7 @@ from hil.config.schema import Config
 from hil.errors import RecordingCutShort
 from hil.estimation.drive.currents import settled_current_findings
 from hil.estimation.model_from_config import voltage_driven
-from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts
+from hil.estimation.result import QUANTISATION_FLOOR_TICKS, arm_facts, quantities
 from hil.estimation.result_checks import describe_chain_choice
 from hil.estimation.settled_period import settled_period
 from hil.estimation.settled_warnings import warnings_of
@@ -30,7 +30,7 @@ from hil.estimator.models.conflicts import Trust, conflict_sentences, contradict
 from hil.fakes.plants.arm import armature
 from hil.plan.chain_model import KnownChain, known_chain, torque_constant_stds
 from hil.plan.plan import HELD_OUT, IDENTIFY
-from hil.results.parts import ChainFacts, Covariance, Quantity, RunTiming, SettledFit, Validation, Verdict
+from hil.results.parts import ChainFacts, Covariance, RunTiming, SettledFit, Validation, Verdict
 from hil.results.result import SettledResult
 from hil.runs.period_file import PlayedPeriod, save_periods
 from hil.runs.recording import load_samples
@@ -69,13 +69,13 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
     seconds = round(time.perf_counter() - started, 3)
     linear = len(model.linear_names)
     currents = settled_current_findings(config, samples)
-    truth, extra = true_chain_parameters(config, known), _quantities(estimate, linear, len(estimate.names))
+    truth, extra = true_chain_parameters(config, known), quantities(estimate, linear, len(estimate.names))
     result = SettledResult(
         method="settled period, least squares on Fourier lines, then maximum likelihood of one-step-ahead "
         f"position predictions with an observer of {estimate.softness:g} Hz; {model.description}",
         config=facts.config,
         joints=len(config.joints),
-        parameters=_quantities(estimate, 0, linear),
+        parameters=quantities(estimate, 0, linear),
         extra=extra,
         covariance=Covariance(estimate.names, tuple(map(tuple, estimate.covariance.tolist()))),
         fit=SettledFit(
@@ -169,13 +169,6 @@ def _facts(config: Config, estimate: ChainEstimate, known: KnownChain) -> ChainF
         held=arm.held,
         doubts=arm.doubts,
     )
-
-
-def _quantities(estimate: ChainEstimate, start: int, end: int) -> dict[str, Quantity]:
-    return {
-        estimate.names[index]: Quantity(float(estimate.value[index]), float(estimate.std[index]), estimate.units[index])
-        for index in range(start, end)
-    }
 
 
 def unmoved(config: Config, position: NDArray[np.float64]) -> list[str]:

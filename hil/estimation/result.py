@@ -7,6 +7,7 @@ from hil.arm_model import JointFacts
 from hil.config.schema import Config
 from hil.estimation.truth import scaled, true_parameters
 from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.fit.fitted_parameters import FittedParameters
 from hil.estimator.identify import Estimate
 from hil.results.parts import ArmFacts, Covariance, ModelChoice, Quantity, RunTiming, SettledFit, Validation, Verdict
 from hil.results.result import SettledResult
@@ -35,13 +36,13 @@ def make_result(
 ) -> SettledResult:
     """Build the result of one run; `mean_time` is the mean time of the period's samples on the port's clock [s]."""
     base = len(estimate.model.base_names)
-    truth, extra = true_parameters(config, mean_time), _quantities(estimate, base, len(estimate.names))
+    truth, extra = true_parameters(config, mean_time), quantities(estimate, base, len(estimate.names))
     return SettledResult(
         method=f"settled period, least squares on Fourier lines, then maximum likelihood; "
         f"{estimate.model.friction} friction, {estimate.model.drive} drive",
         config=shown_path,
         joints=len(config.joints),
-        parameters=_quantities(estimate, 0, base),
+        parameters=quantities(estimate, 0, base),
         extra=extra,
         covariance=Covariance(tuple(estimate.names), tuple(map(tuple, estimate.covariance.tolist()))),
         fit=SettledFit(
@@ -83,7 +84,8 @@ def arm_facts(config: Config) -> ArmFacts:
     return ArmFacts(config.arm.gravity, tuple(config.arm.rest_pose), joints)
 
 
-def _quantities(estimate: Estimate, start: int, end: int) -> dict[str, Quantity]:
+def quantities(estimate: FittedParameters, start: int, end: int) -> dict[str, Quantity]:
+    """The parameters with these indices, by name."""
     return {
         estimate.names[index]: Quantity(float(estimate.value[index]), float(estimate.std[index]), estimate.units[index])
         for index in range(start, end)

@@ -108,7 +108,7 @@ def contradictions(
         if name in said or not abs(math.log(value)) > math.hypot(apart * spread, CONTRADICTORY * ratio.std / value):
             continue
         found.append(
-            f"The {_STATES[source]} of {joints[0]} and {joint} contradict each other by a factor of "
+            f"The {_STATES[source]} of {joints[0]} and {joint} disagree by a factor of "
             f"{max(value, 1.0 / value):.3g}: {_relative(joints[0], [(joint, ratio)], source)}, and torque constants "
             f"are uncertain by only {100 * spread:.2g} % relative to each other. The values of all joints are relative "
             f"to the torque of {joints[0]} and share its error: {_CHECK[source]}."

@@ -10,9 +10,20 @@ deviation sigma, grows by
 
     [(distance from the commanded current)^2 - (distance from zero)^2] / (2 sigma^2)
 
-per sample. The step is bounded so that no single reply decides, and the sum is kept at or above zero. Each sample is
-weighted by the time that it represents. The commanded current is any value between the last two goals,
-because a reply may be measured before or after the motor follows the latest goal.
+per sample. The step is bounded so that no single reply decides, and the sum is kept at or above zero. The commanded
+current is any value between the last two goals, because a reply may be measured before or after the motor follows the
+latest goal, and its sensor may have a scale error of `GAIN_ERROR`.
+
+Two thresholds must be exceeded. Errors of successive replies may be related, so each reply is also weighted by the time
+that it represents: the weighted sum has to reach that of `LOST_AFTER_S`. Where replies are few, that would be one or
+two, and one of thousands of looks would exceed it by chance. From any one look on, the unweighted sum exceeds h with a
+probability of at most exp(-h), whatever the goals, because the mean likelihood ratio of a healthy motor is at most 1:
+the number of looks in a run determines `LEAST_RATIO`.
+
+A servo whose readings are frozen while its joint stands still shows no deviation until the goal has moved far from the
+frozen current. But a current that is controlled never stays exactly the same while its goal changes: if all three
+readings do for `FROZEN_S` and the goal has meanwhile changed by more than two sigma, they are frozen. A current of zero
+does not count, since a sensor may have a dead zone there.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
 that it keeps for a joint is a record of the type `MEMORY`.
@@ -27,34 +38,48 @@ from hil.config.joint import JointConfig
 
 __all__ = ["MEMORY", "begin", "look"]
 
-SIGMA_SHARE = 0.1
-"""Standard deviation of ordinary sensor and current-loop errors, relative to the planned peak."""
+GAIN_ERROR = 0.2
+"""Largest scale error of a current sensor in order."""
 
-SIGMA_TICKS = 4.0
+SIGMA_SHARE = 0.05
+"""Standard deviation of other sensor and current-loop errors, relative to the planned peak."""
+
+SIGMA_TICKS = 2.0
 """Lower bound of the standard deviation of current errors, in register ticks."""
+
+ALLOWED_TICKS = 4.0
+"""Lower bound of the accepted deviation, in register ticks."""
 
 LOST_AFTER_S = 0.03
 """Time for which a current must look like zero, at full weight, before it counts as zero [s]."""
 
-_FULL_WEIGHT = 2.0
-"""Upper bound on the log likelihood ratio of one sample: that of a commanded current of two sigma if zero is measured.
-"""
+FROZEN_S = 0.1
+"""Time for which all readings must be exactly the same before they count as frozen [s]."""
+
+_FULL_WEIGHT = 5.0
+"""Upper bound on the log likelihood ratio of one sample: that of a goal of four sigma if zero is measured."""
+
+LEAST_RATIO = 10.0
+"""Log likelihood ratio at which a current counts as zero, however low the rate: at least two samples."""
 
 _FEWEST = 2
-"""Minimum number of samples before a current counts as zero, however low the rate."""
+"""Minimum number of samples that differ from the goal before they are reported, however low the rate."""
 
 MEMORY = np.dtype(
     [
         *((name, "f8") for name in ("per_square", "allowed", "share", "follow_time")),
-        *((name, "f8") for name in ("former_goal", "evidence", "count", "differs_for", "differs")),
+        *((name, "f8") for name in ("former_goal", "evidence", "ratio", "count", "differs_for", "differs")),
+        *((name, "f8") for name in ("carried", "same_since_goal", "same_for")),
     ]
 )
 """Constants and state of the check of one joint.
 
 per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V]; share: the same, relative to the goal; follow_time:
 how long a larger deviation may last [s].
-evidence, count: sum of the log likelihood ratios times seconds, and its number of samples.
+evidence, ratio, count: sum of the log likelihood ratios times seconds, the same without seconds, and its number of
+samples.
 differs_for, differs: duration [s] and number of samples of a deviation.
+carried: latest current; same_since_goal, same_for: goal when the readings last changed, and the time since then [s].
 """
 
 
@@ -67,29 +92,40 @@ def begin(memory: Any, joint: JointConfig, planned: float, follow_share: float, 
     tick = abs(joint.joint.drive_unit(12.0))
     sigma = max(SIGMA_SHARE * planned, SIGMA_TICKS * tick)
     memory["per_square"] = 0.5 / sigma**2
-    memory["allowed"] = max(follow_share * planned, SIGMA_TICKS * tick)
+    memory["allowed"] = max(follow_share * planned, ALLOWED_TICKS * tick)
     memory["share"] = follow_share
     memory["follow_time"] = follow_time
 
 
-def look(memory: Any, goal: float, carried: float, seconds: float) -> float:
+def look(memory: Any, goal: float, carried: float, seconds: float, stands: bool) -> float:
     """Process a reply; return the duration of a deviation once it has lasted too long [s], otherwise -1.
 
     goal: latest goal [A or V]. carried: measured value in the reply [A or V]. seconds: time since the last reply [s].
+    stands: whether the reply's position and velocity are exactly those of the last one.
     """
+    if stands and carried == memory.carried:
+        memory.same_for += seconds
+    else:
+        memory.carried, memory.same_since_goal, memory.same_for = carried, goal, 0.0
+    changed = goal - memory.same_since_goal
+    if memory.same_for >= FROZEN_S and carried != 0.0 and changed * changed * memory.per_square > 2.0:
+        return float(memory.same_for)
     former, memory.former_goal = memory.former_goal, goal
     low, high = min(goal, former), max(goal, former)
     off = max(low - carried, carried - high, 0.0)
-    gain = (off * off - carried * carried) * memory.per_square
+    error = GAIN_ERROR * (abs(low) if carried < low else abs(high))
+    beyond = max(off - error, 0.0)
+    gain = (beyond * beyond - carried * carried) * memory.per_square
     gain = max(min(gain, _FULL_WEIGHT), -_FULL_WEIGHT)
     evidence = memory.evidence + gain * seconds
     if evidence > 0.0:
         memory.evidence = evidence
+        memory.ratio += gain
         memory.count += 1.0
-        if evidence >= _FULL_WEIGHT * LOST_AFTER_S and memory.count >= _FEWEST:
+        if evidence >= _FULL_WEIGHT * LOST_AFTER_S and memory.ratio >= LEAST_RATIO:
             return float(memory.count * seconds)
     else:
-        memory.evidence = memory.count = 0.0
+        memory.evidence = memory.ratio = memory.count = 0.0
     # A stabiliser may command more than was planned.
     if off <= memory.allowed or off <= memory.share * abs(goal):
         memory.differs_for = memory.differs = 0.0

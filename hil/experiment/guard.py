@@ -27,7 +27,7 @@ from hil.experiment.command_limits import CommandLimits
 from hil.experiment.deadlines import Deadlines
 from hil.experiment.joint_checks import JOINT, MOST_OUTSIDE_RAD, JointChecks
 from hil.experiment.silence import LATE_WAKE_UP_S, Silence
-from hil.experiment.status_check import StatusCheck
+from hil.experiment.status_check import WHY_LOST, StatusCheck
 from hil.plan.find_torque import how_to_find_torque
 from hil.plan.recent_motion import RecentMotion
 
@@ -229,8 +229,7 @@ class Guard:
         self._stop(
             index,
             Cause.GOALS_LOST,
-            f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. Goals are being "
-            "lost in transit, or the servo refuses them: check its cable and limits.",
+            f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. {WHY_LOST}",
         )
 
     def _stop_for(self, fault: int, state: State) -> NoReturn:
@@ -429,6 +428,12 @@ class Guard:
                 f"Its goal register reads {held:.3f} {unit}, which matches what it carries: another program is "
                 "commanding it, or goals are being altered or lost in transit."
             )
+        same_for = self._joints[index]["following"]["same_for"]
+        if carried and same_for >= following.FROZEN_S:
+            return (
+                f"All its readings have been exactly the same for {1e3 * same_for:.0f} ms: they are frozen, or its "
+                "current is limited. Check the servo and whether a device between adapter and servo repeats replies."
+            )
         along = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
         allowed = self._joints[index]["following"]["allowed"]
         if along > abs(commanded) + allowed or along < -allowed:
@@ -504,6 +509,9 @@ class Guard:
 
     def _stop(self, index: int, cause: Cause, what: str) -> NoReturn:
         name = self._names[index]
+        if cause is Cause.GOALS_LOST:
+            # What arrives when nothing should destroys goals on the wire.
+            what = what.replace(WHY_LOST, self._heard_instead() or WHY_LOST)
         raise SafetyStop(f"{name[0].upper()}{name[1:]} {what}", cause)
 
 

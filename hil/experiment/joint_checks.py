@@ -139,7 +139,8 @@ def _fault(
         return VELOCITY
     joint.position, joint.seen_at = position, now
     if joint.is_followed:
-        joint.found = following.look(joint.following, goal, current, seconds)
+        stands = position == former and velocity == joint.consistency.velocity
+        joint.found = following.look(joint.following, goal, current, seconds, stands)
         if joint.found >= 0.0:
             return FOLLOWING
     is_long = elapsed > LONG_GAP * interval

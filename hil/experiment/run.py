@@ -348,7 +348,7 @@ def _positions(config: Config, bus: ServoBus) -> list[float]:
 
 
 def _from_where_it_lies(config: Config, plan: Plan, bus: ServoBus, run: RunFolder, note: Note) -> tuple[Config, Plan]:
-    """Plan a spatial arm's motion again if the arm is not exactly in its rest pose; save the change for an estimate."""
+    """Replan a spatial arm's motion if the arm is not exactly in its rest pose; save the change for the estimate."""
     lies = from_where_it_lies(config, bus.read_positions())
     if lies is config:
         return config, plan

@@ -1,9 +1,8 @@
 """Checks of a servo's status registers: is torque on, is the watchdog armed, was the goal accepted, is the reply
 recent?
 
-None of this is visible in position and velocity, and it is visible in the current only if the servo has a motor current
-sensor. The registers are read back several times per 0.1 s (hil.drivers.bus), so each of these faults is detected
-within 0.1 s.
+None of this shows in position or velocity; it shows in the current only if the servo has a motor current sensor. The
+registers are read back several times per 0.1 s (hil.drivers.bus), so each of these faults is detected within 0.1 s.
 """
 
 from collections import deque
@@ -37,6 +36,10 @@ _HELD_BEFORE = 4
 """If writes are lost, a servo may also hold one of this many goals that were sent before the latest matching status."""
 
 
+WHY_LOST = "Goals are being lost in transit, or the servo refuses them: check its cable and limits."
+"""Advice if nothing that was heard explains lost goals."""
+
+
 class StatusCheck:
     """Compares reported values with the commanded ones. `look` returns the fault, or None.
 
@@ -58,6 +61,8 @@ class StatusCheck:
         self._held: list[float | None] = [None] * len(config.joints)
         self._agreed_at = [0] * len(config.joints)
         self._is_foreign = [False] * len(config.joints)
+        self._missed_at = [-1] * len(config.joints)
+        """Number of goals sent when a status last differed, by joint."""
         self._foreign = [ForeignValues() for _ in config.joints]
         """Goals in the status that this program never sent, by joint."""
         # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
@@ -86,7 +91,7 @@ class StatusCheck:
         """
         if status.hardware_error and not (self._bears_errors and status.torque):
             error = describe_error(HardwareError(status.hardware_error))
-            return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then power-cycle it."
+            return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then power-cycle the servo."
         if status.torque is False:
             return Cause.TORQUE_OFF, (
                 "has lost its torque: Torque Enable reads 0 although this program switched it on. It was rebooted, its "
@@ -119,7 +124,8 @@ class StatusCheck:
             self._missed[joint] = 0
             self._held[joint], self._agreed_at[joint], self._is_foreign[joint] = None, self._cycles, False
             return None
-        self._held[joint] = status.goal
+        former, self._held[joint] = self._held[joint], status.goal
+        missed_at, self._missed_at[joint] = self._missed_at[joint], self._cycles
         foreign = self._foreign[joint]
         if self._never_sent(joint, status.goal):
             self._is_foreign[joint] = True
@@ -128,6 +134,13 @@ class StatusCheck:
         self._missed[joint] += 1
         if self._missed[joint] < _GOALS_MISSED and not is_repeated:
             return None
+        if former is not None and missed_at == self._cycles - 1:
+            half = self._half_tick[joint]
+            if abs(status.goal - self._goals[-2][joint]) < half <= abs(status.goal - former):
+                return Cause.STALE, (
+                    "returns stale data: it holds the goal that it seemed to have missed one cycle before, so its "
+                    "replies are a cycle late. Check the adapter, its latency and its cable."
+                )
         unit = self._unit[joint]
         held = f"it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent"
         if self._is_foreign[joint] or is_repeated:
@@ -136,10 +149,7 @@ class StatusCheck:
                 "Either another program or controller is commanding it (stop or unplug that one), or goals are being "
                 "corrupted on the bus (check the adapter and the cable)."
             )
-        return Cause.GOALS_LOST, (
-            f"does not accept goals: {held}, and it missed an earlier one too. Goals are being lost in transit, or the "
-            "servo refuses them: check its cable and limits."
-        )
+        return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {WHY_LOST}"
 
     def _never_sent(self, joint: int, held: float) -> bool:
         """Whether the goal that is held differs from every goal sent to any joint since a status last matched.

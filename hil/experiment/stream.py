@@ -190,14 +190,15 @@ class Stream:
                 break
             moving = self._moving(self._play(self._silence(window), Phase.REST))
         if moving:
+            self._check_velocity(state, window)
             raise ExperimentError(
-                self._false_velocity(state, window)
-                or f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again. If it "
+                f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again. If it "
                 "moved by itself, another program is commanding it, or something is pushing or holding it."
             )
 
-    def _false_velocity(self, state: State, window: int) -> str:
-        """Name a joint that reports a velocity although its position has not changed in the last `window` samples.
+    def _check_velocity(self, state: State, window: int) -> None:
+        """Raise SafetyStop, which no brake may follow, for a joint that reports a velocity although its position has
+        not changed in the last `window` samples.
 
         The last sample alone does not prove this: at a low rate, a joint may have begun to move right before it.
         Therefore the sample before it must report a velocity too, or earlier samples must report velocities that would
@@ -211,12 +212,12 @@ class Stream:
             step = abs(joint.position_unit)
             is_false = fast[-2:, index].all() or (fast[-1, index] and distance[index] > _FALSE_STEPS * step)
             if is_false and way <= _STILL_STEPS * step:
-                return (
+                raise SafetyStop(
                     f"{joint.title} reports a velocity of {velocity:.2f} rad/s before the start, but its position has "
                     f"changed by {way:.4f} rad in the last {window * self._pace.interval:.1f} s: one of the two "
-                    "readings is wrong. Check the encoder and its magnet; replace the servo if necessary."
+                    "readings is wrong. Check the encoder and its magnet; replace the servo if necessary.",
+                    Cause.FROZEN,
                 )
-        return ""
 
     def _warm_up(self, segment: Segment) -> None:
         """Play periods that are recorded but not used."""

@@ -1,4 +1,4 @@
-"""Actuators of an MJCF file: controlled by the servos' goals, with their gain, offset and lag."""
+"""Actuators of an MJCF file: controlled by servo goals, with gain, offset and lag."""
 
 from xml.etree import ElementTree as ET
 

@@ -107,7 +107,8 @@ def _same_word(one: str, other: str) -> bool:
 
 
 def _rotor(model: ChainArmModel, number: int) -> float:
-    """A joint's rotor inertia [kg m^2]: as identified or, if only a sum containing it was, typical of its servos.
+    """A joint's rotor inertia [kg m^2]: as identified or, if only a sum containing it was identified, typical of its
+    servos.
 
     If this guess is far too small, the link has to be far too heavy to compensate.
     """

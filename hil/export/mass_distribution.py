@@ -89,7 +89,7 @@ def _share_of_rod(p: Mapping[str, float]) -> float:
 
 
 def _link(moment: float, about_joint: float, share: float, farthest: float) -> LinkMass:
-    """A link with first moment m c and second moment J + m c^2 about its joint, with `share` of it in m c^2 if
+    """A link with first moment m c and second moment J + m c^2 about its joint; m c^2 is `share` of the latter if
     possible.
     """
     if moment == 0:

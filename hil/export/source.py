@@ -22,7 +22,7 @@ __all__ = ["Recorded", "Source", "write_text"]
 
 @dataclass(frozen=True)
 class Source:
-    """A run with a result; link_length: length of link 1 [m] if the parameters do not determine it."""
+    """A run with a result. link_length: length of link 1 [m] if the parameters do not determine it."""
 
     run: Path
     result: Result

@@ -91,7 +91,7 @@ class Belief:
         return float(self.coordinates[:, self.names.index(name)].std())
 
     def ensemble(self, farther: float = 1.0) -> Ensemble:
-        """Ensemble for a dry run; farther: ratio of the range of motion to be simulated to the observed range."""
+        """Ensemble for a dry run. farther: ratio of the range of motion to be simulated to the observed range."""
         belief = self if not self.learned else self._widened(_LEAST_SPREAD * (1.0 + np.log2(max(1.0, farther))))
         parameters = belief.parameters
         joints = 2 if "torque_scale_2" in parameters[0] else 1
@@ -145,8 +145,8 @@ class Belief:
         return belief._without_strays(left, random)
 
     def _motions(self, config: Config, seen: Seen, arms: NDArray[np.int64] | None = None) -> Array:
-        """Motion of the arms with these indices, by default all, under the recorded commands (arms, joints, samples)
-        [rad].
+        """Motion (arms, joints, samples) [rad] of the arms with these indices, by default all, under the recorded
+        commands.
         """
         coordinates = self.coordinates if arms is None else self.coordinates[arms]
         ensemble = replace(self, learned=0, coordinates=coordinates).ensemble()

@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:
     """Return `torque` (joints,) [N m] with joints that stood `still` raised to `ratio` times their `former` torque.
 
-    most: upper limit for those joints: the largest torque that the current limits allow (joints,) [N m].
+    most: upper limit for those joints, set by the current limits (joints,) [N m].
     """
     return np.asarray(np.where(still, np.minimum(ratio * former, most), torque))
 

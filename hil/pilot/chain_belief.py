@@ -46,7 +46,7 @@ SIMULATED = 100
 
 @dataclass(frozen=True)
 class ChainBelief:
-    """An ensemble of arms, of which at most the first SIMULATED are simulated.
+    """An ensemble of arms; at most the first SIMULATED arms are simulated.
 
     lightest: smallest inertia of each joint with the others free, over all arms of the prior (joints,) [kg m^2].
     """

@@ -68,7 +68,8 @@ class Said:
         """Report the progress of simulations after every SILENT_S without a message."""
         which = f"{self._trying}, " if self._trying else ""
         self._after_silence(
-            f"Still looking for a motion safe for all arms: {which}{done} of {total} simulations of this amplitude."
+            f"Still looking for a motion that is safe for all arms: {which}{done} of {total} simulations of this "
+            "amplitude."
         )
 
     def designing(self, done: int, total: int) -> None:

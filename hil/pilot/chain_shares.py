@@ -27,7 +27,7 @@ from hil.setup.session.servo_session import Say
 Array = NDArray[np.float64]
 
 SEARCH_ARMS, ARMS = 24, 72
-"""Numbers of arms simulated in the search for a safe share of the amplitude, and to confirm it."""
+"""Numbers of arms simulated to find a safe share of the amplitude, and to confirm it."""
 
 PILOT_SHARES = (0.3, 0.2, 0.12, 0.06)
 SHARES = (1.0, 0.88, 0.76, 0.64, 0.52, 0.4, 0.28, 0.18)
@@ -73,7 +73,7 @@ class Found:
 class SafeShares:
     """The current belief about the arm, and the paths designed for it.
 
-    last: share of the previous run; cap: largest share after a run that exceeded a limit. Both are fractions of the
+    last: share of the previous run. cap: largest share after a run that exceeded a limit. Both are fractions of the
     amplitude of `paths`, and are converted when these paths are replaced. tell: called with the progress of each
     simulation of the arms. designing: called with the progress of each path's design. trying: called with a description
     of each path and amplitude before it is simulated. simulated: motion simulated so far [s]. passed: on which sides of
@@ -95,7 +95,7 @@ class SafeShares:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether so much has been simulated that no further paths are tried."""
+        """Whether so much has been simulated that no further paths should be tried."""
         return self.simulated > MOST_SIMULATED_S
 
     @property
@@ -212,9 +212,9 @@ class SafeShares:
         return found, why
 
     def _largest(self, config: Config, shares: tuple[float, ...]) -> tuple[Found | None, str, float]:
-        """Return the first safe share of the paths, why a larger share is unsafe, and the clearance that one lacks [m].
+        """Return the first safe share of the paths, why a larger one is unsafe, and how much clearance that lacks [m].
 
-        If neither the first share nor the last one, tried on few arms, is safe, the shares between are not tried.
+        If neither the first share nor the last one, tried on few arms, is safe, those in between are not tried.
         """
         self._path += 1
         found, why, shortage = self._found(config, shares[0], f"amplitude 1 of at most {len(shares)}")
@@ -234,7 +234,7 @@ class SafeShares:
         return found, why, shortage
 
     def _found(self, config: Config, share: float, which: str) -> tuple[Found | None, str, float]:
-        """Return this share if it is safe, else why it is not, and how much clearance it lacks [m]."""
+        """Return this share if it is safe, otherwise why it is not, and how much clearance it lacks [m]."""
         shortage = 0.0
         for count in (SEARCH_ARMS, ARMS):
             found, why, lacking = self._unsafe(config, share, count, which)
@@ -246,7 +246,9 @@ class SafeShares:
         return (None if why else found), why, shortage
 
     def _unsafe(self, config: Config, share: float, count: int, which: str) -> tuple[Found | None, str, float]:
-        """Simulate a share on some arms; return the prediction, why it is not safe, and its lack of clearance [m]."""
+        """Simulate a share on some arms; return the prediction, why the share is unsafe, and the clearance it lacks
+        [m].
+        """
         if self.trying is not None:
             most = (1 + OTHER_SEEDS) * (1 + REDESIGNS)
             self.trying(f"path {self._path} of at most {most}, {which}")
@@ -273,7 +275,7 @@ class SafeShares:
 
 
 def _round_rate(rate: float, period: float) -> float:
-    """Return the next multiple of 10 Hz, if it gives a whole number of samples per period, otherwise the next rate [Hz]
+    """Return the next multiple of 10 Hz if it gives a whole number of samples per period, otherwise the next rate [Hz]
     that does.
     """
     tens = 10.0 * np.ceil(rate / 10.0)
@@ -290,7 +292,7 @@ def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
-    """Suggest changes that may make a path safe that was rejected as `unsafe`."""
+    """Suggest changes that may turn a path that was rejected as `unsafe` into a safe one."""
     if not foreseen.is_clear:
         helps = "A rest_pose farther from obstacles, or less restrictive [clearance] settings (floor, boxes, margin)"
         return f"{helps}, if the arm allows it, can help. {_better_known(config)}"

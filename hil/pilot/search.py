@@ -96,7 +96,7 @@ class Search:
         return with_stabiliser(self.config, self.belief, self.springs)
 
     def first_run(self) -> tuple[Config, Amplitude]:
-        """Configuration and amplitude of the first run, without running it. Raises NoSafeTorque."""
+        """Return the configuration and amplitude of the first run, but do not run it. Raises NoSafeTorque."""
         return self._pilot_amplitude(pilot_config(self.held, self.options), 0)
 
     def find(self) -> tuple[Config, Amplitude]:
@@ -150,7 +150,7 @@ class Search:
         return np.asarray(swing > MOVED_STEPS * step)
 
     def amplitude(self, config: Config, share: float, plan: Plan | None = None) -> Amplitude:
-        """The largest amplitude that is safe for all plausible arms; share: fraction of each limit that they may use.
+        """The largest amplitude that is safe for all plausible arms. share: fraction of each limit that they may use.
 
         If there is none, the amplitude of the last run is used, provided that the real arm has shown it to be safe, and
         otherwise a smaller one. Raises NoSafeTorque if there has been no run yet.
@@ -179,7 +179,7 @@ class Search:
 
     @property
     def _farther(self) -> float:
-        """Ratio of the allowed to the observed range of motion, for the joint with the most room."""
+        """Largest ratio of the allowed to the observed range of motion among the joints."""
         allowed = np.ptp(np.array([joint.position_limit for joint in self.config.joints]), axis=1)
         swings = [each for each in (self.swing, self.earlier_swing) if each is not None]
         swing = np.max(swings, axis=0) if swings else np.zeros(len(allowed))
@@ -328,7 +328,7 @@ class Search:
 
     def _refuse_velocity_limit(self, fast: NDArray[np.bool_], held: NDArray[np.bool_]) -> NoReturn:
         """Raise ExperimentError because of the velocity limit. fast: joints that exceeded it. held: joints that did not
-        move with all their torque.
+        move even with all their torque.
         """
         said = "; ".join(
             f"{joint.name}: velocity_limit = {joint.velocity_limit:g} rad/s, {MOVED_STEPS} encoder steps are "
@@ -364,7 +364,7 @@ def _names(config: Config, chosen: NDArray[np.bool_]) -> list[str]:
 
 
 def used_range(found: Amplitude) -> Array:
-    """Share of its position range that each joint of the median arm uses (joints,)."""
+    """Fraction of its position range that each joint of the median arm uses (joints,)."""
     lowest, highest = found.prediction.median[:2]
     low, high = found.prediction.limits[:2]
     used: Array = (highest - lowest) / (high - low)

@@ -31,7 +31,7 @@ class KnownChain:
 
 @dataclass(frozen=True)
 class ChainTorque:
-    """Inverse dynamics of an assumed model. rigid: base parameters; friction and offset (joints,) [SI]."""
+    """Inverse dynamics of an assumed model. rigid: base parameters. friction, offset: (joints,) [SI]."""
 
     base: BaseParameters
     rigid: Array

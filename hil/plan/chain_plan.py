@@ -31,10 +31,10 @@ TORQUE_SHARE = 0.8  # of a joint's torque limit that a path may use: the rest is
 
 @dataclass(frozen=True)
 class PathSegment(Segment):
-    """A path; its multisine is the torque that is commanded for it.
+    """A path. Its multisine is the torque that is commanded for the path.
 
-    way, back: goals of the transitions from and to the rest pose (samples, joints) [A]. paths: the desired motions:
-    transition, period, transition back. thought: the assumed model from which the torque was computed. peaks: largest
+    way, back: goals of the transitions from and to the rest pose (samples, joints) [A]. paths: the desired motions
+    (transition, period, transition back). thought: the assumed model from which the torque was computed. peaks: largest
     goal for the path without the stabiliser (joints,) [A].
     """
 

@@ -82,7 +82,7 @@ class _Test:
     seen: list[tuple[float, float]] = field(default_factory=list)
 
     def share(self, lacking: float, torque: float) -> float:
-        """Drop of the unexplained torque, relative to that of the joint's own torque."""
+        """Drop in the unexplained torque, relative to the drop in the joint's own torque."""
         assert self.lacking is not None
         return (self.lacking - lacking) / (self.torque - torque) if torque != self.torque else 0.0
 

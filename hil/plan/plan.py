@@ -20,7 +20,7 @@ ROLES = (IDENTIFY, HELD_OUT)
 
 @dataclass(frozen=True)
 class Segment:
-    """One multisine and its role; `period_current`: goal currents of one period (samples, joints) [A]."""
+    """One multisine and its role. period_current: goal currents of one period (samples, joints) [A]."""
 
     role: str
     multisine: Multisine

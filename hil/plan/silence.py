@@ -19,7 +19,7 @@ along the path that it was following. Torque must be off 100 ms after the last r
 """
 
 BRIDGED_ALONE_S = 0.028
-"""How long servos may fail to reply while an arm is lowered and another servo replies [s]. Such a servo may have
+"""How long servos may fail to reply while an arm is lowered and another servo replies [s]. The silent servo may have
 changed its ID: then only its Bus Watchdog, which counts from the last packet on the bus for any servo, can stop it.
 """
 

@@ -64,7 +64,7 @@ class Stabiliser:
         return all(abs(position - pose) <= BALANCED_RAD for position, pose in away)
 
     def add(self, goal: list[float], former: State | None) -> list[float]:
-        """Goal currents [A] with the stabiliser's contribution added; former: the sample before this command."""
+        """Goal currents [A] with the stabiliser's contribution added. former: the sample before this command."""
         if former is None:
             return goal
         added, integral = self._added, self._integral
@@ -120,7 +120,7 @@ def feedback_of(config: Config) -> Feedback:
 
 
 def stabiliser_share(config: Config, samples: NDArray[np.void]) -> StabiliserShare:
-    """The stabiliser's share of the torque in consecutive samples of one multisine, rows of a recording."""
+    """The stabiliser's share of the torque in consecutive rows of a recording, from one multisine."""
     torque = feedback_torque(config, samples)
     constants = np.array([joint.torque_per_goal for joint in config.joints])
     commanded = samples["goal_current"][1:] * constants

@@ -75,7 +75,7 @@ def _restarts(rows: Rows) -> list[Rows]:
     parts = [rows.kept(slice(first, last)) for first, last in pairwise(edges)]
     if len(parts) > 1:
         often = "once" if len(parts) == 2 else f"{len(parts) - 1} times"
-        said = f"Time goes back {often}: treated as {len(parts)} recordings."
+        said = f"Time goes back {often}, so the rows are treated as {len(parts)} recordings."
         parts[0] = parts[0].kept(slice(None), said)
     return parts
 
@@ -107,7 +107,7 @@ def _ordered(source: str, rows: Rows) -> Rows:
         return rows
     if back > FEW * rows.time.size:
         raise CsvError(
-            f"{source}: time goes back {back} times: it must increase. Check the time column, or sort the rows."
+            f"{source}: time goes back {back} times, but it must increase. Check the time column, or sort the rows."
         )
     order = np.argsort(rows.time, kind="stable")
     sorted_rows = rows.kept(order, f"{source}: {back} rows out of order were sorted by time.")
@@ -154,6 +154,6 @@ def _apart(rows: Rows) -> list[Rows]:
     edges = [0, *ends.tolist(), rows.time.size]
     parts = [rows.kept(slice(first, last)) for first, last in pairwise(edges)]
     if len(parts) > 1:
-        said = f"{len(ends)} gaps of more than {LONGEST_GAP:g} s: treated as {len(parts)} recordings."
+        said = f"{len(ends)} gaps of more than {LONGEST_GAP:g} s split the recording into {len(parts)} parts."
         parts[0] = parts[0].kept(slice(None), said)
     return parts

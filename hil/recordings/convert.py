@@ -71,10 +71,10 @@ def convert(table: Table, columns: Columns) -> Converted:
     notes += [note for part in parts for note in part.notes]
     long = [part for part in parts if len(parts) == 1 or _is_long_enough(part, whole.segment)]
     if len(long) < len(parts):
-        notes.append(f"{table.source}: {len(parts) - len(long)} pieces shorter than a segment were left out.")
+        notes.append(f"{table.source}: {len(parts) - len(long)} parts shorter than a segment were left out.")
     if not long:
         raise CsvError(
-            f"{table.source}: gaps of more than {LONGEST_GAP:g} s split the recording into pieces that are all shorter "
+            f"{table.source}: gaps of more than {LONGEST_GAP:g} s split the recording into parts that are all shorter "
             f"than a segment ({whole.segment:g} s). Record for longer without gaps, or choose shorter segments "
             "(columns.segment)."
         )

@@ -71,11 +71,11 @@ def said(columns: Columns, table: Table) -> str:
     used = {table.find(name)[0] for name in (columns.time, *(columns.position or []), *getattr(columns, drive)) if name}
     unused = [name for name in table.columns if name not in used]
     left_out = f" Not used: {', '.join(name or 'a column without a name' for name in unused)}." if unused else ""
-    return f"{table.source}: columns read: time: {time}; position: {position}; {drive}: {driven}.{left_out}"
+    return f"{table.source}: columns read: time = {time}; position = {position}; {drive} = {driven}.{left_out}"
 
 
 def _described(kind: str, names: Sequence[str], columns: Columns, table: Table) -> str:
-    """The columns' names, and their unit where the header does not state it."""
+    """The columns' names, with their unit if the header does not state it."""
     given = getattr(columns, f"{kind}_unit", None)
     if given is not None:
         return f"{', '.join(names)} [{given}]"
@@ -136,7 +136,7 @@ def _spaced(name: str) -> str:
 
 
 def _stem(name: str) -> str:
-    """The part of a column's name that all joints share: the name without the joint's number, or up to the dot."""
+    """The part of a column's name that all joints share: all but the joint's number, or all before the last dot."""
     numbered = re.sub(r"\d+", "#", name)
     if numbered != name:
         return numbered

@@ -49,7 +49,7 @@ def read_bag(folder: Path) -> list[Table]:
     if not files:
         kept = ", ".join(sorted({path.suffix for path in folder.iterdir() if path.suffix != ".yaml"})) or "nothing"
         raise CsvError(
-            f"{folder} is a ROS 2 bag without MCAP files (it holds {kept}). Convert it: ros2 bag convert, with "
+            f"{folder} is a ROS 2 bag without MCAP files (it holds {kept}). Convert it with `ros2 bag convert` and "
             "storage_id: mcap."
         )
     return [_table(str(folder), files)]
@@ -109,7 +109,7 @@ def _messages(path: Path) -> Iterator[tuple[str, int, Any]]:
                 yield channel.topic, _stamp(decoded, message.log_time), decoded
     except Exception as error:  # of mcap, its decompressors and decoders
         is_plain = isinstance(error, UnsupportedCompressionError) or getattr(error, "filename", None)
-        why = error if is_plain else "it is not an MCAP file, or incomplete or damaged"
+        why = error if is_plain else "it is not an MCAP file, or it is incomplete or damaged"
         raise CsvError(f"{path} cannot be read: {why}.") from error
     if not found:
         what = ", ".join(sorted(refused)) or "no messages"

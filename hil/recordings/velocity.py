@@ -33,7 +33,7 @@ _NOT_MEASURED = re.compile(
 
 @dataclass(frozen=True)
 class Rate:
-    """A joint's velocity column, which is `factor` times the derivative of its position and `late` [s] behind it."""
+    """A velocity column: `factor` times the derivative of the joint's position, delayed by `late` [s]."""
 
     column: str
     factor: float

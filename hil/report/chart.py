@@ -32,7 +32,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart with one x and one y axis; name: file name without extension."""
+    """A chart with one x and one y axis. name: file name without extension."""
 
     name: str
     title: str

@@ -1,6 +1,4 @@
-"""The page of a dry run: verdict, predicted peaks and an animation of one simulated arm; a single file, like a
-report.
-"""
+"""The page of a dry run, a single file: verdict, predicted peaks and an animation of one simulated arm."""
 
 from datetime import datetime
 from pathlib import Path

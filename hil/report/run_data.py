@@ -18,7 +18,7 @@ from hil.runs.run_folder import RunFolder, RunRecord
 
 @dataclass(frozen=True)
 class RunData:
-    """A finished run; events: (time on the port's clock [s], what happened)."""
+    """A finished run. events: (time on the port's clock [s], what happened)."""
 
     run: RunFolder
     config: Config

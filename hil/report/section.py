@@ -39,9 +39,9 @@ class Folded:
 
 @dataclass(frozen=True)
 class Motion:
-    """An animated planar arm. interval: time between frames [s]; angles: each joint's angles, frame by frame [rad].
+    """An animated planar arm. interval: time between frames [s]. angles: each joint's angles, frame by frame [rad].
 
-    lengths: link lengths in any unit; hangs: whether gravity acts in the plane, downwards; caption: text below the
+    lengths: link lengths in any unit. hangs: whether gravity acts in the plane, downwards. caption: text below the
     animation.
     """
 
@@ -54,7 +54,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class SpatialMotion:
-    """An animated spatial arm that can be rotated. caption: what is shown; scene: data of the page's script (JSON
+    """An animated spatial arm that can be rotated. caption: what is shown. scene: data of the page's script (JSON
     types).
     """
 

@@ -18,7 +18,7 @@ _ROW = 18.0  # px: height of a row of the legend
 
 @dataclass(frozen=True)
 class Size:
-    """Size of a figure [px]; points: maximum number of points drawn per curve."""
+    """Size of a figure [px]. points: maximum number of points drawn per curve."""
 
     name: str
     width: float

@@ -65,7 +65,7 @@ def find_runs(folder: Path) -> list[RunSummary]:
 
 
 def summarise(path: Path) -> RunSummary:
-    """Summarise one run folder; a damaged file is reported in the summary, not raised."""
+    """Summarise one run folder; damaged files are mentioned in the summary and raise no exception."""
     facts = _facts(path)
     arm = Path(str(facts.get("config", ""))).stem or path.name
     verdict, residual = _outcome(path)
@@ -78,7 +78,7 @@ def summarise(path: Path) -> RunSummary:
 
 
 def read_note(path: Path) -> Note:
-    """The note of a run, empty if there is none. Raises RunFolderError if it is damaged, or there is no run."""
+    """The note of a run, empty if there is none. Raises RunFolderError if it is damaged, or if there is no run."""
     if not _is_run(path):
         raise _no_run(path)
     file = path / NOTE_FILE

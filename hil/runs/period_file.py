@@ -44,7 +44,7 @@ class PlayedPeriod:
         return relative_error(self.position, self.predicted)
 
     def error_beyond(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Like `relative_error`, but excluding the encoders' `noise` (joints,) [rad], which no model predicts."""
+        """Like `relative_error`, but excluding the encoders' `noise` (joints,) [rad], which no model can predict."""
         return relative_error(self.position, self.predicted, noise)
 
 

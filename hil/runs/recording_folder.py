@@ -57,8 +57,8 @@ class RecordingRecord:
 
 @dataclass(frozen=True)
 class Predicted:
-    """One recording as it was used for the estimate. time: sampling times (samples,) [s]; torque, position,
-    predicted: (joints, samples) [N m, rad].
+    """One recording as it was used for the estimate. time: sampling times (samples,) [s]. torque, position, predicted:
+    (joints, samples) [N m, rad].
 
     predicted: prediction of the fitted model, segment by segment, each from its estimated state; NaN where nothing was
     simulated.

@@ -3,7 +3,7 @@
 config.toml     copied byte for byte
 experiment.json the [experiment] as run, if hil chose it (pilot, torque found by dry runs)
 stabiliser.json the [stabiliser] as used, if hil chose it
-run.json        versions, start time, and the facts needed to interpret the samples
+run.json        versions, start time, and the data needed to interpret the samples
 servo_settings.json  the servos' settings before the run (hil.setup.session.servo_session)
 events.jsonl    events with their time, one JSON object per line, written as they happen
 samples.npy     every sample (hil.runs.recording)
@@ -84,7 +84,7 @@ class Excitation:
 
 @dataclass(frozen=True)
 class RunRecord(RunFacts):
-    """The contents of run.json: facts, versions and machine. started: ISO 8601 with the offset from UTC."""
+    """The contents of run.json: `RunFacts`, versions and machine. started: ISO 8601 with the offset from UTC."""
 
     started: str
     versions: Mapping[str, str]
@@ -120,7 +120,9 @@ class RunFolder:
 
     @classmethod
     def create(cls, path: Path, config: Config) -> "RunFolder":
-        """Create the folder and copy the configuration. Raises RunFolderError if it is not empty or not writable."""
+        """Create the folder and copy the configuration. Raises RunFolderError if the folder is not empty or not
+        writable.
+        """
         run = cls(path)
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -276,7 +278,7 @@ class RunFolder:
             raise RunFolderError(f"{folder.path} cannot be written: {error.strerror}.") from error
 
     def write_facts(self, facts: RunFacts, plan: Plan) -> None:
-        """Write run.json: the facts, versions and machine."""
+        """Write run.json: `facts`, versions and machine."""
         record = RunRecord(
             **{each.name: getattr(facts, each.name) for each in fields(RunFacts)},
             started=datetime.now().astimezone().isoformat(timespec="seconds"),

@@ -11,7 +11,7 @@ SERVO_CLOCK_WRAP_S = 32.768
 """Period after which the servos' Realtime Tick wraps [s]: it counts milliseconds from 0 to 32767."""
 
 LOST_SHARE = 0.005
-"""The summary of a run names a joint if more than this fraction of its samples was lost."""
+"""The summary of a run names a joint if more than this fraction of the joint's samples was lost."""
 
 _FEWEST_READINGS = 5
 _EDGES_US = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1e3, 2e3, 5e3, 1e4, 1e5, 1e6)
@@ -54,7 +54,7 @@ def lost_samples(samples: NDArray[np.void], names: Sequence[str]) -> str:
     left_out = float(np.mean(~sent))
     listed = ", ".join(f"{100 * share:.1f} % of {name}" for name, share in zip(names, shares.tolist(), strict=True))
     late = (
-        f" Of all samples, {100 * left_out:.1f} % were not taken because this computer was too late: close other "
+        f" Of all samples, {100 * left_out:.1f} % were not taken because this computer was late: close other "
         "programs, or lower experiment.rate."
         if left_out > LOST_SHARE
         else ""

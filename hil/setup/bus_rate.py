@@ -1,4 +1,4 @@
-"""The sample rate that a bus can sustain, measured with torque off for every exchange mode.
+"""The sample rate that a bus can sustain in each exchange mode, measured with torque off.
 
 The sustainable rate depends on servos, cables and adapter. A computer that other programs keep busy delays individual
 exchanges. An experiment tolerates this (`hil.experiment.deadlines`), so such outliers are reported but do not limit the

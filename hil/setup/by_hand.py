@@ -106,7 +106,7 @@ def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Arr
         return Moved(joint.name, asked, angles, False, unlike)
     if change[most] < 0.0:
         found = (
-            f"{joint.name!r} moved by {change[most]:+.2f} rad, so its angle increases in the opposite direction to the "
+            f"{joint.name!r} moved by {change[most]:+.2f} rad, so its angle increases in the direction opposite to the "
             f"description's: set direction = {_reversed(joint)} and determine zero_ticks again, or correct the axis"
         )
         return Moved(joint.name, asked, angles, False, found)

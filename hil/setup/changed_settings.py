@@ -7,15 +7,18 @@ from itertools import permutations
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
-from hil.drivers.servo_model import RETURN_DELAY_UNIT
+from hil.drivers.servo_model import RETURN_DELAY_UNIT, Mode
 from hil.errors import Cause
 
 __all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "may_be_later", "settings_now"]
 
 _MODE, _DELAY = "Operating Mode", "Return Delay Time"
-_REGISTERS = (_MODE, "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _DELAY)
+_GOAL_PWM = "Goal PWM"
+"""In current mode, a limit of the motor's voltage. A tripped watchdog leaves 0 there, which is nobody's setting."""
 
-WRITTEN = frozenset({"Operating Mode", "Current Limit"})
+_REGISTERS = (_MODE, "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _GOAL_PWM, _DELAY)
+
+WRITTEN = frozenset({"Operating Mode", "Current Limit", _GOAL_PWM})
 """Settings that this program writes itself."""
 
 _LATE = frozenset({Cause.LATE, Cause.MISSING})
@@ -56,7 +59,8 @@ def settings_now(bus: ServoBus) -> Settings:
     """Read the settings that determine how servos move and what they report.
 
     Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
-    to an earlier request. If the two readings differ, the value is unknown and omitted.
+    to an earlier request. If the two readings differ, the value is unknown and omitted. So are all values of a servo
+    whose ID is read wrongly: its replies are late, and equal values may be those of other registers.
     """
     found: dict[tuple[Joint, str], int] = {}
     for joint, servo in bus.drives.items():
@@ -64,7 +68,11 @@ def settings_now(bus: ServoBus) -> Settings:
         with suppress(DriverError):
             first = {register: servo.read(register, attempts=1) for register in known}
             again = {register: servo.read(register, attempts=1) for register in reversed(known)}
-            found |= {(joint, register): first[register] for register in known if first[register] == again[register]}
+            if servo.read("ID", attempts=1) == servo.id:
+                same = [register for register in known if first[register] == again[register]]
+                found |= {(joint, register): first[register] for register in same}
+            if joint.mode is not Mode.CURRENT or not found.get((joint, _GOAL_PWM)):
+                found.pop((joint, _GOAL_PWM), None)
     return found
 
 

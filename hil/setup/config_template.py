@@ -1,4 +1,4 @@
-"""Generate the commented TOML file of an arm from a few facts."""
+"""Generate the commented TOML file of an arm from `ArmAnswers`."""
 
 import json
 import math

@@ -99,7 +99,7 @@ def _at_rest(handles: Sequence[Servo], names: Sequence[str], stance: str, ask: A
 
 
 def _one_baud(heard: Sequence[Heard]) -> tuple[int, list[Found]]:
-    """Return the baud rate at which servos answered, and those that are of supported models."""
+    """Return the baud rate at which servos of supported models answered, and these servos."""
     answered = {each.baud: [found for found in each.servos if found.model in SERVO_MODELS] for each in heard}
     usable = {baud: servos for baud, servos in answered.items() if servos}
     if not usable:

@@ -1,4 +1,4 @@
-"""Measure the sample rate for a new arm's file on its bus, with torque off."""
+"""Measure, with torque off, the sample rate that a new arm's bus can sustain."""
 
 from pathlib import Path
 

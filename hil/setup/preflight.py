@@ -117,7 +117,7 @@ def _path(config: Config) -> Iterator[Finding]:
 
 
 def _described(config: Config) -> Iterator[Finding]:
-    """Report doubts about the description, and whether the rest pose of a spatial arm is clear."""
+    """Report doubts about the description, and whether a spatial arm touches anything in its rest pose."""
     for doubt in doubts(config):
         yield Finding(Level.WARNING, "arm", "description", "doubtful", doubt)
     if not config.is_chain:
@@ -209,7 +209,7 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
 
 
 def _still_off(bus: ServoBus) -> Iterator[Finding]:
-    """Report torque that has come on since the servos were checked: this check neither switches it on nor off."""
+    """Report torque that has come on since the servos were checked: this check switches it neither on nor off."""
     try:
         on = switched_on(bus.drives)
     except DriverError as error:
@@ -279,8 +279,8 @@ def _torque(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: S
 def _drive_mode(_config: Config, _joint_config: JointConfig, _joint: Joint, servo: Servo) -> _Seen:
     drive_mode = servo.read("Drive Mode")
     fix = (
-        "0 is needed: bit 0 reverses the servo (use `direction = -1` instead), bit 3 lets any goal switch torque on. "
-        "Set it with DYNAMIXEL Wizard 2.0."
+        "0 is needed: bit 0 reverses the servo (use `direction = -1` instead), and bit 3 lets any goal switch torque "
+        "on. Set it with DYNAMIXEL Wizard 2.0."
     )
     return _graded(not drive_mode & ~TIME_BASED_PROFILE, "drive mode", str(drive_mode), fix)
 
@@ -330,7 +330,7 @@ def _baud(config: Config, joint_config: JointConfig, _joint: Joint, servo: Servo
 
 
 def _share(joint_config: JointConfig) -> float:
-    """Share of the joint's goal limit that one of its servos provides [A or V]."""
+    """Part of the joint's goal limit that one of its servos provides [A or V]."""
     return joint_config.goal_limit / len(joint_config.ids)
 
 

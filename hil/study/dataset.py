@@ -21,7 +21,7 @@ _WHOLE = ("run", "seed", "worker")
 
 
 class Dataset:
-    """The Parquet files in a folder; only one writer at a time."""
+    """The Parquet files in a folder, which must have only one writer at a time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

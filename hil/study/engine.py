@@ -45,7 +45,7 @@ that needs too much memory kills every worker that tries it."""
 
 @contextmanager
 def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> Iterator["Client"]:
-    """Connect to a Dask cluster; scheduler: None for this machine, "tcp://HOST:PORT", or "slurm".
+    """Connect to a Dask cluster. scheduler: None for this machine, "tcp://HOST:PORT", or "slurm".
 
     Raises MissingExtra if Dask is not installed, and ConfigError if no scheduler answers, there is no worker, or a
     worker has different versions of hil or of Python packages.

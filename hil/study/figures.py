@@ -10,7 +10,7 @@ import pyarrow as pa
 _NORMAL_95 = 1.959964
 _MOST_CATEGORIES = 12
 _NO_FIGURE = ("status", "message", "where", "task", "seed", "config_sha256", "worker", "recording", "arm_type")
-"""Columns that identify a run; rates and quantiles of them are not computed."""
+"""Columns that identify a run; no rates or quantiles are computed for them."""
 
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 

@@ -28,7 +28,7 @@ class FleetSpread:
 
 @dataclass(frozen=True)
 class Unlike:
-    """An outlier: a parameter of one arm; deviations: distance from the median in combined standard deviations."""
+    """An outlying parameter of one arm. deviations: distance from the median in combined standard deviations."""
 
     recording: str
     name: str
@@ -52,7 +52,7 @@ class FleetArm:
 
 @dataclass(frozen=True)
 class Fleet:
-    """Comparison of the arms of one type; spreads and unlike (outliers, largest first) are empty for too few arms."""
+    """Comparison of the arms of one type. spreads, unlike (outliers, largest first): empty if there are too few."""
 
     type: str
     arms: tuple[FleetArm, ...]

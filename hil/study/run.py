@@ -34,7 +34,7 @@ DEFAULT_COLUMNS["estimate"] = (*DEFAULT_COLUMNS["identify"], "recording", "arm_t
 
 @dataclass(frozen=True)
 class StudyProgress:
-    """Progress of a study; failed: number of runs that ended in an error; dashboard: URL of Dask's dashboard."""
+    """Progress of a study. failed: number of runs that ended in an error. dashboard: URL of Dask's dashboard."""
 
     done: int
     runs: int

@@ -109,7 +109,7 @@ def _check_versions(spec: Spec) -> None:
 
 @contextmanager
 def _at_most(seconds: float) -> Iterator[None]:
-    """Raise OutOfTime in this thread once the process has used so much processor time.
+    """Raise OutOfTime in this thread once the process has used this much processor time.
 
     No signal is used, because runs are not done in a worker's main thread. Compiled code is not interrupted.
     """

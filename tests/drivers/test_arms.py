@@ -305,3 +305,21 @@ def test_six_servos_with_shadows_hold_400_hz_at_1_mbaud(opened: Open, fast: bool
             assert not rate.wait().missed
             assert not any(bus.exchange([0.02] * 4).missing)
     assert rate.missed == 0
+
+
+# Late replies
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize(("model", "mode"), [("XM430-W350", Mode.CURRENT), ("XL430-W250", Mode.PWM)])
+def test_a_late_reply_is_recognised_by_its_length_whatever_it_answers(
+    opened: Open, model: str, mode: Mode, fast: bool
+) -> None:
+    """The state of a servo in PWM mode has two bytes more than that of one in current mode."""
+    named = ((1, "shoulder"), (2, "elbow"))
+    joints = [Joint(name, number, servo_model(model), zero_ticks=2048, mode=mode) for number, name in named]
+    bus, _ = opened(arm({"model": model}, {"model": model}), *joints, fast_sync_read=fast)
+    back = bus.prepared._read_back
+    assert back is not None
+    sizes = [read.reply_size for read in (*(plan.read for plan in bus.prepared._plans), *back.reads)]
+    assert len(set(sizes)) == len(sizes)

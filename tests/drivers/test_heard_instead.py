@@ -78,6 +78,15 @@ def test_late_replies_are_called_late() -> None:
 
 
 @pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize("kept", [0, 15, -5, -3])
+def test_a_reply_or_its_end_that_arrives_again_is_called_repeated(kept: int, fast: bool) -> None:
+    """With a fast read, only the last servo's part may be repeated, which has no header."""
+    fine = both(1, 2, fast=fast)
+    repeated = said(fine, waiting=fine[kept:], fast=fast).startswith("Replies are repeated in transit")
+    assert repeated == (kept != -3), "three bytes may be noise"
+
+
+@pytest.mark.parametrize("fast", [False, True])
 @pytest.mark.parametrize("kept", [-1, -5])
 def test_a_reply_that_was_still_arriving_when_time_was_up_is_late_not_damaged(kept: int, fast: bool) -> None:
     fine = both(1, 2, fast=fast)

@@ -164,6 +164,9 @@ class _Wire:
     def clearPort(self) -> None:
         pass
 
+    def hear(self, received: bytes) -> None:
+        pass
+
     def writePort(self, packet: list[int]) -> int:
         self.sent += bytes(packet)
         return len(packet)

@@ -183,7 +183,7 @@ def test_list_of_faults(capsys: pytest.CaptureFixture[str]) -> None:
         (("nowhere.toml", "--pty"), "nowhere.toml cannot be read"),
         ((str(CONFIG), "--pty", "--link", str(CONFIG)), "already exists"),
         ((str(CONFIG), "--pty", "--fault", "gone"), "kinds: lost_reply"),
-        ((str(CONFIG), "--pty", "--fault", "overload:servo=9"), "servo = 9: the IDs in"),
+        ((str(CONFIG), "--pty", "--fault", "overload:servo=9"), "servo = 9, but the IDs in"),
     ],
 )
 def test_wrong_input_is_one_message(capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], said: str) -> None:

@@ -1,5 +1,11 @@
 """Changes to the text of a configuration."""
 
+FEWER_SAMPLES = (("rate = 400.0 ", "rate = 200.0 "), ("ramp = 1.0 ", "ramp = 0.5 "))
+"""Changes that halve the number of samples, to which the processor time of a fake arm is proportional."""
+
+QUICK = (FEWER_SAMPLES[0], ("ramp = 1.0 ", "held_out = false\nramp = 0.5 "))
+"""The same without held-out data: a quarter of the samples."""
+
 
 def replaced(text: str, *changes: tuple[str, str]) -> str:
     """The text with the first occurrence of each old string replaced by the new one; each must occur."""

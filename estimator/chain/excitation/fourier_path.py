@@ -1,8 +1,8 @@
 """Excitation of a chain by paths that are finite Fourier series of the joint angles.
 
 The arm is driven with the torque that an approximate model requires for the path, plus that of a software spring and
-damper. The series is optimised for the purpose of the result: predicting the torque of other motions in the same range.
-The criterion is evaluated for the worst joint and covers all unknowns of the regression, including friction and
+damper. The series is optimised for the intended use of the result: predicting the torque of other motions in the same
+range. The criterion is evaluated for the worst joint and covers all unknowns of the regression, including friction and
 offsets. If a joint moves little, its gravity torque cannot be distinguished from an offset; a criterion on inertial
 parameters alone would miss this.
 

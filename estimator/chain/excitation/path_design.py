@@ -10,7 +10,7 @@ creeping motion would seem to identify a light joint, whose torque is mostly fri
 
 This designer is for the pilot experiment, where only limits are known: it also chooses the centre and width of the
 motion. For a box that the user has chosen, `fourier_path.design_path` is simpler; its criterion, the prediction of
-other motions in that box, requires a given box.
+other motions, requires a given box.
 """
 
 from collections.abc import Callable
@@ -113,7 +113,7 @@ class PathDesigner:
     def design(self, seed: int, generations: int = GENERATIONS, tell: Tell | None = None) -> Design:
         """Return the best path found; raises ExcitationError if none is allowed.
 
-        tell: called with the number of steps done and their total.
+        tell: called with the number of steps done and the total.
         """
         random = np.random.default_rng(seed)
         told = counted(tell, CENTRES + generations)

@@ -72,7 +72,7 @@ class ChainProblem:
     reach: float = 1.0
     """Fraction of their maximum change per step that friction-shape parameters may use; less near the minimum."""
     prior_weight: float = 1.0
-    """Factor on the prior's precision; above 1 while model errors exceed the noise that the weights assume, so that the
+    """Scale of the prior's precision; above 1 while model errors exceed the noise that the weights assume, so that the
     prior still decides what the data do not determine.
     """
     added: tuple[Array | None, ...] = ()
@@ -133,8 +133,8 @@ class ChainProblem:
         return self._with_prior(x, self._of_data(x))
 
     def tempered(self, x: Array) -> tuple["ChainProblem", Quadratic]:
-        """Return the problem with the prior's weight raised in proportion to the excess of the residual at `x` over the
-        assumed noise, and the sum of squares at `x`.
+        """Return the problem, with the prior's weight raised in proportion to the excess of the residual at `x` over
+        the assumed noise, and the sum of squares at `x`.
 
         Repeated readings have the same reduced weight as in the sum of squares.
         """

@@ -56,7 +56,7 @@ class ChainFit:
     missing: Array
     """Estimated distance from `value` to the minimum (parameters,) [SI]."""
     white_covariance: Array
-    """Covariance of `value` if the errors of all samples were independent."""
+    """Covariance that `value` would have if the errors of all samples were independent."""
     starts: tuple[Array, ...]
     """State at the first sample of each period (2, joints) [rad, rad/s]."""
     positions: tuple[Array, ...]
@@ -194,8 +194,8 @@ def _fit(
 
 
 def _at_bound(problem: ChainProblem, minimum: Minimum, value: Array, std: Array) -> tuple[str, ...]:
-    """Return the parameters at a bound although the data favour values beyond it, if this affects base parameters or
-    viscous or dry friction.
+    """Return the parameters that lie at a bound although the data favour values beyond it, if this affects base
+    parameters or viscous or dry friction.
 
     std: standard errors of the parameters `value` (parameters,).
     """

@@ -4,10 +4,10 @@ The observer starts stiff, so that the simulation can follow the motion with sta
 the fit improves.
 
 If joints often stick, stage 1's estimate of friction can be far off. So can the link parameters and torque scales,
-which are correlated with friction. Softening the observer while the shape of friction is fixed then leads the fit
-towards another minimum, in a curved valley, where it stops short. So if the soft observer does not explain the motion,
-a second fit starts from the prior's links, with the shape of friction free as soon as the stiffest observer follows
-the motion. The better of the two fits is continued.
+which are correlated with friction. Softening the observer while the shape of friction is fixed then leads the fit into
+a curved valley, where it stops short of another minimum. So if the soft observer does not explain the motion, a second
+fit starts from the prior's links, with the shape of friction free as soon as the stiffest observer follows the motion.
+The better of the two fits is continued.
 """
 
 import math
@@ -75,7 +75,7 @@ def integration_steps(periods: Sequence[SettledPeriod], longest: float) -> int:
 
 
 def repeated(period: SettledPeriod) -> Array:
-    """Return the weight of each sample (joints, samples), less than 1 if it shares its error with its neighbours.
+    """Return the weight of each sample (joints, samples), less than 1 for a sample that shares its neighbours' error.
 
     While a joint sticks, its encoder repeats one reading with one rounding error. Counted at every sample, that error
     would make the simulated joint creep towards the reading, through friction that is smoothed near standstill.
@@ -193,7 +193,7 @@ def softened(coarse: ChainProblem, x: Array, options: ChainOptions) -> tuple[Arr
 
 
 def _minimised(problem: ChainProblem, x: Array, ftol: float) -> tuple[Minimum, ChainProblem]:
-    """Return the minimum from `x`, with the prior's weight raised according to the residual, and that problem."""
+    """Return the minimum from `x` with the prior weighted according to the residual, and the problem so weighted."""
     trial, at = problem.tempered(x)
     found = trial.minimise(x, ftol, at=at)
     return replace(found, iterations=found.iterations + 1), trial

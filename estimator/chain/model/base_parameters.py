@@ -95,7 +95,7 @@ class BaseParameters:
         return base
 
     def as_all(self, base: Array) -> Array:
-        """Return a full parameter vector (11 joints,) with the same dynamics, where all other parameters are zero."""
+        """Return a full parameter vector (11 joints,) with the same dynamics, zero except for the base parameters."""
         every = np.zeros(TERMS * self.chain.joints)
         every[self.columns] = base
         return every

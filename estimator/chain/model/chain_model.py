@@ -17,7 +17,7 @@ FRICTION: dict[str, dict[str, str]] = {
     "stribeck_load": {"coulomb_width": "rad/s", "stribeck_rise": "1", "stribeck_velocity": "rad/s", "load": "1"},
 }
 ADDED_MASS = "added_mass_scale"
-"""Factor on the torque of a known added mass: the first joint's assumed torque constant divided by its true one."""
+"""Scale of the torque of a known added mass: the first joint's assumed torque constant divided by its true one."""
 DRIVE = {"delay": ("delay",), "lag": ("lag",), "delay_lag": ("delay", "lag")}
 
 

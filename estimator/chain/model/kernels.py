@@ -35,7 +35,7 @@ def room(joints: int) -> Any:
 
     frame    rotation by rows and origin of each link (joints, 12)
     motion   joint axis; velocity; acceleration, with gravity as an upward acceleration; time derivative of the axis;
-             velocity of the previous link x axis; the corresponding term of its acceleration (joints, 6, 6)
+             cross product of the previous link's velocity and the axis; that of its acceleration (joints, 6, 6)
     body     columns MASS to FORCE; single links, then composites (2, joints, BODY)
     seized   composite inertia times axis (joints, 6)
     mass     mass matrix (joints, joints)

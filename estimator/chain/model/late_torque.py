@@ -1,8 +1,8 @@
 """Delays of the torque of a chain's drives: the lag of each joint, and the back-EMF of voltage-driven joints.
 
 The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
-product of its back-EMF and its lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous
-friction is due to it. The lag of a winding makes a joint lighter by at most half of its inertia, where the poles of the
+product of back-EMF and lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due
+to back-EMF. The lag of a winding makes a joint lighter by at most half of its inertia, where the poles of the
 equivalent motor coincide. Far from the minimum of a fit, parameters may imply a greater loss, which is then limited to
 this value.
 """
@@ -35,13 +35,13 @@ def lags_of(parameters: Mapping[str, float], joints: int) -> Array:
 
 
 def lag_slopes(parameters: Mapping[str, float], joints: int) -> Array:
-    """Return the derivatives of each joint's lag with respect to the lag of joint 1 and its own ratio (2, joints)."""
+    """Return the derivatives of each joint's lag with respect to joint 1's lag and the joint's ratio (2, joints)."""
     lag = parameters.get("lag", 0.0)
     return np.array([[parameters.get(f"lag_ratio_{j + 1}", 1.0), lag] for j in range(joints)]).T.copy()
 
 
 def as_moving(base: BaseParameters, parameters: Mapping[str, float]) -> dict[str, float]:
-    """Return the parameters of the equivalent arm, with lighter rotors, whose back-EMF does not lag."""
+    """Return the parameters of the equivalent arm, which has lighter rotors and a back-EMF that does not lag."""
     moving = dict(parameters)
     generating = _generating(base.chain.joints, parameters)
     possible = _possible(base, parameters, generating)
@@ -52,7 +52,7 @@ def as_moving(base: BaseParameters, parameters: Mapping[str, float]) -> dict[str
 
 
 def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[int, float]:
-    """Return the apparent loss of inertia of each voltage-driven joint, counted from 0 [kg m^2]."""
+    """Return the apparent loss of inertia of each voltage-driven joint [kg m^2], by joint (from 0)."""
     generating = _generating(base.chain.joints, parameters)
     possible = _possible(base, parameters, generating)
     return {joint: possible * share * viscous * late for joint, share, viscous, late in generating}
@@ -83,8 +83,8 @@ def rotor(base: BaseParameters, joint: int) -> Array:
 
 
 Losses = list[tuple[Array, dict[int, float]]]
-"""For each voltage-driven joint: its rotor (base parameters,), and the decrease of its inertia [kg m^2] per unit of
-each parameter that its lagging back-EMF depends on, keyed by that parameter's index.
+"""For each voltage-driven joint: what its rotor adds to the base parameters (base parameters,), and the decrease of its
+inertia [kg m^2] per unit of each parameter that its lagging back-EMF depends on, keyed by that parameter's index.
 """
 
 
@@ -124,8 +124,8 @@ def complete(lost: Losses, derivative: Array) -> None:
 
 
 def _generating(joints: int, parameters: Mapping[str, float]) -> list[tuple[int, float, float, float]]:
-    """Return each voltage-driven joint, the fraction of its viscous friction due to back-EMF, that friction, and its
-    delay.
+    """Return each voltage-driven joint, the fraction of its viscous friction due to back-EMF, that friction, and the
+    joint's delay.
     """
     late = lags_of(parameters, joints) + max(parameters.get("delay", 0.0), 0.0)
     return [

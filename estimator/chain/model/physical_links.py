@@ -120,5 +120,5 @@ def _coordinates(link: Array) -> Array:
 
 
 def _scales() -> Array:
-    """Return the typical step of each coordinate: a factor e for spreads and mass, centimetres for the centre."""
+    """Return the typical step of each coordinate: a factor of e for spreads and mass, centimetres for the centre."""
     return np.array([1.0, 1.0, 1.0, 1.0, 0.003, 0.003, 0.02, 0.003, 0.02, 0.02])

@@ -1,7 +1,7 @@
 """Check at every sample whether the motion of a spatial arm is consistent with its known parameters.
 
 Angles, velocities and commanded torques pass through the same first-order low-pass filter, which also yields
-accelerations. The residual torque, `torque - Y(q, v, a) theta`, is compared with its uncertainty, due to the
+accelerations. The residual torque, `torque - Y(q, v, a) theta`, is compared with its uncertainty, which is due to the
 parameters' covariance, rounding of the velocities, and noise that is estimated while the arm moves. The parameters are
 updated as well (a Kalman filter for slowly drifting constants), so the tolerance narrows over time. As in
 `hil.estimator.models.momentum_observer`, which planar arms use, the friction that can hold a joint at rest is

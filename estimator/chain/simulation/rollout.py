@@ -190,7 +190,7 @@ def inertias(arms: ChainArms, poses: Array) -> tuple[Array, Array]:
 
 
 def is_physical(arms: ChainArms, poses: Array) -> Any:
-    """Return whether each arm's mass matrix is positive definite in all `poses` (poses, joints) (arms,)."""
+    """Return whether each arm (arms,) has a positive definite mass matrix in all `poses` (poses, joints)."""
     n = arms.base.chain.joints
     work, still = room(n), np.zeros(n)
     rotation, translation, axis, _ = arms.base.chain.arrays

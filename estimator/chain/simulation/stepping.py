@@ -8,7 +8,7 @@ of the step as predicted by the first stage,
     ID(q, v, k) + gamma h S k = f        ID(q', v', l + 2 k) + gamma h S' l = f'
     v += h (3 k + l) / 2                 q += h v + h^2 k / 2
 
-This differs from ROS2 in the Jacobian of its second stage and is still second-order. Differentiating both yields
+This differs from ROS2 in the second stage's Jacobian and is still second-order. Differentiating both yields
 
     W dk = -(ID_q dq + ID_v dv + Y dp + ...)        W = M + gamma h S
 
@@ -104,7 +104,7 @@ def _direct(
 
 # These take whole arrays and indices: a view of a row costs as much as its arithmetic.
 def _add_eight(out: Any, i: int, A: Any, X: Any, j: int, width: int) -> None:
-    """Add the products of A's columns j to j + 7 in rows i and i + 1 with those rows of X to those rows of out.
+    """Add the product of A (rows i and i + 1, columns j to j + 7) and X (rows j to j + 7) to rows i and i + 1 of out.
 
     Processing two rows at a time halves the number of reads of X.
     """
@@ -150,8 +150,8 @@ def _multiply(A: Any, X: Any, inner: int, out: Any) -> None:
 def _solve_for(inverse: Any, mixed: Any, columns: int, first: int, A: Any) -> None:
     """Set A to -inverse [mixed, 1], in the order of the rows of `z` in `_run_loop`.
 
-    mixed: coefficients of the derivatives of angles and velocities and, from row `first` of `z` on, accelerations;
-    `columns` in all. That of the direct derivatives is 1.
+    mixed: coefficients (`columns` in all) of the derivatives of angles and velocities, then of accelerations, which are
+    in `z` from row `first` on. The coefficient of the direct derivatives is 1.
     """
     n = inverse.shape[0]
     for i in range(n):
@@ -229,8 +229,8 @@ def _follow(
 def _pieces(p: Any, v: Any, k: Any, step: float, most: int) -> int:
     """Return the number of smaller steps, at most `most`, that replace this one.
 
-    A joint that may pass through the steep part of its friction crosses at most CROSSED widths in one of them. A joint
-    that sticks needs no smaller steps. k: last accelerations.
+    A joint that may pass through the steep part of its friction crosses at most CROSSED widths in each. A joint that
+    sticks needs no smaller steps. k: last accelerations.
     """
     needed = 1.0
     for j in range(v.size):
@@ -244,7 +244,7 @@ def _broken(p: Any, v: Any, k: Any, t: Any, solve: Any, step: float, most: int) 
     """Return the number of smaller steps, at most `most`, that replace an undivided one after its first stage.
 
     A joint that breaks away from standstill in this step was not accelerating before it, so `_pieces` cannot predict
-    it. Friction at the end of the stage then differs from the tangent that the stage assumed; the velocity error
+    this. Friction at the end of the stage then differs from the tangent that the stage assumed; the velocity error
     that this difference causes may reach CROSSED widths. k: accelerations of the stage. t: motor torques. solve: as
     `_stage` left it.
     """

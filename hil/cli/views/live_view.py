@@ -103,7 +103,7 @@ class LiveView:
         return f"{heat:.0f} °C {supply:.1f} V" if math.isfinite(heat) and math.isfinite(supply) else ""
 
     def _gauge(self, value: float, low: float, high: float, place: int) -> list[Text]:
-        """Return the value and a gauge of its position between its limits, which turns yellow near a limit."""
+        """Return the value and a gauge that shows it between its limits and turns yellow near either of them."""
         width, outside = self._layout.gauge, not low <= value <= high
         shown = Text(f"{value:+{_VALUE}.2f}" if math.isfinite(value) else " " * _VALUE, style="red" if outside else "")
         if place > self._layout.gauges:

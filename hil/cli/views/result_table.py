@@ -23,7 +23,7 @@ _MOST_NAMED = 3
 """If more models than this were tried, the output gives their number instead of their names."""
 
 _ALIKE = 0.05
-"""Two errors whose relative difference is smaller than this count as equal."""
+"""Two errors count as equal if their relative difference is smaller than this."""
 
 
 def print_result(result: SettledResult, config: Config, run: Path, console: Console) -> None:
@@ -98,7 +98,7 @@ def _parameters(result: SettledResult, truth: Truth) -> Table:
 
 
 def _shown(entry: Quantity) -> list[str]:
-    """Return value and standard error; no digits if the motion provides no information about the value."""
+    """Return value and standard error, without digits if the motion provides no information about the value."""
     return [f"{entry.value:.5g}", f"{entry.std:.1e}"] if entry.std < math.inf else ["undetermined", "-"]
 
 

@@ -1,4 +1,4 @@
-"""mujoco.sysid on a settled period, for comparison; installed with the extra `peers`.
+"""mujoco.sysid on a settled period, for comparison; installed with the `peers` extra.
 
 The arm is a MuJoCo model with one or two hinges. The unknowns are the first moment and inertia of each link, the
 armature of joint 2, and each joint's damping, friction loss and constant torque, all scaled by expected values. The

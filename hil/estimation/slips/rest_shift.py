@@ -42,10 +42,9 @@ def rest_shift_warnings(config: Config, samples: NDArray[np.void], result: Settl
         held = _FRICTION_TIMES * friction.coulomb.median * (1.0 + friction.stribeck_rise.median)
         if abs(shift) > LEAST_RAD and more > held:
             found.append(
-                f"{joint.name} came to rest {shift:+.2f} rad away from where it had rested before the run. The torques "
-                f"of gravity at the two angles differ by {more:.2g} N m. Unless friction holds it there, its horn "
-                "slipped on the shaft, or its encoder moved: tighten the screws, set zero_ticks again, and record "
-                "again."
+                f"{joint.name} came to rest {shift:+.2f} rad away from where it had rested before the run. The gravity "
+                f"torques at the two angles differ by {more:.2g} N m. Unless friction holds it there, either its horn "
+                "slipped on the shaft or its encoder moved: tighten the screws, set zero_ticks again, and record again."
             )
     return found
 

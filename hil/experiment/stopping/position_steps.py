@@ -39,7 +39,7 @@ class PositionSteps:
         self._steps = [0] * len(self._seen)
 
     def corrected(self, state: State) -> State:
-        """Return the exchange with positions that continue the motion so far [rad]."""
+        """Return a copy of the exchange with positions extrapolated from the motion so far [rad]."""
         position, at = list(state.position), state.time_before_write
         for joint, is_missing in enumerate(state.missing):
             if not is_missing:

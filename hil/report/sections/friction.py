@@ -30,7 +30,7 @@ def friction(data: RunData) -> Section | None:
     words = (
         "Dots: commanded torque minus the model's inertia and gravity torque, once for the measured motion and once "
         "for the model's own, from positions alone. Deriving accelerations from positions smooths every reversal, so "
-        "near standstill both sets deviate equally from the curve; there, static friction also takes any value that "
+        "near standstill both sets deviate equally from the curve; there, static friction can also take any value that "
         "holds the joint. If the friction model is right, the two sets of dots agree.",
     )
     return Section("friction", "Friction", words, pictures=tuple(pictures))

@@ -24,7 +24,7 @@ def parameters(data: RunData) -> Section:
 
 
 def parameters_of(result: Result, truth: Mapping[str, float] | None = None, note: str = "") -> Section:
-    """Return the section on parameters for any kind of result. truth: true values in the result's units; note: a
+    """Return the section on parameters for any kind of result. truth: true values in the result's units. note: a
     sentence about them.
     """
     groups = {} if result.chain is None else result.chain.groups
@@ -44,7 +44,7 @@ def parameters_of(result: Result, truth: Mapping[str, float] | None = None, note
 def _table(
     entries: Mapping[str, Quantity], truth: Mapping[str, float], groups: Mapping[str, str], caption: str
 ) -> Table:
-    """Build a table; groups: composition of a spatial arm's base parameters, by name."""
+    """Build a table. groups: composition of a spatial arm's base parameters, by name."""
     head = ("parameter", "meaning", "unit", "value", "95 % interval", "rel. error", *(("truth",) if truth else ()))
     rows = tuple(_row(name, entry, truth, groups) for name, entry in entries.items())
     return Table(head, rows, 3, caption, (1, 5) if truth else (1,))

@@ -19,7 +19,7 @@ _NEVER_ON = "Torque is off on all servos, confirmed by reading it back; this com
 
 
 def end_with(bus: ServoBus, stopped: BaseException | None, left: Sequence[str], before: TorqueOff | None) -> None:
-    """Add the remaining messages to the exception that ended the block, or raise another if it no longer applies.
+    """Add the remaining messages to the exception that ended the block, or raise another if that one no longer applies.
 
     before: the report on torque before the settings were restored; None if this command had not switched torque on.
     """
@@ -52,8 +52,8 @@ def _retract(stopped: BaseException, told: str) -> None:
 def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
     """Return the exception to raise in place of `error` if torque is now off on all servos, otherwise None.
 
-    It is the exception that led to cutting torque. If there was none, and replies were only missing when torque was cut
-    at the end, it is an ExperimentError. A note about the torque state is attached to it.
+    It is the exception that led to torque being cut. If there was none, and replies were missing only when torque was
+    cut at the end, it is an ExperimentError. A note about the torque state is attached to it.
     """
     report = bus.torque_off_report
     error.args = (str(report),)
@@ -66,7 +66,7 @@ def confirmed_later(bus: ServoBus, error: TorqueNotOff) -> BaseException | None:
 
 @contextmanager
 def telling_of_torque(bus: ServoBus) -> Iterator[None]:
-    """Add a note about torque to any exception that ends the block, unless it already has one: a stop may also come
+    """Add a note about torque to any exception that ends the block, unless it already has one: a stop may also occur
     between two runs.
     """
     try:

@@ -45,7 +45,8 @@ class Left:
         if not self.is_to_restore:
             return f"{title}: {others}" if others else ""
         restored = (
-            f"an earlier run ended before it could restore the servo's settings ({self.kept.since}); this one will."
+            f"an earlier run ended before it could restore the servo's settings ({self.kept.since}); this one will "
+            "restore them."
         )
         return f"{title}: {restored} {others[:1].upper()}{others[1:]}".rstrip()
 

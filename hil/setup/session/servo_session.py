@@ -16,7 +16,7 @@ from pathlib import Path
 from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
-from hil.drivers.errors import DriverError, PortLost
+from hil.drivers.errors import BusShared, DriverError, PortLost, ServoRefused
 from hil.drivers.joint import Joint
 from hil.drivers.preparation.settings import read_settings
 from hil.drivers.servo_model import Mode
@@ -52,7 +52,7 @@ REBOOT_S = 0.6
 """A servo that does not answer at the end may be booting; it is tried again after this time [s]."""
 
 COUNT_DOWN_S = 5.0
-"""After a stopped run: time from the warning that the arm will move again until torque is switched on [s]."""
+"""After a stopped run, time [s] between the warning that the arm will move again and torque being switched on."""
 
 
 def to_stderr(text: str) -> None:
@@ -179,7 +179,7 @@ class ServoSession:
             self.bus.report_driven(on, silent)
         if off := [joint for joint in self._on_again if joint not in {*on, *silent}]:
             yield (
-                f"Another program switched torque on at {and_list(map(str, off))} while the settings were being "
+                f"Another program switched torque on at {and_list(map(str, off))} before or while the settings were "
                 "restored. It was cut again and was still off when it was last read. End that program before "
                 "you reach into the arm: it may switch torque on again."
             )
@@ -219,10 +219,11 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
         token = _outermost.set(session)
         stopped: BaseException | None = None
         try:
-            session.begin(config, folder)
-            bus.release_held()  # saving the settings has taken time
-            bus.prepare()
-            yield bus
+            with _naming_who_drives(bus):
+                session.begin(config, folder)
+                bus.refuse_switched_on()  # saving the settings has taken time
+                bus.prepare()
+                yield bus
         except BaseException as error:
             stopped = error
             raise
@@ -231,7 +232,23 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
             before = bus.torque_off_report
             with signals_held_back():
                 left = session.end()
+            if bus.port.strangers and not isinstance(stopped, BusShared):
+                left.append(
+                    "Another program has sent packets on this bus while the servos were set up or restored "
+                    f"({bus.port.strangers} were received). Their settings were read back, but end that program before "
+                    "the next start: its packets may destroy others, or move the arm."
+                )
             end_with(bus, stopped, left, before)
+
+
+@contextmanager
+def _naming_who_drives(bus: ServoBus) -> Iterator[None]:
+    """If a servo refuses a setting because another program has switched its torque on, name that program."""
+    try:
+        yield
+    except ServoRefused:
+        bus.refuse_switched_on()
+        raise
 
 
 def has_moved() -> bool:

@@ -1,4 +1,4 @@
-"""Report what differs from before the session although every servo's settings have been restored as far as possible."""
+"""Report settings that differ from those before the session although all have been restored as far as possible."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -44,7 +44,9 @@ def unrestored(
 
 
 def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:
-    """Restore what an earlier run left on servos that this run did not reach; say where that is impossible."""
+    """Restore settings that an earlier run left on servos that this run did not reach; report those that cannot be
+    restored.
+    """
     waiting: list[tuple[Joint, str]] = []
     for joint in saved.left:
         if joint in saved.kept:
@@ -107,8 +109,8 @@ def _lowered_limits(saved: SavedSettings, settings: Settings, silent: Collection
 
 
 def _changed_meaning(saved: SavedSettings, settings: Settings, silent: Collection[Joint]) -> Iterator[str]:
-    """Say which settings that change the meaning of angles or goals were changed during the session: the next start
-    accepts them as they are.
+    """Report changes to settings that determine the meaning of angles or goals: the next start accepts them as they
+    are.
     """
     for joint, servo in saved.bus.drives.items():
         for name in (_OFFSET, _DRIVE_MODE):

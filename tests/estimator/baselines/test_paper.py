@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hil.estimator.baselines.paper import (
+from benchmarks.paper_equations import (
     PaperArm,
     coefficients,
     fit_as_printed,

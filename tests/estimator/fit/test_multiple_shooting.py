@@ -158,7 +158,7 @@ def test_mean_torque_is_the_integral_of_what_was_held_or_drawn() -> None:
         (
             lambda r: {"position": r.position + 20.0 * (r.time == r.time[99])},
             RecordingError,
-            r"joint 1: sample 100 at \S+ s is \S+ rad away from both its neighbours: single samples are wrong",
+            r"joint 1: sample 100 at \S+ s is \S+ rad away from both its neighbours: it is an outlier",
         ),
         (lambda r: {"position": np.full_like(r.position, np.nan)}, RecordingError, "0 % of"),
         (lambda r: {"position": np.zeros_like(r.position)}, StandstillError, "joint 1 moved by 0 rad"),

@@ -254,7 +254,7 @@ def test_joints_of_plant_and_servos_must_agree() -> None:
 def test_arm_or_plant(tmp_path: Path) -> None:
     path = tmp_path / "arm.toml"
     path.write_text('[fake]\n[[fake.servos]]\nid = 1\nmodel = "XM430-W350"\nzero_ticks = 0\n', encoding="utf-8")
-    with pytest.raises(DescriptionError, match="give exactly one of the table arm, the table chain and plant"):
+    with pytest.raises(DescriptionError, match="give exactly one of these: the table arm, the table chain, or plant"):
         load_fake(path)
 
 

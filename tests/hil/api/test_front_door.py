@@ -18,6 +18,7 @@ from hil.errors import ConfigError, CsvError, MissingExtra, ResultError, RunFold
 from hil.results.result import SettledResult
 from hil.setup.preflight import Level, check_arm
 from tests.support.command_line import hil as command
+from tests.support.edits import FEWER_SAMPLES, QUICK
 
 ArmFile = Callable[..., Path]
 
@@ -29,7 +30,7 @@ def in_tmp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_identify_gives_what_the_command_writes(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
-    path = arm_file()
+    path = arm_file(*FEWER_SAMPLES)
     heard: list[hil.Progress] = []
     result = hil.identify(path, out="by_function", on_progress=heard.append)
     assert capsys.readouterr() == ("", "")
@@ -99,7 +100,7 @@ def test_a_check_that_fails_says_what(arm_file: ArmFile) -> None:
 
 
 def test_two_runs_within_a_second_have_folders_of_their_own(arm_file: ArmFile, monkeypatch: pytest.MonkeyPatch) -> None:
-    runs = [hil.record(arm_file()).path for _ in range(2)]
+    runs = [hil.record(arm_file(*QUICK)).path for _ in range(2)]
     assert len({*runs}) == 2 and all(path.parent == Path("runs") for path in runs)
 
 
@@ -122,11 +123,12 @@ def test_a_callback_that_raises_disturbs_nothing(arm_file: ArmFile, caplog: pyte
         if progress.fraction is not None and progress.fraction > 0.3:
             raise KeyError("enough")
 
-    run = hil.record(arm_file(), out="run", on_progress=refuse)
+    run = hil.record(arm_file(*QUICK), out="run", on_progress=refuse)
     assert len(run.samples) > 1000 and heard[-1].fraction == pytest.approx(0.3, abs=0.05)
     assert [each.exc_info is not None for each in caplog.records if each.levelname == "ERROR"] == [True]
 
 
+@pytest.mark.usefixtures("few_stops")
 def test_a_dry_run_foretells(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
     lengths = ("rest_pose = ", "link_lengths = [0.12, 0.10]\nrest_pose = ")
     path = arm_file(lengths, ("ramp = 1.0 ", "held_out = false\nramp = 1.0 "))
@@ -139,11 +141,23 @@ def test_a_dry_run_foretells(arm_file: ArmFile, capsys: pytest.CaptureFixture[st
 
 
 def test_dry_run_can_be_called_whatever_was_imported_before() -> None:
-    for first in ("import hil.dry_run.prior", "hil.dry_run"):
-        call = "try:\n    hil.dry_run('nowhere.toml')\nexcept hil.HilError as error:\n    print(error)"
-        code = f"import hil\n{first}\n{call}"
-        said = subprocess.check_output([sys.executable, "-c", code], text=True)
-        assert said.startswith("nowhere.toml cannot be read")
+    """In two processes, forked from one that has imported everything but hil, which takes most of the time."""
+    code = (
+        "import os, numba, numpy, pydantic, scipy.optimize\n"
+        "for first in ('import hil.dry_run.prior', 'hil.dry_run'):\n"
+        "    child = os.fork()\n"
+        "    if not child:\n"
+        "        import hil\n"
+        "        exec(first)\n"
+        "        try:\n"
+        "            hil.dry_run('nowhere.toml')\n"
+        "        except hil.HilError as error:\n"
+        "            print(error, flush=True)\n"
+        "        os._exit(0)\n"
+        "    os.waitpid(child, 0)\n"
+    )
+    said = subprocess.check_output([sys.executable, "-c", code], text=True).splitlines()
+    assert [line.startswith("nowhere.toml cannot be read") for line in said] == [True, True]
 
 
 def test_results_show_themselves(identified_once: Path) -> None:
@@ -210,7 +224,7 @@ def test_the_log_is_under_hil_and_silent_unless_asked(
 ) -> None:
     assert any(isinstance(each, logging.NullHandler) for each in logging.getLogger("hil").handlers)
     with caplog.at_level(logging.INFO, logger="hil"):
-        hil.identify(arm_file(), out="run")
+        hil.identify(arm_file(*QUICK), out="run")
     names = {each.name for each in caplog.records}
     assert names and all(name.startswith("hil.") for name in names)
     assert any("torque on" in each.message for each in caplog.records)

@@ -165,9 +165,9 @@ def test_a_base_whose_shape_cannot_be_read_has_none(tmp_path: Path) -> None:
     ("shape", "said"),
     [
         ('<sphere radius="wide"/>', "radius='wide' must be a number"),
-        ('<box size="0.1 -0.1 0.1"/>', 'a box of its geometry has size="0.1 -0.1 0.1": lengths [m] cannot be negative'),
+        ('<box size="0.1 -0.1 0.1"/>', 'a box in its geometry has size="0.1 -0.1 0.1", but lengths [m] cannot'),
         ('<box size="0.1 0.1"/>', 'size="0.1 0.1" must be three numbers'),
-        ('<cylinder radius="0.1"/>', "a cylinder of its geometry has no length"),
+        ('<cylinder radius="0.1"/>', "a cylinder in its geometry has no length"),
         ('<mesh filename="a.stl" scale="0.001"/>', 'scale="0.001" must be three numbers'),
     ],
 )
@@ -187,7 +187,7 @@ LIMITS = '<limit lower="-0.94" upper="1.38"'
         ((LIMITS, '<limit lower="-0.94" upper="0.9"'), "but position_limit lets it move from"),
         (('iyy="', 'iyy="9'), "no mass distribution can have this inertia"),
         ((LIMITS, '<limit lower="-80" upper="80"'), "are these degrees? Limits must be in radians: [-1.4, 1.4]"),
-        (("<inertia ", "<no_inertia "), "it has a mass but no <inertia>"),
+        (("<inertia ", "<no_inertia "), "has a mass but no <inertia>"),
         (("<box size=", "<mesh filename="), "replaced by a capsule"),
         (("", ""), ""),
     ],

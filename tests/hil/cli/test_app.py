@@ -18,11 +18,13 @@ from hil.cli.errors import exit_code
 from hil.errors import RunFolderError
 from hil.runs.recording import load_samples
 from tests.support.command_line import hil
+from tests.support.edits import FEWER_SAMPLES, QUICK
 from tests.support.paths import CONFIGS
 
 ArmFile = Callable[..., Path]
 
 LONG = (
+    ("rate = 400.0", "rate = 200.0"),
     ("period = 2.0", "period = 100.0"),
     ("band = [0.5, 6.0]", "band = [0.1, 0.3]"),
     (
@@ -47,7 +49,7 @@ def without_timing(result: dict[str, Any]) -> dict[str, Any]:
 def test_identify_prints_a_table_and_estimate_gives_the_same_numbers_again(
     arm_file: ArmFile, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert hil("identify", arm_file(), "--out", "run") == 0
+    assert hil("identify", arm_file(*FEWER_SAMPLES), "--out", "run") == 0
     printed = capsys.readouterr()
     for said in (
         "inertia_1",
@@ -70,7 +72,7 @@ def test_identify_prints_a_table_and_estimate_gives_the_same_numbers_again(
 
 
 def test_a_recording_alone_is_estimated_later(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
-    assert hil("record", arm_file(), "--out", "run", "--json") == 0
+    assert hil("record", arm_file(*QUICK), "--out", "run", "--json") == 0
     recorded = json.loads(capsys.readouterr().out)
     assert recorded["samples"] == len(load_samples(Path("run/samples.npy"), 2)) > 1000
     assert recorded["timing"]["lost_replies"] == 0
@@ -89,17 +91,17 @@ def test_a_pilot_is_not_recorded_alone(capsys: pytest.CaptureFixture[str]) -> No
 def test_json_is_the_only_thing_on_standard_output_and_a_seed_gives_one_result(
     arm_file: ArmFile, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = arm_file()
+    path = arm_file(*FEWER_SAMPLES)
     assert hil("identify", path, "--out", "a", "--json") == 0
     first = json.loads(capsys.readouterr().out)
     assert hil("identify", path, "--out", "b", "--json") == 0
     second = json.loads(capsys.readouterr().out)
     assert without_timing(first) == without_timing(second)
-    assert first["timing"]["lost_replies"] == 0 and first["timing"]["rate_held"] == pytest.approx(400.0)
+    assert first["timing"]["lost_replies"] == 0 and first["timing"]["rate_held"] == pytest.approx(200.0)
 
 
 def test_the_run_folder_is_named_after_time_and_arm(arm_file: ArmFile) -> None:
-    assert hil("identify", arm_file(), "--json") == 0
+    assert hil("identify", arm_file(*QUICK), "--json") == 0
     (folder,) = Path("runs").iterdir()
     assert folder.name.endswith("-arm")
     assert {file.name for file in folder.iterdir()} == {
@@ -155,16 +157,14 @@ def test_bad_arguments_and_files(arm_file: ArmFile, capsys: pytest.CaptureFixtur
     assert "cannot be written" in capsys.readouterr().err
 
 
-def test_a_recording_cut_short_is_said(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
-    assert hil("identify", arm_file(), "--out", "run", "--json") == 0
-    path = Path("run/samples.npy")
+def test_a_recording_cut_short_is_said(identified: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = identified / "samples.npy"
     whole = np.load(path)
     np.save(path, whole[:1200])
-    capsys.readouterr()
-    assert hil("estimate", "run") == 1
+    assert hil("estimate", identified) == 1
     assert "holds 600 samples of the multisine for 'identify', 0 whole periods" in capsys.readouterr().err
     path.write_bytes(path.read_bytes()[:5000])
-    assert hil("estimate", "run") == 2
+    assert hil("estimate", identified) == 2
     assert "samples.npy cannot be read" in capsys.readouterr().err
 
 

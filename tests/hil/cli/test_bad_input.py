@@ -126,7 +126,7 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate still.csv", 2, "joint 1 moved by 0 rad"),
     ("estimate unknown.csv", 2, "a, b, c"),
     ("estimate not.parquet", 2, "not.parquet"),
-    ("estimate not.mcap", 2, "not.mcap cannot be read: it is not an MCAP file, or incomplete or damaged."),
+    ("estimate not.mcap", 2, "not.mcap cannot be read: it is not an MCAP file, or it is incomplete or damaged."),
     ("estimate old.db3", 2, ".db3 files are not supported"),
     ("estimate arm.npz --config columns.toml --out other", 2, ".npz files are not supported. Recordings are CSV"),
     ("estimate arm.jsonl --out other", 2, ".jsonl files are not supported"),

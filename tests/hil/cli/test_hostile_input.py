@@ -19,9 +19,9 @@ from hil.runs.recording import load_samples
 from hil.runs.recording_folder import load_recordings
 from hil.runs.run_folder import RunFolder
 from tests.support.command_line import hil
+from tests.support.edits import QUICK
 
 ArmFile = Callable[..., Path]
-SHORT = ("ramp = 1.0 ", "held_out = false\nramp = 1.0 ")
 
 
 def with_plant(arm_file: ArmFile, plant: str) -> Path:
@@ -60,24 +60,25 @@ def test_a_link_made_by_somebody_else_while_the_cable_was_out_stays(arm_file: Ar
     assert link.read_text() == "mine"
 
 
-@pytest.mark.parametrize("name", ["[/red]", "<b>&\"'", "--", "]]>", "é中"])
+@pytest.mark.usefixtures("few_stops")
+@pytest.mark.parametrize("names", [("[/red]", "<b>&\"'"), ("--", "]]>"), ("é中", "&amp;")])
 def test_a_name_that_is_markup_is_a_name(
-    arm_file: ArmFile, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+    arm_file: ArmFile, tmp_path: Path, names: tuple[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    quoted = name.replace("\\", "\\\\").replace('"', '\\"')
+    quoted = [name.replace("\\", "\\\\").replace('"', '\\"') for name in names]
     lengths = ("[arm]\n", "[arm]\nlink_lengths = [0.147, 0.18]\n")
-    path = arm_file(SHORT, lengths, ('name = "elbow"', f'name = "{quoted}"'))
+    named = [(f'name = "{old}"', f'name = "{new}"') for old, new in zip(("shoulder", "elbow"), quoted, strict=True)]
+    path = arm_file(*QUICK, lengths, *named)
     run = tmp_path / "run"
     assert hil("identify", path, "--out", run) == 0
     assert hil("check", path) == 0
-    if name == "[/red]":
+    if "[/red]" in names:
         assert hil("dry-run", path, "--arms", 20) in (0, 1)
     said = capsys.readouterr().out
-    assert "inertia_2" in said and name in said
+    assert "inertia_2" in said and all(name in said for name in names)
     assert hil("export", run, "--format", "urdf", "--format", "mjcf") == 0
     for file in (*run.rglob("*.urdf"), *run.rglob("*.xml")):
-        names = [element.get("name") for element in ET.parse(file).iter("joint")]
-        assert name in names
+        assert {*names} <= {element.get("name") for element in ET.parse(file).iter("joint")}
     page = (run / "report.html").read_text(encoding="utf-8")
     assert "<b>&" not in page
 

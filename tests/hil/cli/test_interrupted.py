@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.edits import FEWER_SAMPLES
 from tests.support.interrupted import STAGES, interrupt
 from tests.support.paths import CONFIGS
 
@@ -40,7 +41,7 @@ def test_a_stop_loses_nothing_that_was_finished(
     if stage.pilot or stage.command == "dry-run":
         (tmp_path / "arm.toml").write_text((CONFIGS / "first_time.toml").read_text(encoding="utf-8"), encoding="utf-8")
     else:
-        arm_file()
+        arm_file(*FEWER_SAMPLES)
     if stage.command == "export":
         shutil.copytree(identified, tmp_path / "run")
     found = interrupt(name, number, WORDS[stage.command], tmp_path)

@@ -9,6 +9,7 @@ import pytest
 
 from hil.cli.app import COMMANDS
 from tests.support.command_line import hil
+from tests.support.edits import QUICK
 
 
 @pytest.fixture(autouse=True)
@@ -27,7 +28,7 @@ def test_every_subcommand_has_an_example_and_both_options(name: str, capsys: pyt
 def test_more_and_less_is_said_on_standard_error(
     arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = arm_file()
+    path = arm_file(*QUICK)
     assert hil("record", path, "--out", "plain") == 0
     plain = capsys.readouterr()
     assert "Torque is off" in plain.err and "INFO" not in plain.err

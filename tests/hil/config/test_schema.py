@@ -40,7 +40,7 @@ def test_every_ready_file_is_right(path: Path) -> None:
         ("rate = 400.0 ", 'rate = "fast" ', r"experiment\.rate = 'fast': must be a number"),
         ("rate = 400.0 ", "rate = 5.0 ", r"experiment\.rate = 5\.0: must be at least 20"),
         ("rate = 400.0 ", "rate = nan ", r"experiment\.rate = nan: must be"),
-        ("rate = 400.0 ", "rate = 400.05 ", r"rate \* period = 4000\.5: must be a whole number.*period = 9\.99875"),
+        ("rate = 400.0 ", "rate = 400.05 ", r"rate \* period = 4000\.5 must be a whole number.*period = 9\.99875"),
         ("rate = 400.0 ", "rrate = 400.0 ", r"experiment\.rrate is not a known key; did you mean rate\?"),
         ("seed = 1", "colour = 1", r"experiment\.colour is not a known key; allowed: rate, period"),
         ("[experiment]", "[experimentt]", r"experimentt is not a known key; did you mean experiment\?"),

@@ -82,7 +82,11 @@ def test_a_horizontal_arm_is_foreseen_to_wander_and_a_stabiliser_to_hold_it(arm_
     path = arm_file()  # overwritten by the horizontal arm
     text = (CONFIGS / "fake_horizontal.toml").read_text(encoding="utf-8")
     text = replaced(
-        text, KNOWN, ("period = 10.0 ", "held_out = false\nperiod = 4.0 "), ("[0.30, 0.18]", "[0.15, 0.09]")
+        text,
+        KNOWN,
+        ("rate = 400.0 ", "rate = 200.0 "),
+        ("period = 10.0 ", "held_out = false\nperiod = 4.0 "),
+        ("[0.30, 0.18]", "[0.15, 0.09]"),
     )
     held_text = text.replace(
         "[model]\n", "[stabiliser]\nstiffness = [1.0, 0.5]\ndamping = [0.02, 0.01]\n\n[model]\n", 1
@@ -120,6 +124,7 @@ def test_pilot_needs_link_lengths_and_peak_torque_may_be_left_out(arm_file: Call
         make_plan(config)
 
 
+@pytest.mark.usefixtures("few_stops")
 @pytest.mark.parametrize(("peak", "code"), [("[0.20, 0.10]", 0), ("[1.60, 1.20]", 1)])
 def test_the_verdict_is_the_exit_code(
     arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str], peak: str, code: int
@@ -161,6 +166,7 @@ def test_every_joint_is_shown_with_the_unit_of_its_own_goal() -> None:
     assert units["wrist_roll"] == ("current", "A") and units["shoulder_pan"] == ("voltage", "V")
 
 
+@pytest.mark.usefixtures("few_stops")
 def test_a_table_for_a_person_with_what_the_servos_say(
     arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -39,7 +39,7 @@ def test_a_ratio_beyond_the_uncertainty_of_torque_constants_is_a_contradiction(
     extra = {"delay": Quantity(1e-3, 1e-5, "s"), "torque_scale_2": Quantity(ratio, std, "1")}
     found = contradictions(JOINTS, extra, spread, "column")
     assert bool(found) is contradictory
-    assert all("of joint 1 and joint 2 contradict each other by a factor of" in each for each in found)
+    assert all("of joint 1 and joint 2 disagree by a factor of" in each for each in found)
     said = ratios_said(JOINTS, extra, "column", found)
     assert bool(said) is not contradictory
     assert all("elative to joint 1, joint 2 gives" in each for each in (*found, *said))
@@ -55,7 +55,7 @@ def test_a_recording_whose_first_torque_is_too_small_is_used_with_care_at_most()
     verdict = estimate_any([recording], wanted, 1.0, False, "arm.csv", 9.81, (True, True)).result.verdict
     assert verdict is not None and verdict.trust == "with care"
     said = " ".join(verdict.sentences)
-    assert "torque columns of joint 1 and joint 2 contradict each other by a factor of 1.4" in said
+    assert "torque columns of joint 1 and joint 2 disagree by a factor of 1.4" in said
 
 
 def estimated(ratio: float) -> Any:

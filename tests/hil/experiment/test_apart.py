@@ -9,6 +9,7 @@ from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import servo_model
 from hil.errors import Cause, SafetyStop
 from hil.experiment.apart import ALLOWED_RAD, Apart, causes_of_standstill
+from tests.support.edits import QUICK, replaced
 from tests.support.paths import CONFIGS
 
 
@@ -32,9 +33,7 @@ def test_a_horn_that_slips_stops_the_arm_by_name(tmp_path: Path, slips: bool) ->
     joints, fake = text.split("[fake]", 1)
     joints = joints.replace("id = 1\n", "id = [1, 3]\n", 1)
     joints = joints.replace("direction = 1 ", "direction = [1, -1] #", 1)
-    for old, new in (("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]")):
-        assert old in joints
-        joints = joints.replace(old, new)
+    joints = replaced(joints, ("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"), *QUICK)
     shadow = '[[fake.servos]]\nid = 3\nmodel = "XM430-W350"\njoint = 1\ndirection = -1\nzero_ticks = 1000\n'
     fault = '[[fake.faults]]\nkind = "encoder_jump"\nservo = 3\nat = 3.0\namount = 150\n' if slips else ""
     arm = tmp_path / "arm.toml"

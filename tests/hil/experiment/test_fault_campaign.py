@@ -10,7 +10,15 @@ from benchmarks.fault_campaign.arms import MIXED, RATES, Setting, names, setting
 from benchmarks.fault_campaign.attack import Attack, Kind
 from benchmarks.fault_campaign.campaign import Outcome, inject_drawn, prepare
 from benchmarks.fault_campaign.draw import Drawn
-from benchmarks.fault_campaign.judge import acts_at, addressed, judge_words, received, since_again
+from benchmarks.fault_campaign.judge import (
+    acts_at,
+    addressed,
+    judge_words,
+    received,
+    since_again,
+    stopped_unwatched,
+    was_built_so,
+)
 from benchmarks.fault_campaign.twin import has_healthy_twin, lagging, wired_otherwise
 from benchmarks.fault_campaign.witness import CURRENT_MODE, PWM_MODE, Witness
 from benchmarks.faults import campaign, figures
@@ -105,6 +113,7 @@ TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
     [
         (Kind.PUSHED, "state", UNLIKE_ANY, JUMP),
         (Kind.WEAK, "state", NO_TORQUE, CONTRADICTION),
+        (Kind.HOMING_MOVED, "state", "Check whether another program is changing its settings.", TWICE),
         (Kind.LOWERED_LIMIT, "state", "its Current Limit is 236, but current_limit = 1.2 A needs 447", CONTRADICTION),
         (Kind.DEAF, "state", "does not accept goals: some are lost. Goals are being lost in transit.", CONTRADICTION),
         (Kind.GOAL_FIGHT, "state", "Another program is commanding it.", "stands still. Something is blocking it."),
@@ -191,6 +200,35 @@ def test_arms_of_different_servos_or_with_a_description_are_not_wired_the_other_
     described = config.model_copy(update={"arm": config.arm.model_copy(update={"link_lengths": [0.147, 0.18]})})
     assert wired_otherwise(config, heard) is not None and wired_otherwise(described, heard) is None
     assert wired_otherwise(prepare(Setting(MIXED, 100), PERIOD_S).config, heard) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "more", "is_alike"),
+    [
+        *(("fake_inverted", 0.008, (), True), ("fake_inverted", 0.12, (), False)),
+        *(("fake_inverted", 0.008, (Attack(Kind.CLOCK_SET, 1.0, 1.0),), False), (MIXED, 0.008, (), False)),
+    ],
+    ids=["nothing was written", "limits were written", "another fault", "different servos"],
+)
+def test_equal_servos_that_swap_their_ids_at_the_same_angle_are_an_arm_that_was_built_so(
+    name: str, start: float, more: tuple[Attack, ...], is_alike: bool
+) -> None:
+    ready = prepare(Setting(name, 100), PERIOD_S)
+    drawn = Drawn((Attack(Kind.IDS_SWAPPED, start, start), *more), ())
+    assert was_built_so(ready.config, drawn, ready.undisturbed) == is_alike
+    apart = replace(ready.undisturbed, record=ready.undisturbed.record.copy())
+    apart.record["position"][0, 0] += 0.1
+    assert not was_built_so(ready.config, drawn, apart), "the readings of both joints change"
+
+
+@pytest.mark.parametrize(("after", "nobody"), [(-0.01, False), (0.03, True), (0.2, False)])
+def test_nobody_can_end_the_current_while_the_program_is_stopped_and_the_watchdogs_are_newly_disarmed(
+    after: float, nobody: bool
+) -> None:
+    stop = Attack(Kind.STALL, 1.0 + after, 1.0 + after, amount=0.3)
+    assert stopped_unwatched(Drawn((Attack(Kind.WATCHDOG_OFF, 1.0, 1.0), stop), ())) == (
+        [pytest.approx((0.98 + after, 1.3 + after))] if nobody else []
+    )
 
 
 def test_a_servo_that_has_taken_another_s_id_does_as_told_if_it_obeys_that_id() -> None:

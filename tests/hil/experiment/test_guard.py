@@ -132,6 +132,35 @@ def test_what_was_heard_instead_replaces_the_remedy_for_silence(arm: Arm, missin
     assert stop.value.cause is Cause.MISSING
 
 
+@pytest.mark.parametrize("heard", ["", "Replies are repeated in transit."])
+def test_what_was_heard_beside_the_replies_explains_lost_goals(arm: Arm, heard: str) -> None:
+    """Both where the status shows them, and where read-backs between cycles do."""
+    held = at(1, STILL)._replace(
+        goal_current=(0.0, 0.1),
+        status=tuple(Status(4, 0.0, 0.0, torque=True, hardware_error=0) for _ in range(2)),
+    )
+    guard = Guard(arm(), heard_instead=lambda: heard)
+    guard.look(held)
+    for stops in (
+        lambda: guard.look(at(2, held)),
+        lambda: guard.goals_are_lost(1, "its Goal Current reads 3, but 4 was sent"),
+    ):
+        with pytest.raises(SafetyStop, match=heard or "Goals are being lost in transit") as stop:
+            stops()
+        assert stop.value.cause is Cause.GOALS_LOST and ("being lost" in str(stop.value)) == (not heard)
+
+
+@pytest.mark.parametrize(
+    ("carried", "said"), [(0.05, "All its readings have been exactly the same for 2"), (0.0, "off")]
+)
+def test_frozen_readings_of_a_joint_at_rest_are_told_from_lost_torque(arm: Arm, carried: float, said: str) -> None:
+    guard = Guard(arm(), PLANNED)
+    with pytest.raises(SafetyStop, match=said) as stop:
+        for n in range(400):
+            guard.look(at(n, STILL._replace(goal_current=(0.0, 0.05 + 1e-3 * n), current=(0.0, carried))))
+    assert stop.value.cause is Cause.NOT_FOLLOWING
+
+
 def test_an_arm_that_is_lowered_may_be_silent_longer(arm: Arm) -> None:
     """Counted from the last exchange that all servos answered, which may be older than the lowering."""
     silent = MISSING._replace(missing=(True, True))
@@ -174,7 +203,7 @@ def test_a_current_that_does_not_follow(arm: Arm) -> None:
     guard = Guard(arm())
     for _ in range(11):
         guard.look(off)
-    assert look(guard, off, off, off) is Cause.NOT_FOLLOWING, "30 ms at full weight"
+    assert look(guard, off, off) is Cause.NOT_FOLLOWING, "30 ms at full weight"
     guard = Guard(arm())
     follows = STILL._replace(goal_current=(0.5, 0.0), current=(0.5, 0.0))
     for state in [*[off] * 11, *[follows] * 12] * 3:
@@ -262,7 +291,7 @@ def test_an_arm_with_a_stabiliser_may_give_out_work(arm: Arm) -> None:
 def test_lost_torque_is_measured_against_what_the_configuration_plans(arm: Arm) -> None:
     """At 1.8 N m/A and a planned 0.8 N m, a third of the planned current is enough to detect lost torque."""
     off = STILL._replace(goal_current=(0.15, 0.0))
-    assert look(Guard(arm()), *[off] * 14) is Cause.NOT_FOLLOWING
+    assert look(Guard(arm()), *[off] * 13) is Cause.NOT_FOLLOWING
 
 
 @pytest.mark.parametrize(("carried", "said"), [(0.0, "Its torque is off"), (0.9, "another program"), (-0.6, "another")])

@@ -184,7 +184,7 @@ def test_a_limit_that_another_program_lowered_is_the_cause_that_is_named(
     assert_stopped(ports[0])
 
 
-@pytest.mark.parametrize(("register", "value"), [("PWM Limit", 700), ("Current Limit", 250)])
+@pytest.mark.parametrize(("register", "value"), [("PWM Limit", 700), ("Current Limit", 250), ("Goal PWM", 266)])
 def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
 ) -> None:
@@ -195,9 +195,9 @@ def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
 
     config = arm()
     run = RunFolder.create(tmp_path / "run", config)
-    if register == "Current Limit":
+    if register != "PWM Limit":
         said = run_experiment(config, run, config.path, lower, plan)
-        assert ports[0].bus.servos[2].value(register) == 1193
+        assert ports[0].bus.servos[2].value(register) == {"Current Limit": 1193, "Goal PWM": 885}[register]
     else:
         with pytest.raises(ExperimentError, match="PWM Limit was changed during this command from 885 to 700") as stop:
             run_experiment(config, run, config.path, lower, plan)
@@ -482,6 +482,8 @@ def test_a_velocity_without_motion_before_the_start_is_a_false_reading_unless_it
     run = RunFolder.create(tmp_path / "run", config)
     with pytest.raises(ExperimentError, match=said):
         run_experiment(config, run, config.path, once(freeze, Phase.REST, since), plan)
+    is_braked = Phase.BRAKING in load_samples(run.samples_path, 2)["phase"]
+    assert is_braked == (said == MOVES), "no brake may rely on a false velocity"
     assert_stopped(ports[0])
 
 

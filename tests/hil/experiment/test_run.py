@@ -19,6 +19,7 @@ from hil.experiment.stream import Progress, Watch
 from hil.fakes.protocol_fake import FakeSerial
 from hil.runs.recording import Phase, load_samples
 from hil.runs.run_folder import RunFolder
+from tests.support.edits import FEWER_SAMPLES, QUICK
 from tests.support.short_experiment import CONFIG, short_config
 from tests.support.stream.at_sample import at_sample
 
@@ -47,7 +48,7 @@ def assert_no_torque(port: Any) -> None:
 def test_a_whole_experiment_is_recorded_in_order_and_ends_without_torque(
     arm: Arm, tmp_path: Path, ports: list[Any]
 ) -> None:
-    config = arm()
+    config = arm(*FEWER_SAMPLES)
     made = run(config, tmp_path / "run")
     assert_no_torque(ports[0])
     samples = load_samples(made.samples_path, 2)
@@ -56,14 +57,14 @@ def test_a_whole_experiment_is_recorded_in_order_and_ends_without_torque(
     twice = [Phase.RAMP_IN, Phase.PERIODIC, Phase.RAMP_OUT]
     assert order == [Phase.REST, *twice, *twice, Phase.COMING_TO_REST]
     assert not samples["missing"].any()
-    assert np.allclose(np.diff(samples["deadline"]), 1 / 400)
+    assert np.allclose(np.diff(samples["deadline"]), 1 / 200)
     assert np.abs(samples["goal_current"]).max(axis=0) == pytest.approx([0.80 / 1.8, 0.42 / 1.8], abs=2.7e-3)
-    assert np.abs(samples["velocity"][-40:]).max() < 0.1
+    assert np.abs(samples["velocity"][-20:]).max() < 0.1
 
 
 def test_a_warm_up_is_played_once_before_the_first_multisine_and_used_for_nothing(arm: Arm, tmp_path: Path) -> None:
     period = arm().experiment.period
-    config = arm(("[experiment]", f"[experiment]\nwarm_up = {1.5 * period}"))
+    config = arm(("[experiment]", f"[experiment]\nwarm_up = {1.5 * period}"), *FEWER_SAMPLES)
     made = run(config, tmp_path / "run")
     samples = load_samples(made.samples_path, 2)
     warming = samples["phase"] == Phase.WARM_UP
@@ -95,7 +96,7 @@ def test_further_periods_follow_the_settled_one_and_progress_is_shown_20_times_a
 
 
 def test_two_runs_of_one_seed_are_the_same_to_the_last_bit(arm: Arm, tmp_path: Path) -> None:
-    config = arm()
+    config = arm(*QUICK)
     first = load_samples(run(config, tmp_path / "a").samples_path, 2)
     second = load_samples(run(config, tmp_path / "b").samples_path, 2)
     assert first.tobytes() == second.tobytes()
@@ -103,9 +104,9 @@ def test_two_runs_of_one_seed_are_the_same_to_the_last_bit(arm: Arm, tmp_path: P
 
 def test_an_arm_that_still_swings_is_awaited(arm: Arm, tmp_path: Path) -> None:
     """Within 0.05 rad before torque comes on, and within much more before it would be at rest."""
-    config = arm(("start = [-1.5707963, 0.0]", "start = [-1.37, 0.0]"))
+    config = arm(("start = [-1.5707963, 0.0]", "start = [-1.37, 0.0]"), *QUICK)
     rests = load_samples(run(config, tmp_path / "run").samples_path, 2)["position"]
-    assert rests[0, 0] < -1.45 and np.ptp(rests[:40], axis=0).max() < 0.01
+    assert rests[0, 0] < -1.45 and np.ptp(rests[:20], axis=0).max() < 0.01
 
 
 def test_a_rest_pose_at_the_encoders_wrap_is_found_on_either_side(arm: Arm) -> None:
@@ -219,7 +220,7 @@ def test_where_grease_warms_up_a_warm_up_is_proposed(arm: Arm, tmp_path: Path) -
     with pytest.raises(
         NotSettled, match=r"decreases slowly from period to period.*set experiment.warm_up = \d+"
     ) as caught:
-        run(arm(never, *drives), tmp_path / "run")
+        run(arm(never, *drives, *FEWER_SAMPLES), tmp_path / "run")
     seconds = float(str(caught.value).rsplit("= ", 1)[1].rstrip("."))
     assert 20.0 <= seconds <= 90.0  # 1e-4 of the motion is left after five or six times 6 s
 
@@ -229,7 +230,7 @@ def test_an_upright_arm_is_balanced_before_torque_is_cut(
 ) -> None:
     """Its stabiliser's springs leave it where gravity, friction and an offset hold it, from where it may fall."""
     pushed = [(f"offset = {each}", "offset = 0.08") for each in ("0.004", "-0.003")]
-    upright = arm(*pushed, ("peak_torque = [0.60, 0.35]", "peak_torque = [0.3, 0.2]"), base="fake_inverted")
+    upright = arm(*pushed, ("peak_torque = [0.60, 0.35]", "peak_torque = [0.3, 0.2]"), *QUICK, base="fake_inverted")
 
     def left_at(name: str) -> float:
         run(upright, tmp_path / name)
@@ -270,14 +271,14 @@ def test_a_servo_in_another_mode_is_brought_into_current_mode_and_back(
 ) -> None:
     seen: list[int] = []
     look = at_sample(10, lambda: seen.extend(servo.operating_mode for servo in ports[0].bus.servos.values()))
-    run(arm(), tmp_path / "run", look)  # like servos from the factory, the fake starts in position mode
+    run(arm(*QUICK), tmp_path / "run", look)  # like servos from the factory, the fake starts in position mode
     assert seen == [0, 0]
     assert [servo.operating_mode for servo in ports[0].bus.servos.values()] == [3, 3]
 
 
 def test_factory_return_delay_is_waited_for(arm: Arm, tmp_path: Path) -> None:
     slow = ("zero_ticks = 2048\n\n[fake.arm]", "zero_ticks = 2048\nreturn_delay_us = 500\n\n[fake.arm]")
-    samples = load_samples(run(arm(slow), tmp_path / "run").samples_path, 2)
+    samples = load_samples(run(arm(slow, *QUICK), tmp_path / "run").samples_path, 2)
     assert not samples["missing"].any()
 
 

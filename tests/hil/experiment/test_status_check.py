@@ -51,6 +51,24 @@ def test_a_goal_may_get_lost_once_but_not_twice_in_a_row(arm: Arm) -> None:
 
 
 @pytest.mark.parametrize(
+    ("held", "pauses", "cause"),
+    [((0.06, 0.07), 0, Cause.STALE), ((0.06, 0.06), 0, Cause.GOALS_LOST), ((0.06, 0.08), 1, Cause.GOALS_LOST)],
+)
+def test_a_servo_that_holds_the_goal_it_seemed_to_have_missed_answers_a_cycle_late(
+    arm: Arm, held: Sequence[float], pauses: int, cause: Cause
+) -> None:
+    """After a pause the missed goal is not that of the cycle before, so goals may get lost now and then."""
+    check = StatusCheck(arm())
+    goals = iter((0.06, 0.07, 0.08, 0.09))
+    for holds, before in zip(held, (2, 1 + pauses), strict=True):
+        for _ in range(before):
+            goal = next(goals)
+            check.sent((goal, 0.0))
+        wrong = check.look(0, FINE._replace(goal=holds), goal, 1.0)
+    assert wrong is not None and wrong[0] is cause and ("a cycle late" in wrong[1]) == (cause is Cause.STALE)
+
+
+@pytest.mark.parametrize(
     ("held", "is_foreign"),
     [((0.404, 0.404), True), ((-0.1, -0.11), True), ((0.07, 0.404), True), ((0.07, 0.07), False)],
 )

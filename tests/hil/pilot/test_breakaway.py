@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from hil.config.schema import Config, load_config
+from hil.config.schema import Config, parse_config
 from hil.dry_run.amplitude import most_torque
 from hil.errors import Cause, DidNotMove, ExperimentError, NoSafeTorque, NotSettled, SafetyStop
 from hil.pilot import full
@@ -16,6 +16,7 @@ from hil.pilot.options import PilotOptions
 from hil.pilot.search import Search
 from hil.pilot.steps import Played, Step, tells_of_the_arm
 from hil.runs.run_folder import RunFolder
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 OPTIONS = PilotOptions()
@@ -24,7 +25,9 @@ SHOULDER = np.array([True, False])
 
 @pytest.fixture(scope="module")
 def config() -> Config:
-    return load_config(CONFIGS / "first_time.toml")
+    path = CONFIGS / "first_time.toml"
+    short = (("rate = 400.0 ", "rate = 100.0 "), ("period = 10.0 ", "period = 4.0 "), ("band = [0.1,", "band = [0.25,"))
+    return parse_config(replaced(path.read_text(encoding="utf-8"), *short), path)
 
 
 def test_only_joints_that_stood_still_are_raised_and_no_farther_than_their_limit() -> None:

@@ -13,6 +13,7 @@ from hil.pilot.chain_belief import SIMULATED, ChainBelief, _poses
 from hil.pilot.chain_paths import Paths, chain_config
 from hil.pilot.chain_shares import step_config
 from hil.runs.recording import Phase
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 
@@ -23,7 +24,9 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Config:
     urdf = (CONFIGS / "leg.urdf").read_text(encoding="utf-8")
     first, _, rest = urdf.partition('<axis xyz="0 1 0"/>')
     (folder / "leg.urdf").write_text(first + '<axis xyz="0.99875 0.05 0"/>' + rest, encoding="utf-8")
-    (folder / "leg.toml").write_text((CONFIGS / "leg.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    text = (CONFIGS / "leg.toml").read_text(encoding="utf-8")
+    text = replaced(text, ("period = 10.0", "period = 5.0"), ("rate = 400.0", "rate = 100.0"))
+    (folder / "leg.toml").write_text(text, encoding="utf-8")
     return chain_config(load_config(folder / "leg.toml"))
 
 

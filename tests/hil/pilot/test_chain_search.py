@@ -15,8 +15,6 @@ from hil.config.schema import Config, load_config, parse_config
 from hil.dry_run import chain_summary
 from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
-from hil.dry_run.chain_stop import ARMS as STOPPED
-from hil.dry_run.chain_stop import MOMENTS
 from hil.dry_run.chain_summary import chain_dry_run_json, chain_dry_run_lines, unsafe
 from hil.errors import Cause, ConfigError, DidNotMove, NoSafeTorque, NotSettled, SafetyStop
 from hil.estimator.chain.excitation.fourier_path import Path as Motion
@@ -30,18 +28,25 @@ from hil.pilot.chain_shares import PILOT_SHARES, Found, SafeShares, step_config
 from hil.pilot.steps import Say
 from hil.plan.chain_model import known_chain
 from hil.runs.recording import load_samples
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 LEG = CONFIGS / "leg.toml"
+TEXT = replaced(LEG.read_text(encoding="utf-8"), ("period = 10.0", "period = 5.0"), ("rate = 400.0", "rate = 100.0"))
+"""A shorter experiment, so that designs and simulations take less time."""
+
 DESIGNED: dict[str, Paths] = {}
+
+
+def leg(*changes: tuple[str, str]) -> Config:
+    return parse_config(replaced(TEXT, *changes), LEG)
 
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> hil.Identification:
     folder = tmp_path_factory.mktemp("leg")
-    text = LEG.read_text(encoding="utf-8").replace("period = 10.0", "period = 6.0")
     (folder / "leg.urdf").write_bytes((CONFIGS / "leg.urdf").read_bytes())
-    (folder / "leg.toml").write_text(text, encoding="utf-8")
+    (folder / "leg.toml").write_text(TEXT, encoding="utf-8")
     return hil.identify(folder / "leg.toml", out=folder / "run")
 
 
@@ -71,7 +76,7 @@ def test_all_of_it_stays_within_limits_and_ends_at_rest(found: hil.Identificatio
 
 
 def test_optimised_paths_are_twice_as_certain_as_random_ones() -> None:
-    config = chain_config(load_config(LEG))
+    config = chain_config(leg(("rate = 100.0", "rate = 400.0")))  # velocities are compared with finite differences
     paths = Paths.of(config, ChainBelief.prior(config).torque)
     plain = [paths.designer.plain(paths.identify.centre, seed).worst for seed in range(5)]
     assert paths.identify.worst < 0.5 * np.median(plain)
@@ -83,7 +88,7 @@ def test_optimised_paths_are_twice_as_certain_as_random_ones() -> None:
 
 
 def test_a_motion_that_could_meet_a_box_is_not_safe() -> None:
-    config = chain_config(load_config(LEG))
+    config = chain_config(leg())
     belief = ChainBelief.prior(config)
     paths = Paths.of(config, belief.torque)
     held = step_config(belief.with_stabiliser(config))
@@ -95,8 +100,7 @@ def test_a_motion_that_could_meet_a_box_is_not_safe() -> None:
     assert isinstance(motion, Motion)
     foot = hil_foot(config, motion)
     box = f'[[clearance.boxes]]\nname = "stone"\ncentre = {foot}\nsize = [0.03, 0.03, 0.03]\n\n[experiment]\n'
-    text = LEG.read_text(encoding="utf-8").replace("[experiment]\n", box, 1)
-    blocked = step_config(belief.with_stabiliser(chain_config(parse_config(text, LEG))))
+    blocked = step_config(belief.with_stabiliser(chain_config(leg(("[experiment]\n", box)))))
     why = unsafe(blocked, predict_chain(blocked, plan, arms))
     assert "stone" in why
     assert "s into 'identify'" in why
@@ -111,8 +115,7 @@ def hil_foot(config: object, motion: Motion) -> list[float]:
 
 
 def test_no_room_is_said() -> None:
-    text = LEG.read_text(encoding="utf-8").replace("floor = -0.4 ", "floor = 0.02 ")
-    config = chain_config(parse_config(text, LEG))
+    config = chain_config(leg(("floor = -0.4 ", "floor = 0.02 ")))
     with pytest.raises(ConfigError, match=r"arm\.rest_pose puts shank .* into floor"):
         Paths.of(config, ChainBelief.prior(config).torque)
 
@@ -130,7 +133,7 @@ def test_learning_moves_the_arms_to_what_was_seen(found: hil.Identification) -> 
 
 
 def test_only_a_limit_takes_amplitude_away_not_a_joint_that_friction_holds() -> None:
-    config = chain_config(load_config(LEG))
+    config = chain_config(leg())
     belief = ChainBelief.prior(config)
     search = searching(config, belief, cast("Any", None), print)
     played = Found(0.3, cast("Any", None), cast("Any", None))
@@ -209,7 +212,7 @@ def test_where_little_of_a_path_is_safe_another_one_with_more_reserve_is_tried(
     monkeypatch: pytest.MonkeyPatch, safe_at_first: float
 ) -> None:
     """It is used if more is learned from it, and never if nothing of it is safe."""
-    config = chain_config(load_config(LEG))
+    config = chain_config(leg())
     said: list[str] = []
     search = search_of(config, ChainBelief.prior(config), said)
     designed, roomier = search.paths, []
@@ -236,8 +239,8 @@ def test_where_little_of_a_path_is_safe_another_one_with_more_reserve_is_tried(
 
 
 def test_an_arm_too_heavy_for_any_path_is_refused_with_the_reason_and_what_helps() -> None:
-    config = chain_config(load_config(LEG))
-    search = search_of(config, heavier(ChainBelief.prior(config), 20.0), [])
+    config = chain_config(leg())
+    search = search_of(config, heavier(ChainBelief.prior(config), 40.0), [])
     with pytest.raises(
         NoSafeTorque, match=r"not even the designed path at 90 % of its amplitude: .*needs about.*More accurate.*larger"
     ):
@@ -246,7 +249,7 @@ def test_an_arm_too_heavy_for_any_path_is_refused_with_the_reason_and_what_helps
 
 @pytest.mark.slow
 def test_paths_from_other_seeds_are_tried_before_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = chain_config(load_config(LEG))
+    config = chain_config(leg())
     said: list[str] = []
     search = search_of(config, ChainBelief.prior(config), said)
     first, seed = search.paths, config.experiment.seed
@@ -290,7 +293,7 @@ def test_a_period_too_short_for_a_path_is_a_mistake_in_the_file() -> None:
 
 
 def test_a_path_that_is_safe_is_kept() -> None:
-    config = chain_config(load_config(LEG))
+    config = chain_config(leg())
     search = search_of(config, ChainBelief.prior(config), [])
     designed = search.paths
     assert search.safe(step_config(search.config), (0.3,)).share == 0.3
@@ -298,7 +301,7 @@ def test_a_path_that_is_safe_is_kept() -> None:
 
 
 def test_paths_that_are_rejected_do_not_make_later_ones_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = chain_config(load_config(LEG))
+    config = chain_config(leg())
     search = search_of(config, ChainBelief.prior(config), [])
     designed, tried = search.paths, []
 
@@ -323,7 +326,7 @@ def test_a_reserve_always_leaves_some_range() -> None:
     for _ in range(8):
         reserve = reserve.larger(0.01)
     assert reserve.position < 0.35
-    config = chain_config(load_config(LEG))
+    config = chain_config(leg())
     with pytest.raises(NoSafeTorque, match="no position range is left"):
         Paths.of(config, ChainBelief.prior(config).torque, replace(RESERVE, position=0.5))
 
@@ -337,7 +340,7 @@ def wider(paths: Paths, times: float) -> Paths:
 
 def test_another_path_starts_with_no_more_amplitude_than_the_one_it_replaces(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shares of different paths cannot be compared; those of the previous run and of its limit are converted."""
-    config = chain_config(load_config(LEG))
+    config = chain_config(leg())
     search = search_of(config, ChainBelief.prior(config), [])
     designed, tried = search.paths, []
     search.last, search.cap = 0.2, 0.8
@@ -360,12 +363,14 @@ def test_another_path_starts_with_no_more_amplitude_than_the_one_it_replaces(mon
 def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) -> None:
     for place in ("chain_shares.SEARCH_ARMS", "chain_shares.ARMS", "chain_rehearsal.ARMS"):
         monkeypatch.setattr(f"hil.pilot.{place}", 4 if "SEARCH" in place else 12)
-    text = LEG.read_text(encoding="utf-8").replace("period = 10.0", "period = 5.0")
-    config, told = parse_config(text, LEG), list[int]()
+    moments, stopped = 5, 3
+    monkeypatch.setattr("hil.dry_run.chain_stop.MOMENTS", moments)
+    monkeypatch.setattr("hil.dry_run.chain_stop.ARMS", stopped)
+    config, told = leg(), list[int]()
     designed = list[tuple[int, int]]()
     first = rehearse(config, 4, tell=lambda _, of: told.append(of), designing=lambda *each: designed.append(each))
     assert (told.count(4), told.count(12)) == (4, 2 * 12)  # also while it searches
-    assert told.count(2 * MOMENTS * STOPPED) == 2 * 2 * MOMENTS * STOPPED, "its stops as well"
+    assert told.count(2 * moments * stopped) == 2 * 2 * moments * stopped, "its stops as well"
     assert designed[0] == (1, designed[-1][1]) and designed[-1][0] == len(designed) == designed[-1][1]
     pilot = ChainSearch.of(config, cast("Any", None), LEG, cast("Any", None), lambda _: None)
     found = pilot.safe(step_config(pilot.config), PILOT_SHARES)
@@ -386,16 +391,16 @@ def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) ->
     # Where no share is safe, both refuse, for the same reason.
     monkeypatch.setattr(SafeShares, "_largest", lambda *_: (None, "shank and floor: 2 mm", 0.0))
     monkeypatch.setattr("hil.pilot.chain_shares.REDESIGNS", 0)
+    monkeypatch.setattr(Paths, "of", lambda *_, paths=pilot.paths, **__: paths)
     with pytest.raises(NoSafeTorque) as refused:
         pilot.safe(step_config(pilot.config), PILOT_SHARES)
-    monkeypatch.setattr(Paths, "of", lambda *_, **__: pilot.paths)
     again = rehearse(config, 4)
     assert again.why_not(again.config) == str(refused.value)
     assert not again.is_safe(again.config)
 
 
 def test_a_dry_run_of_more_arms_than_the_prior_has_draws_further_ones() -> None:
-    belief = ChainBelief.prior(chain_config(load_config(LEG)))
+    belief = ChainBelief.prior(chain_config(leg()))
     arms = belief.at_least(belief.arms.size + 3)
     assert arms.size == belief.arms.size + 3
     np.testing.assert_array_equal(arms.rigid[:5], belief.at_least(5).rigid)
@@ -483,7 +488,7 @@ def test_a_search_that_has_simulated_enough_tries_the_least_amplitude_only(monke
 
 
 def test_a_search_is_bounded_and_a_refusal_says_that_it_ended_early(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = chain_config(load_config(LEG))
+    config = chain_config(leg())
     said: list[str] = []
     search = search_of(config, ChainBelief.prior(config), said)
     monkeypatch.setattr(search, "_largest", lambda *_: (None, "shank hits floor", 0.0))
@@ -499,7 +504,7 @@ def test_a_search_is_bounded_and_a_refusal_says_that_it_ended_early(monkeypatch:
 def test_a_refusal_names_a_rate_only_if_a_motion_is_safe_at_it(
     monkeypatch: pytest.MonkeyPatch, enough: float, named: str
 ) -> None:
-    config = chain_config(parse_config(LEG.read_text(encoding="utf-8").replace("rate = 400.0", "rate = 50.0"), LEG))
+    config = chain_config(leg(("rate = 100.0", "rate = 50.0")))
     belief = ChainBelief.prior(config)
     search, paths, tried = search_of(config, belief, []), None, list[Config]()
 

@@ -19,13 +19,14 @@ from hil.pilot.gains import with_stabiliser
 from hil.pilot.options import PilotOptions
 from hil.setup.config_template import ArmAnswers, JointAnswers, arm_toml
 from tests.support.command_line import hil
+from tests.support.edits import replaced
 
 HANGING, FLAT, UPRIGHT = (-math.pi / 2, 9.81), (0.0, 0.0), (math.pi / 2, 9.81)
 ARMS = 24
 
 
 def written(folder: Path, kind: tuple[float, float], joints: int = 1, swing: float = 1.2, **joint: Any) -> Path:
-    """The file that `hil init` writes for such an arm."""
+    """The file that `hil init` writes for such an arm, with a shorter period."""
     rest, gravity = kind
     each = tuple(
         JointAnswers(
@@ -41,7 +42,9 @@ def written(folder: Path, kind: tuple[float, float], joints: int = 1, swing: flo
         for number in range(1, joints + 1)
     )
     path = folder / "arm.toml"
-    path.write_text(arm_toml(ArmAnswers("fake://arm.toml", 1_000_000, each, gravity, "# Test.")), encoding="utf-8")
+    text = arm_toml(ArmAnswers("fake://arm.toml", 1_000_000, each, gravity, "# Test."))
+    text = replaced(text, ("period = 10.0 ", "period = 4.0 "), ("band = [0.1, 5.0]", "band = [0.25, 5.0]"))
+    path.write_text(text, encoding="utf-8")
     return path
 
 

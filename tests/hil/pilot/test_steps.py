@@ -14,7 +14,7 @@ from rich.console import Console
 
 import hil
 from hil.cli.views.result_table import print_result
-from hil.config.schema import load_config
+from hil.config.schema import Config, load_config
 from hil.errors import ConfigError
 from hil.estimation.settled_estimate import estimate_run
 from hil.experiment.run import run_experiment
@@ -29,6 +29,7 @@ from hil.report.run_data import RunData
 from hil.results.result import SettledResult
 from hil.runs.run_folder import RunFolder
 from tests.support.dry_runs import worst_relative_std
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 Writes = Counter[tuple[int, str]]
@@ -51,10 +52,25 @@ def counted_eeprom_writes() -> Iterator[Writes]:
 
 
 @pytest.fixture(scope="module")
+def first_time(tmp_path_factory: pytest.TempPathFactory) -> Config:
+    """The bundled file with a shorter experiment at a lower rate, whose pilots settle roughly."""
+    path = tmp_path_factory.mktemp("first_time") / "first_time.toml"
+    text = replaced(
+        (CONFIGS / path.name).read_text(encoding="utf-8"),
+        ("rate = 400.0 ", "settle_within = 0.03\nrate = 200.0 "),
+        ("period = 10.0 ", "period = 6.0 "),
+        ("band = [0.1,", "band = [0.167,"),
+    )
+    path.write_text(text, encoding="utf-8")
+    return load_config(path)
+
+
+@pytest.fixture(scope="module")
 def in_steps_counted(
+    first_time: Config,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[tuple[SettledResult, Path, list[str]], Writes]:
-    config = load_config(CONFIGS / "first_time.toml")
+    config = first_time
     assert config.experiment.peak_torque is None and config.arm.prior is None
     run = RunFolder.create(tmp_path_factory.mktemp("steps") / "run", config)
     said: list[str] = []
@@ -110,16 +126,20 @@ def test_every_step_says_predicted_against_seen(in_steps: Any) -> None:
         assert np.abs(foreseen / seen - 1).max() <= 0.10
 
 
-def test_the_run_folder_estimates_again_with_the_torque_that_was_found(in_steps: Any) -> None:
+def test_the_run_folder_estimates_again_with_the_torque_that_was_found(in_steps: Any, first_time: Config) -> None:
     result, path, _ = in_steps
     folder = RunFolder.open(path)
     assert folder.load_config().experiment.peak_torque == pytest.approx(result.steps[-1].peak_torque)
-    assert (path / "config.toml").read_bytes() == (CONFIGS / "first_time.toml").read_bytes()
+    assert (path / "config.toml").read_bytes() == first_time.path.read_bytes()
     assert estimate_run(folder).parameters == result.parameters
 
 
 def test_an_inverted_arm_is_identified_with_a_stabiliser(tmp_path: Path) -> None:
-    config = load_config(CONFIGS / "fake_inverted.toml")
+    text = (CONFIGS / "fake_inverted.toml").read_text(encoding="utf-8")
+    (tmp_path / "arm.toml").write_text(
+        replaced(text, ("rate = 400.0 ", "rate = 200.0 "), ("period = 10.0 ", "period = 6.0 ")), encoding="utf-8"
+    )
+    config = load_config(tmp_path / "arm.toml")
     run = RunFolder.create(tmp_path / "run", config)
     run_experiment(config, run, config.path, lambda _: None)
     result = estimate_run(run)
@@ -138,9 +158,11 @@ def test_an_inverted_arm_is_identified_with_a_stabiliser(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_second_run_starts_from_the_first_and_needs_fewer_steps(in_steps: Any, tmp_path: Path) -> None:
+def test_a_second_run_starts_from_the_first_and_needs_fewer_steps(
+    in_steps: Any, first_time: Config, tmp_path: Path
+) -> None:
     first, _, _ = in_steps
-    config = load_config(CONFIGS / "first_time.toml")
+    config = first_time
     said: list[str] = []
     run = RunFolder.create(tmp_path / "run", config)
     _, second = identify_in_steps(config, run, config.path, lambda _: None, said.append, first)
@@ -150,9 +172,11 @@ def test_a_second_run_starts_from_the_first_and_needs_fewer_steps(in_steps: Any,
         assert abs(entry.value - second.truth[name]) <= 0.01 * abs(second.truth[name]), name
 
 
-def test_an_earlier_result_narrows_the_belief_and_is_dropped_when_the_arm_moves_otherwise(in_steps: Any) -> None:
+def test_an_earlier_result_narrows_the_belief_and_is_dropped_when_the_arm_moves_otherwise(
+    in_steps: Any, first_time: Config
+) -> None:
     first, _, _ = in_steps
-    config = load_config(CONFIGS / "first_time.toml")
+    config = first_time
     said: list[str] = []
     search = Search.of(config, Mock(), Mock(say=said.append), earlier=first)
     prior = prior_belief(config, 96)

@@ -87,7 +87,7 @@ def test_errors_that_repeat_with_the_motion_are_trusted_with_care(setup: bench.S
     found.names, found.value = (*found.names, "torque_scale_2"), np.append(found.value, 0.7)
     found.std = np.append(found.std, 1e-3)
     scaled = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
-    assert scaled.trust == "with care" and "contradict each other by a factor of 1.43" in " ".join(scaled.sentences)
+    assert scaled.trust == "with care" and "disagree by a factor of 1.43" in " ".join(scaled.sentences)
     found.names, found.value, found.std = found.names[:-1], found.value[:-1], found.std[:-1]
     found.systematic = 3.0
     hidden = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]

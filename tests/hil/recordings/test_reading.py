@@ -122,7 +122,7 @@ def spoilt(change: Callable[[list[str]], list[str]]) -> Converted:
     ("change", "said", "recordings"),
     [
         (lambda rows: [each for row in rows for each in (row, row)], "800 repeated rows were left out", 1),
-        (lambda rows: [*rows[:300], *rows[340:]], "columns read: time: time", 1),
+        (lambda rows: [*rows[:300], *rows[340:]], "columns read: time = time", 1),
         (lambda rows: [*rows[:300], "nan,,,,", *rows[300:]], "1 rows without a time", 1),
         (lambda rows: [*rows[:300], rows[301], rows[300], *rows[302:]], "1 rows out of order were sorted", 1),
         (lambda rows: [*rows[:300], rows[300].rpartition(",")[0] + ",", *rows[301:]], "torque was filled in", 1),
@@ -427,7 +427,7 @@ def test_a_column_named_datetime_is_the_time_and_one_without_a_name_is_named() -
         encoding="utf-8",
     )
     (note, *_) = read(Path("a.csv")).notes
-    assert "time: datetime" in note and "Not used: a column without a name." in note
+    assert "time = datetime" in note and "Not used: a column without a name." in note
 
 
 def test_the_example_of_a_file_of_one_joint_has_its_own_names() -> None:

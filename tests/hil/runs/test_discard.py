@@ -8,6 +8,7 @@ import pytest
 from hil.config.schema import Config
 from hil.runs.run_folder import RunFolder
 from tests.support.command_line import hil
+from tests.support.edits import QUICK
 
 
 def test_a_failed_start_can_be_tried_again(arm_file: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
@@ -39,7 +40,7 @@ def test_ctrl_c_during_the_estimate_keeps_the_recording_and_says_how_to_go_on(
     def interrupted(_: RunFolder) -> None:
         raise KeyboardInterrupt
 
-    path = arm_file()
+    path = arm_file(*QUICK)
     out = path.parent / "run"
     with monkeypatch.context() as patched:
         patched.setattr("hil.api.experiment.estimate_run", interrupted)

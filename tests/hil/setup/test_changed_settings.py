@@ -1,10 +1,13 @@
 """What is said of settings that differ from those before the run."""
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import pytest
 
 from hil.drivers.joint import Joint
 from hil.drivers.servo_model import servo_model
-from hil.setup.changed_settings import changed_settings
+from hil.setup.changed_settings import changed_settings, settings_now
 
 SHOULDER, ELBOW = (Joint(name, number, servo_model("XM430-W350")) for number, name in ((1, "shoulder"), (2, "elbow")))
 LIMIT = "Current Limit"
@@ -22,3 +25,25 @@ def test_one_that_differs_from_all_before_has_not(before: tuple[int, int], after
     settings = [dict(zip(((SHOULDER, LIMIT), (ELBOW, LIMIT)), each, strict=True)) for each in (before, after)]
     said = changed_settings(settings[0], settings[1])
     assert LIMIT in said and ("swapped" in said) == (before == (0, 1))
+
+
+class Late:
+    """A servo whose replies are `late` requests old."""
+
+    def __init__(self, late: int) -> None:
+        self.id = 2
+        self.table = {"ID": 2, "Operating Mode": 16, "Drive Mode": 0, "Homing Offset": 0, "Return Delay Time": 0}
+        self._replies = [0] * late
+
+    def read(self, register: str, attempts: int) -> int:
+        self._replies.append(self.table[register])
+        return self._replies.pop(0)
+
+
+@pytest.mark.parametrize("late", [0, 1, 2])
+def test_settings_are_unknown_if_replies_are_late(late: int) -> None:
+    """Several settings are 0, and would be taken for another that is not."""
+    servo = Late(late)
+    found = settings_now(cast(Any, SimpleNamespace(drives={ELBOW: servo})))
+    known = {(ELBOW, name): value for name, value in servo.table.items() if name != "ID"}
+    assert found == ({} if late else known)

@@ -23,6 +23,7 @@ from hil.setup import preflight
 from hil.setup.preflight import Finding, Level, check_arm
 from hil.setup.scan import Asking, listen, scan
 from hil.setup.servo_settings import open_servo, set_up
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 Arm = Callable[..., Config]
@@ -131,6 +132,7 @@ def test_a_rest_pose_inside_the_floor_is_found_by_the_check(tmp_path: Path) -> N
     urdf = "open_manipulator_x_like.urdf"
     (tmp_path / urdf).write_bytes((CONFIGS / urdf).read_bytes())
     text = (CONFIGS / "fake_open_manipulator_x.toml").read_text(encoding="utf-8")
+    text = replaced(text, ("period = 10.0", "period = 5.0"), ("rate = 400.0", "rate = 200.0"))
     (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
     found = look(load_config(tmp_path / "arm.toml"))
     assert found["arm", "rest pose"].level is found["experiment", "path"].level is Level.OK

@@ -14,7 +14,7 @@ from hil.study.run import StudyProgress, run_study
 from hil.study.schema import EngineTable, load_study
 from hil.study.work import TIMINGS
 from tests.support.command_line import hil
-from tests.support.edits import replaced
+from tests.support.edits import QUICK, replaced
 from tests.support.paths import CONFIGS
 
 STUDY = """
@@ -38,7 +38,7 @@ columns = ["parameters.*.value", "verdict.trust"]
 @pytest.fixture
 def study_file(tmp_path: Path) -> Path:
     text = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
-    text = replaced(text, ("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"))
+    text = replaced(text, ("period = 10.0 ", "period = 2.0 "), ("band = [0.1, 5.0]", "band = [0.5, 6.0]"), *QUICK)
     (tmp_path / "arm.toml").write_text(text, encoding="utf-8")
     path = tmp_path / "study.toml"
     path.write_text(STUDY, encoding="utf-8")
@@ -66,7 +66,7 @@ def test_one_worker_and_two_give_the_same_rows(study_file: Path, tmp_path: Path)
     assert [each.done for each in seen] == [1, 2]
 
 
-def test_a_study_is_resumed_where_it_stopped(study_file: Path, tmp_path: Path) -> None:
+def test_a_study_is_resumed_where_it_stopped(study_file: Path, tmp_path: Path, cluster: str) -> None:
     text = STUDY.replace('task = "identify"', 'task = "empty"').replace("runs = 4", "runs = 40")
     study_file.write_text(text, encoding="utf-8")
     study, out = load_study(study_file), tmp_path / "out"
@@ -79,11 +79,11 @@ def test_a_study_is_resumed_where_it_stopped(study_file: Path, tmp_path: Path) -
             raise Stopped
 
     with pytest.raises(Stopped):
-        run_study(study, out, worker_count=1, watch=stop)
+        run_study(study, out, scheduler=cluster, watch=stop)
     assert len(Dataset(out / "rows").done()) == 7
     with pytest.raises(RunFolderError, match="--resume"):
-        run_study(study, out, worker_count=1)
-    dataset = run_study(study, out, resume=True, worker_count=1)
+        run_study(study, out, scheduler=cluster)
+    dataset = run_study(study, out, resume=True, scheduler=cluster)
     assert dataset.table().column("run").to_pylist() == list(range(40))
     study_file.write_text(text.replace("seed = 3", "seed = 4"), encoding="utf-8")
     with pytest.raises(ConfigError, match="is not the study"):

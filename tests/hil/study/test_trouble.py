@@ -31,6 +31,7 @@ config = "fake_two_link_ideal"
 "fake.faults.0.servo" = [2]
 "fake.faults.0.at" = [3.0]
 "experiment.period" = [2.0]
+"experiment.rate" = [200.0]
 "experiment.band.0" = [0.5]
 """
 
@@ -53,10 +54,10 @@ def die_at(value: int) -> int:
     return value
 
 
-def test_each_gives_results_in_order_and_raises_what_was_raised() -> None:
-    assert each(double, range(5), count=2) == [0, 2, 4, 6, 8]
+def test_each_gives_results_in_order_and_raises_what_was_raised(cluster: str) -> None:
+    assert each(double, range(5), scheduler=cluster) == [0, 2, 4, 6, 8]
     with pytest.raises(ValueError, match="seven"):
-        each(double, range(9), count=1)
+        each(double, range(9), scheduler=cluster)
 
 
 def test_a_job_that_kills_every_worker_is_given_up_and_the_others_are_done(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,8 +137,8 @@ def test_a_run_of_an_arm_in_space_finds_its_urdf(tmp_path: Path) -> None:
     assert f'urdf = "{CONFIGS / "open_manipulator_x_like.urdf"}"' in text
 
 
-def test_faults_are_rows_that_say_how_it_ended(tmp_path: Path) -> None:
-    rows = run_study(study(tmp_path, FAULT), tmp_path / "out", worker_count=1).table().to_pylist()
+def test_faults_are_rows_that_say_how_it_ended(tmp_path: Path, cluster: str) -> None:
+    rows = run_study(study(tmp_path, FAULT), tmp_path / "out", scheduler=cluster).table().to_pylist()
     assert [row["status"] for row in rows] == ["done", "done"], [row["message"] for row in rows]
     assert [row["fault.outcome"] for row in rows] == ["stopped", "stopped"]
     assert rows[1]["fault.cause"] == "missing replies"
@@ -170,7 +171,7 @@ def scheduler(tmp_path: Path) -> Iterator[tuple[str, "subprocess.Popen[bytes]"]]
 
 
 def test_a_scheduler_that_dies_is_told_and_the_study_resumed(
-    tmp_path: Path, scheduler: tuple[str, "subprocess.Popen[bytes]"]
+    tmp_path: Path, scheduler: tuple[str, "subprocess.Popen[bytes]"], cluster: str
 ) -> None:
     address, process = scheduler
     made, out = study(tmp_path, EMPTY.format(runs=1000)), tmp_path / "out"
@@ -183,7 +184,7 @@ def test_a_scheduler_that_dies_is_told_and_the_study_resumed(
         run_study(made, out, scheduler=address, watch=kill)
     kept = Dataset(out / "rows").done()
     assert 100 <= len(kept) < 1000
-    dataset = run_study(made, out, resume=True, worker_count=1)
+    dataset = run_study(made, out, resume=True, scheduler=cluster)
     assert dataset.table().column("run").to_pylist() == list(range(1000))
 
 

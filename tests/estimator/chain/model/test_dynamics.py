@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from hil.description.urdf import read_urdf
-from hil.estimator.chain.model.dynamics import inverse_dynamics, mass_matrix, regressor, torque_derivatives
+from hil.estimator.chain.model.dynamics import inverse_dynamics, mass_matrix, regressor, split
 from hil.estimator.chain.model.geometry import Chain
+from hil.estimator.chain.model.kernels import accelerate, differentiate, move, place, room
 from hil.estimator.errors import ModelError, ShapeError
 from tests.support.chains import random_chain, random_parameters, random_urdf
 
@@ -19,6 +20,21 @@ SAMPLES = 20
 def motion(joints: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return rng.standard_normal((3, joints, SAMPLES)) * np.array([2.0, 3.0, 10.0])[:, None, None]
+
+
+def torque_derivatives(
+    chain: Chain, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of the torques by angles and by velocities at one instant (joints, joints)."""
+    link, armature = split(chain, parameters)
+    work = room(chain.joints)
+    rotation, translation, axis, gravity = chain.arrays
+    q, v, a = map(np.ascontiguousarray, (q, v, a))
+    place(rotation, translation, axis, q, work[0], work[1])
+    move(link, armature, v, work)
+    accelerate(armature, gravity, v, a, work)
+    differentiate(gravity, work)
+    return work[6], work[7]
 
 
 def described(path: Path, joints: int) -> tuple[Chain, np.ndarray]:

@@ -16,13 +16,14 @@ from hil.experiment.run import run_experiment
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 from hil.runs.timing import timing
+from tests.support.edits import QUICK
 from tests.support.stream.at_sample import at_sample
 
 Arm = Callable[..., Config]
 
 
 def test_a_stall_costs_the_periods_it_covers_and_no_burst_follows(arm: Arm, tmp_path: Path, ports: list[Any]) -> None:
-    config = arm()
+    config = arm(QUICK[1])
 
     def stall() -> None:
         ports[0].clock.wait_until(ports[0].clock.now() + 10.5 / 400)
@@ -42,7 +43,7 @@ def test_a_stall_costs_the_periods_it_covers_and_no_burst_follows(arm: Arm, tmp_
 
 
 def test_the_servos_clocks_supply_and_temperature_are_on_file(arm: Arm, tmp_path: Path) -> None:
-    config = arm()
+    config = arm(QUICK[1])
     run = RunFolder.create(tmp_path / "run", config)
     run_experiment(config, run, config.path, lambda _: None)
     samples = load_samples(run.samples_path, 2)
@@ -98,7 +99,7 @@ def test_a_latency_timer_that_may_not_be_set_is_refused_with_the_command_to_type
 
 
 def test_a_person_sees_heat_and_supply(arm: Arm, tmp_path: Path) -> None:
-    config = arm()
+    config = arm(*QUICK)
     run = RunFolder.create(tmp_path / "run", config)
     seen: list[Any] = []
     run_experiment(config, run, config.path, lambda progress: seen.append(progress.state.slow))

@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -14,12 +15,14 @@ from hil.cli.errors import message
 from hil.config.schema import load_config
 from hil.drivers.errors import BusShared, DriverError, PortLost, TorqueNotOff, WrongModel
 from hil.drivers.joint import Joint
+from hil.drivers.preparation.prepare import prepare_servo
+from hil.drivers.servo import Servo
 from hil.errors import Cause, ExperimentError, HilError, SafetyStop, StopRequested
 from hil.fakes.bus.faults import Fault
 from hil.setup.preflight import Finding, Level, check_arm
 from hil.setup.session.end_of_session import about_torque
 from hil.setup.session.saved_settings import SavedSettings
-from hil.setup.session.servo_session import COUNT_DOWN_S, SETTINGS_NAME, servo_session
+from hil.setup.session.servo_session import COUNT_DOWN_S, SETTINGS_NAME, ServoSession, servo_session
 from hil.setup.session.settings_file import settings_path
 from tests.support.bench import SHORT, Arm, Bench, play
 
@@ -76,6 +79,69 @@ def test_torque_that_another_program_switches_on_between_two_runs_is_cut_and_nam
             pytest.fail("the next run began")
     assert not any(servo.torque_enabled for servo in bench.servos.values())
     assert "Torque is off on both servos, confirmed by reading it back." in stop.value.__notes__
+
+
+@pytest.mark.parametrize(
+    "after",
+    [
+        "hil.setup.session.servo_session.settings_now",  # while settings are saved
+        "hil.drivers.bus.check_quiet",  # while this program listens for others
+        "hil.drivers.bus.prepare_servo",  # the other servo refuses its mode
+        "hil.experiment.run._write_facts",  # both refuse their limits
+    ],
+)
+def test_torque_that_another_program_switches_on_during_the_set_up_is_cut_and_named(
+    arm: Arm, tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch, after: str
+) -> None:
+    module, _, name = after.rpartition(".")
+    before = getattr(sys.modules[module], name)
+    done: list[object] = []
+
+    def then(*given: Any) -> Any:
+        result = before(*given)
+        if not done:
+            done.append(bench.servos[2].write(64, b"\1"))
+        return result
+
+    monkeypatch.setattr(after, then)
+    with pytest.raises(BusShared, match=r"'elbow'.*switched on by another program") as stop:
+        play(arm(SHORT), tmp_path / "run")
+    assert bench.changed() == []
+    assert "Torque is off on both servos, confirmed by reading it back." in stop.value.__notes__
+
+
+def test_a_servo_whose_mode_has_just_been_set_has_no_goal(
+    arm: Arm, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A change of mode leaves Goal Current at Current Limit: torque that comes on then would drive it with that."""
+    goals: list[int] = []
+
+    def prepared(joint: Joint, servo: Servo, others: set[int]) -> None:
+        prepare_servo(joint, servo, others)
+        goals.append(bench.servos[joint.id].value("Goal Current"))
+
+    monkeypatch.setattr("hil.drivers.bus.prepare_servo", prepared)
+    with servo_session(arm(SHORT)):
+        assert goals == [0, 0]
+
+
+@pytest.mark.parametrize("is_run", [False, True])
+def test_packets_of_another_master_while_settings_are_restored_are_named(
+    arm: Arm, tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch, is_run: bool
+) -> None:
+    def begins(*given: Any) -> Any:
+        bench.port.bus.faults.add(Fault(kind="other_master", servo=1, at=bench.port.clock.now()))
+        return end(*given)
+
+    end = ServoSession.end
+    monkeypatch.setattr(ServoSession, "end", begins)
+    with pytest.raises(ExperimentError, match="Another program has sent packets on this bus"):
+        if is_run:
+            play(arm(SHORT), tmp_path / "run")
+        else:
+            with servo_session(arm(SHORT)):
+                pass
+    assert bench.changed() == []
 
 
 def test_a_check_reports_torque_that_came_on_meanwhile_and_leaves_it(

@@ -51,7 +51,7 @@ class PaperArm:
     def stiffness(self) -> Array:
         """Return K (2, 2) [N m/rad]: gravity linearised about the hanging pose.
 
-        This is equation (7), corrected: its first term contains cos q1.
+        This is equation (7), corrected to contain cos q1 in its first term.
         """
         first = (self.mass_1 + self.mass_2) * self.length_1 * self.gravity
         second = self.mass_2 * self.length_2 * self.gravity
