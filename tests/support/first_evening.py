@@ -189,8 +189,15 @@ def _terminal(words: Sequence[str], folder: Path, forked: bool) -> Iterator[tupl
 
 def _start(words: Sequence[str], folder: Path, terminal: int) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", *words]
-    files = {"stdin": terminal, "stdout": terminal, "stderr": terminal}
-    return subprocess.Popen(command, **files, cwd=folder, env=_environment(), start_new_session=True)
+    return subprocess.Popen(
+        command,
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,
+        cwd=folder,
+        env=_environment(),
+        start_new_session=True,
+    )
 
 
 def _fork(words: Sequence[str], folder: Path, terminal: int) -> Forked:
