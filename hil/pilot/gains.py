@@ -21,11 +21,6 @@ _HELD = 1.5  # friction over gravity's torque at one radian from rest: at 1 it h
 _TORQUE_SHARE = 0.35  # largest share of the torque limit at a deflection of 1 rad, beyond what gravity needs
 
 
-def needs_stabiliser(config: Config, belief: Belief) -> bool:
-    """Whether the median arm has a joint that gravity fails to return to its rest pose."""
-    return bool(wandering(config, belief).any())
-
-
 def wandering(config: Config, belief: Belief) -> NDArray[np.bool_]:
     """Joints that need a spring (joints,): all joints of an arm that falls over or lies flat, otherwise those held by
     friction.

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from hil.estimator.arrays import Array
 from hil.estimator.chain.model.geometry import LINK_TERMS, Chain
-from hil.estimator.chain.model.kernels import accelerate, differentiate, move, place, regress, room
+from hil.estimator.chain.model.kernels import accelerate, move, place, regress, room
 from hil.estimator.compiled import compiled
 from hil.estimator.errors import ShapeError
 
@@ -38,24 +38,6 @@ def mass_matrix(chain: Chain, parameters: Array, position: Array) -> Array:
     move(link, armature, np.zeros(chain.joints), work)
     mass: Array = work[4]
     return mass
-
-
-def torque_derivatives(
-    chain: Chain, parameters: Array, position: Array, velocity: Array, acceleration: Array
-) -> tuple[Array, Array]:
-    """Return the derivatives of the torques with respect to angles and to velocities at one instant.
-
-    Both are (joints, joints) [N m/rad, N m s/rad].
-    """
-    link, armature = split(chain, parameters)
-    work = room(chain.joints)
-    rotation, translation, axis, gravity = chain.arrays
-    q, v, a = (np.asarray(each, dtype=np.float64) for each in (position, velocity, acceleration))
-    place(rotation, translation, axis, q, work[0], work[1])
-    move(link, armature, v, work)
-    accelerate(armature, gravity, v, a, work)
-    differentiate(gravity, work)
-    return work[6], work[7]
 
 
 def regressor(

@@ -174,7 +174,7 @@ def test_a_current_that_does_not_follow(arm: Arm) -> None:
     guard = Guard(arm())
     for _ in range(11):
         guard.look(off)
-    assert look(guard, off, off, off) is Cause.NOT_FOLLOWING, "30 ms at full weight"
+    assert look(guard, off, off) is Cause.NOT_FOLLOWING, "30 ms at full weight"
     guard = Guard(arm())
     follows = STILL._replace(goal_current=(0.5, 0.0), current=(0.5, 0.0))
     for state in [*[off] * 11, *[follows] * 12] * 3:
@@ -262,7 +262,7 @@ def test_an_arm_with_a_stabiliser_may_give_out_work(arm: Arm) -> None:
 def test_lost_torque_is_measured_against_what_the_configuration_plans(arm: Arm) -> None:
     """At 1.8 N m/A and a planned 0.8 N m, a third of the planned current is enough to detect lost torque."""
     off = STILL._replace(goal_current=(0.15, 0.0))
-    assert look(Guard(arm()), *[off] * 14) is Cause.NOT_FOLLOWING
+    assert look(Guard(arm()), *[off] * 13) is Cause.NOT_FOLLOWING
 
 
 @pytest.mark.parametrize(("carried", "said"), [(0.0, "Its torque is off"), (0.9, "another program"), (-0.6, "another")])

@@ -7,13 +7,32 @@ import numpy as np
 import pytest
 
 from hil.description.urdf import read_urdf
-from hil.estimator.chain.model.dynamics import inverse_dynamics, mass_matrix, regressor, torque_derivatives
+from hil.estimator.chain.model.dynamics import inverse_dynamics, mass_matrix, regressor, split
 from hil.estimator.chain.model.geometry import Chain
+from hil.estimator.chain.model.kernels import accelerate, differentiate, move, place, room
 from hil.estimator.errors import ModelError, ShapeError
 from tests.support.chains import random_chain, random_parameters, random_urdf
 
 SIZES = (1, 2, 4, 6, 7)
 SAMPLES = 20
+
+
+def torque_derivatives(
+    chain: Chain, parameters: np.ndarray, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of the torques with respect to angles and to velocities at one instant.
+
+    Both are (joints, joints) [N m/rad, N m s/rad].
+    """
+    link, armature = split(chain, parameters)
+    work = room(chain.joints)
+    rotation, translation, axis, gravity = chain.arrays
+    q, v, a = (np.asarray(each, dtype=np.float64) for each in (position, velocity, acceleration))
+    place(rotation, translation, axis, q, work[0], work[1])
+    move(link, armature, v, work)
+    accelerate(armature, gravity, v, a, work)
+    differentiate(gravity, work)
+    return work[6], work[7]
 
 
 def motion(joints: int, seed: int) -> np.ndarray:
