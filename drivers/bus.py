@@ -192,14 +192,13 @@ class ServoBus(TorqueSwitch):
         refuse_held(self._servos)
         for servo in self._servos.values():
             if servo.read("Bus Watchdog") == WATCHDOG_TRIPPED and servo.read("Torque Enable"):
-                servo.write("Torque Enable", 0)  # so that any torque found from now on is another program's
+                servo.write("Torque Enable", 0)  # any torque from now on is another program's
 
     def prepare(self) -> None:
         """Set every servo's mode with torque off, and prepare the exchange.
 
-        Torque must have been found off (`release_held`). Raises ServoFault, BusShared if another master is heard or
-        has switched torque on since, and WrongSetting if a register rules out an experiment and only the user may
-        change it.
+        Raises ServoFault, BusShared if another master is heard or has switched torque on since `release_held`, and
+        WrongSetting if a register rules out an experiment and only the user may change it.
         """
         check_quiet(self.port)
         ids = {drive.id for drive in self._drives}

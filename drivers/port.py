@@ -141,7 +141,7 @@ class Port:
         another master.
         """
         self.strangers = 0
-        """Number of instructions of another master received during set-up work, since the count was last reset."""
+        """Number of another master's instructions received during set-up work."""
         self._serial = opened
         self._timeout: float | None = opened.timeout
         self.clock: Clock = getattr(opened, "clock", None) or WallClock()

@@ -52,7 +52,7 @@ class SdkPort:
             port.overheard = b""
 
     def hear(self, received: bytes) -> None:
-        """Count the instructions of another master among bytes received before a request or before its reply."""
+        """Count another master's instructions among bytes other than a reply."""
         if received and not self._port.echoes:
             self._port.strangers += sum(not packet.is_status for packet in Framer().feed(received))
 

@@ -137,7 +137,7 @@ class ReadBack:
         self.longest = max(_FADES * self.longest, seconds)
 
     def may_repeat(self, now: float, takes: float) -> bool:
-        """Whether a lost read-back, which takes `takes` [s], may be repeated at once; if so, it is taken to be."""
+        """Whether a lost read-back that takes `takes` [s] is repeated at once."""
         if takes >= self._longest_again or now <= self._repeated_at + TRY_AGAIN_S:
             return False
         self._repeated_at = now

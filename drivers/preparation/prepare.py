@@ -73,7 +73,7 @@ def _trips(servo: Servo) -> list[float]:
 
 
 def check_quiet(port: Port) -> None:
-    """Raise BusShared if another master's instructions are received; the port then begins to count those to come."""
+    """Raise BusShared if another master's instructions are received."""
     port.discard_input()
     port.strangers = 0
     heard = list(Framer().feed(port.read(_MOST_HEARD_BYTES, LISTEN_S)))
@@ -134,7 +134,7 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
     if servo.read("Bus Watchdog"):
         servo.write("Bus Watchdog", 0)  # goals are read-only while it is tripped
     if joint.mode is Mode.CURRENT:
-        servo.write("Goal Current", 0)  # a change of mode leaves it at Current Limit, were torque switched on now
+        servo.write("Goal Current", 0)  # a change of mode leaves it at Current Limit
     # Goal PWM also limits the output in current mode, and another program may have left it at zero.
     if joint.mode is Mode.CURRENT and servo.read("Goal PWM") != servo.read("PWM Limit"):
         servo.write("Goal PWM", servo.read("PWM Limit"))

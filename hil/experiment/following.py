@@ -12,13 +12,11 @@ deviation sigma, grows by
 
 per sample. The step is bounded so that no single reply decides, and the sum is kept at or above zero. The commanded
 current is any value between the last two goals, because a reply may be measured before or after the motor follows the
-latest goal, and its sensor may have a scale error of `GAIN_ERROR`.
+latest goal, and may be off by a scale error of `GAIN_ERROR`.
 
-Two thresholds must be exceeded. Errors of successive replies may be related, so each reply is also weighted by the time
-that it represents: the weighted sum has to reach that of `LOST_AFTER_S`. Where replies are few, that would be one or
-two, and one of thousands of looks would exceed it by chance. From any one look on, the unweighted sum exceeds h with a
-probability of at most exp(-h), whatever the goals, because the mean likelihood ratio of a healthy motor is at most 1:
-the number of looks in a run determines `LEAST_RATIO`.
+Successive errors may be related, so each sample is weighted by the time that it represents. Chance must not decide in
+one of thousands of looks either: the unweighted sum must reach h = `LEAST_RATIO` too, which that of a healthy motor
+does with a probability of at most exp(-h) from any one look on.
 
 A servo whose readings are frozen while its joint stands still shows no deviation until the goal has moved far from the
 frozen current. But a current that is controlled never stays exactly the same while its goal changes: if all three
@@ -39,10 +37,10 @@ from hil.config.joint import JointConfig
 __all__ = ["MEMORY", "begin", "look"]
 
 GAIN_ERROR = 0.2
-"""Largest scale error of a current sensor in order."""
+"""Largest scale error of a current sensor."""
 
 SIGMA_SHARE = 0.05
-"""Standard deviation of other sensor and current-loop errors, relative to the planned peak."""
+"""Standard deviation of other errors, relative to the planned peak."""
 
 SIGMA_TICKS = 2.0
 """Lower bound of the standard deviation of current errors, in register ticks."""
@@ -60,10 +58,10 @@ _FULL_WEIGHT = 5.0
 """Upper bound on the log likelihood ratio of one sample: that of a goal of four sigma if zero is measured."""
 
 LEAST_RATIO = 10.0
-"""Log likelihood ratio at which a current counts as zero, however low the rate: at least two samples."""
+"""Log likelihood ratio at which a current counts as zero, however low the rate."""
 
 _FEWEST = 2
-"""Minimum number of samples that differ from the goal before they are reported, however low the rate."""
+"""Minimum number of samples that differ from the goal, however low the rate."""
 
 MEMORY = np.dtype(
     [
@@ -76,8 +74,7 @@ MEMORY = np.dtype(
 
 per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V]; share: the same, relative to the goal; follow_time:
 how long a larger deviation may last [s].
-evidence, ratio, count: sum of the log likelihood ratios times seconds, the same without seconds, and its number of
-samples.
+evidence, ratio, count: sum of the log likelihood ratios times seconds, without seconds, and its number of samples.
 differs_for, differs: duration [s] and number of samples of a deviation.
 carried: latest current; same_since_goal, same_for: goal when the readings last changed, and the time since then [s].
 """

@@ -14,7 +14,7 @@ __all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "may_be_later
 
 _MODE, _DELAY = "Operating Mode", "Return Delay Time"
 _GOAL_PWM = "Goal PWM"
-"""In current mode, a limit of the motor's voltage. A tripped watchdog leaves 0 there, which is nobody's setting."""
+"""In current mode, a limit of the voltage; a tripped watchdog leaves 0."""
 
 _REGISTERS = (_MODE, "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _GOAL_PWM, _DELAY)
 

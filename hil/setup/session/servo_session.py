@@ -219,11 +219,14 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
         token = _outermost.set(session)
         stopped: BaseException | None = None
         try:
-            with _naming_who_drives(bus):
+            try:
                 session.begin(config, folder)
                 bus.refuse_switched_on()  # saving the settings has taken time
                 bus.prepare()
                 yield bus
+            except ServoRefused:
+                bus.refuse_switched_on()
+                raise
         except BaseException as error:
             stopped = error
             raise
@@ -234,21 +237,10 @@ def servo_session(config: Config, folder: Path | None = None, say: Say = to_stde
                 left = session.end()
             if bus.port.strangers and not isinstance(stopped, BusShared):
                 left.append(
-                    "Another program has sent packets on this bus while the servos were set up or restored "
-                    f"({bus.port.strangers} were received). Their settings were read back, but end that program before "
-                    "the next start: its packets may destroy others, or move the arm."
+                    "Another program has sent packets on this bus while the servos were set up or restored. End it "
+                    "before the next start: it may move the arm."
                 )
             end_with(bus, stopped, left, before)
-
-
-@contextmanager
-def _naming_who_drives(bus: ServoBus) -> Iterator[None]:
-    """If a servo refuses a setting because another program has switched its torque on, name that program."""
-    try:
-        yield
-    except ServoRefused:
-        bus.refuse_switched_on()
-        raise
 
 
 def has_moved() -> bool:
