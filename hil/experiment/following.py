@@ -18,11 +18,6 @@ Successive errors may be related, so each sample is weighted by the time that it
 one of thousands of looks either: the unweighted sum must reach h = `LEAST_RATIO` too, which that of a healthy motor
 does with a probability of at most exp(-h) from any one look on.
 
-A servo whose readings are frozen while its joint stands still shows no deviation until the goal has moved far from the
-frozen current. But a current that is controlled never stays exactly the same while its goal changes: if all three
-readings do for `FROZEN_S` and the goal has meanwhile changed by more than two sigma, they are frozen. A current of zero
-does not count, since a sensor may have a dead zone there.
-
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
 that it keeps for a joint is a record of the type `MEMORY`.
 """
@@ -51,9 +46,6 @@ ALLOWED_TICKS = 4.0
 LOST_AFTER_S = 0.03
 """Time for which a current must look like zero, at full weight, before it counts as zero [s]."""
 
-FROZEN_S = 0.1
-"""Time for which all readings must be exactly the same before they count as frozen [s]."""
-
 _FULL_WEIGHT = 5.0
 """Upper bound on the log likelihood ratio of one sample: that of a goal of four sigma if zero is measured."""
 
@@ -67,7 +59,6 @@ MEMORY = np.dtype(
     [
         *((name, "f8") for name in ("per_square", "allowed", "share", "follow_time")),
         *((name, "f8") for name in ("former_goal", "evidence", "ratio", "count", "differs_for", "differs")),
-        *((name, "f8") for name in ("carried", "same_since_goal", "same_for")),
     ]
 )
 """Constants and state of the check of one joint.
@@ -76,7 +67,6 @@ per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V]; share: the sa
 how long a larger deviation may last [s].
 evidence, ratio, count: sum of the log likelihood ratios times seconds, without seconds, and its number of samples.
 differs_for, differs: duration [s] and number of samples of a deviation.
-carried: latest current; same_since_goal, same_for: goal when the readings last changed, and the time since then [s].
 """
 
 
@@ -94,19 +84,11 @@ def begin(memory: Any, joint: JointConfig, planned: float, follow_share: float, 
     memory["follow_time"] = follow_time
 
 
-def look(memory: Any, goal: float, carried: float, seconds: float, stands: bool) -> float:
+def look(memory: Any, goal: float, carried: float, seconds: float) -> float:
     """Process a reply; return the duration of a deviation once it has lasted too long [s], otherwise -1.
 
     goal: latest goal [A or V]. carried: measured value in the reply [A or V]. seconds: time since the last reply [s].
-    stands: whether the reply's position and velocity are exactly those of the last one.
     """
-    if stands and carried == memory.carried:
-        memory.same_for += seconds
-    else:
-        memory.carried, memory.same_since_goal, memory.same_for = carried, goal, 0.0
-    changed = goal - memory.same_since_goal
-    if memory.same_for >= FROZEN_S and carried != 0.0 and changed * changed * memory.per_square > 2.0:
-        return float(memory.same_for)
     former, memory.former_goal = memory.former_goal, goal
     low, high = min(goal, former), max(goal, former)
     off = max(low - carried, carried - high, 0.0)

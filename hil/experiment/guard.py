@@ -428,12 +428,6 @@ class Guard:
                 f"Its goal register reads {held:.3f} {unit}, which matches what it carries: another program is "
                 "commanding it, or goals are being altered or lost in transit."
             )
-        same_for = self._joints[index]["following"]["same_for"]
-        if carried and same_for >= following.FROZEN_S:
-            return (
-                f"All its readings have been exactly the same for {1e3 * same_for:.0f} ms: they are frozen, or its "
-                "current is limited. Check the servo and whether a device between adapter and servo repeats replies."
-            )
         along = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
         allowed = self._joints[index]["following"]["allowed"]
         if along > abs(commanded) + allowed or along < -allowed:

@@ -139,8 +139,7 @@ def _fault(
         return VELOCITY
     joint.position, joint.seen_at = position, now
     if joint.is_followed:
-        stands = position == former and velocity == joint.consistency.velocity
-        joint.found = following.look(joint.following, goal, current, seconds, stands)
+        joint.found = following.look(joint.following, goal, current, seconds)
         if joint.found >= 0.0:
             return FOLLOWING
     is_long = elapsed > LONG_GAP * interval

@@ -51,10 +51,10 @@ class Following:
         following.begin(self._joint[0]["following"], config, planned, follow_share, follow_time)
         self._checks = JointChecks(self._joint, ANY)
 
-    def look(self, goal: float, carried: float, seconds: float, position: float = 0.0) -> float | None:
+    def look(self, goal: float, carried: float, seconds: float) -> float | None:
         """Process a reply, `seconds` after the previous one; return the duration of a deviation [s] if too long."""
         self._joint["seen_at"] = 0.0
         self._checks.interval = seconds
-        found = self._checks.look(_state(0.0, position, goal=goal, current=carried), 0.0)
+        found = self._checks.look(_state(0.0, goal=goal, current=carried), 0.0)
         assert found in (FINE, FOLLOWING)
         return float(self._joint["found"][0]) if found == FOLLOWING else None

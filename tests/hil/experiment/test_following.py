@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config, load_config
-from hil.experiment.following import FROZEN_S
 from tests.support.one_joint import Following
 from tests.support.paths import CONFIGS
 
@@ -205,22 +204,3 @@ def test_a_reply_may_be_measured_before_or_after_the_motor_has_the_goal() -> Non
     follow = following()
     for number in range(60):
         assert follow.look(0.5 if number % 2 else -0.5, 0.4 if number % 4 < 2 else -0.4, STEP) is None
-
-
-@pytest.mark.parametrize("name", REAL)
-@pytest.mark.parametrize("rate", RATES)
-@pytest.mark.parametrize("turns", [False, True])
-def test_readings_of_a_joint_at_rest_that_stay_exactly_the_same_while_its_goal_changes_are_frozen(
-    name: str, rate: int, turns: bool
-) -> None:
-    """The goal grows slowly; so far, it has changed by less than may be missing from a healthy motor's current."""
-    config, planned = joints(name)[0]
-    follow, start = Following(config, planned, 0.3, 0.05), 0.2 * planned
-    for index in range(round(0.5 * rate)):
-        goal = start + 0.26 * planned * index / rate
-        found = follow.look(goal, 0.2 * planned, 1 / rate, position=0.001 * (index % 2) * turns)
-        if found is not None:
-            break
-    assert (found is None) == turns
-    if found is not None:
-        assert found >= FROZEN_S and 0.1 * planned < goal - start < 0.13 * planned + 0.26 * planned / rate

@@ -150,17 +150,6 @@ def test_what_was_heard_beside_the_replies_explains_lost_goals(arm: Arm, heard: 
         assert stop.value.cause is Cause.GOALS_LOST and ("being lost" in str(stop.value)) == (not heard)
 
 
-@pytest.mark.parametrize(
-    ("carried", "said"), [(0.05, "All its readings have been exactly the same for 2"), (0.0, "off")]
-)
-def test_frozen_readings_of_a_joint_at_rest_are_told_from_lost_torque(arm: Arm, carried: float, said: str) -> None:
-    guard = Guard(arm(), PLANNED)
-    with pytest.raises(SafetyStop, match=said) as stop:
-        for n in range(400):
-            guard.look(at(n, STILL._replace(goal_current=(0.0, 0.05 + 1e-3 * n), current=(0.0, carried))))
-    assert stop.value.cause is Cause.NOT_FOLLOWING
-
-
 def test_an_arm_that_is_lowered_may_be_silent_longer(arm: Arm) -> None:
     """Counted from the last exchange that all servos answered, which may be older than the lowering."""
     silent = MISSING._replace(missing=(True, True))
