@@ -17,24 +17,6 @@ SIZES = (1, 2, 4, 6, 7)
 SAMPLES = 20
 
 
-def torque_derivatives(
-    chain: Chain, parameters: np.ndarray, position: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of the torques with respect to angles and to velocities at one instant.
-
-    Both are (joints, joints) [N m/rad, N m s/rad].
-    """
-    link, armature = split(chain, parameters)
-    work = room(chain.joints)
-    rotation, translation, axis, gravity = chain.arrays
-    q, v, a = (np.asarray(each, dtype=np.float64) for each in (position, velocity, acceleration))
-    place(rotation, translation, axis, q, work[0], work[1])
-    move(link, armature, v, work)
-    accelerate(armature, gravity, v, a, work)
-    differentiate(gravity, work)
-    return work[6], work[7]
-
-
 def motion(joints: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return rng.standard_normal((3, joints, SAMPLES)) * np.array([2.0, 3.0, 10.0])[:, None, None]
