@@ -197,7 +197,7 @@ def test_compare_and_known_quantities_on_one_run(
     methods = json.loads(capsys.readouterr().out)["methods"]
     assert set(methods) == {"hil", "idim_ls", "rls", "ekf", "ukf", "paper"}
     errors = {name: entry["worst_relative_error"] for name, entry in methods.items()}
-    # The Kalman filters' noise levels are chosen by the true parameters, so in a single run they may be ahead by chance.
+    # The Kalman filters' noise levels are chosen by the true parameters: in a single run they may be ahead by chance.
     # benchmarks/peers.py compares all methods over many runs.
     assert 10 * errors["hil"] < min(errors[name] for name in ("idim_ls", "rls", "paper")), "a fair comparison"
     assert max(errors["ekf"], errors["ukf"]) < 0.1
