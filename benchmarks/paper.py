@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.machine import machine
-from benchmarks.paper_equations import (
+from benchmarks.seed_paper.equations import (
     AMPLITUDES,
     FUNDAMENTAL,
     NOISE,

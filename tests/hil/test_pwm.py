@@ -78,7 +78,7 @@ def test_a_dry_run_knows_what_turning_motors_generate(arm_file: ArmFile, tmp_pat
     ("old", "new", "said"),
     [
         ("voltage_limit = 8.0", "current_limit = 0.8", r"joints\[1\]: voltage_limit is missing; pwm mode needs it"),
-        ("voltage_limit = 8.0", "voltage_limit = 8.0\ncurrent_limit = 0.8", r"current_limit = 0\.8: it has no meaning"),
+        ("voltage_limit = 8.0", "voltage_limit = 8.0\ncurrent_limit = 0.8", r"current_limit = 0\.8 has no meaning"),
         ("voltage_limit = 8.0", 'voltage_limit = 8.0\nmode = "current"', r"XL430-W250 has no current mode"),
         ("voltage_limit = 8.0", "voltage_limit = 2.0", r"more than voltage_limit \* torque_per_volt = 0\.25 N m"),
     ],

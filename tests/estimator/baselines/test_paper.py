@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.paper_equations import (
+from benchmarks.seed_paper.equations import (
     PaperArm,
     coefficients,
     fit_as_printed,

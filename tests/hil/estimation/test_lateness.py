@@ -24,11 +24,11 @@ def test_torque_between_deadlines_is_the_mean_of_what_acted() -> None:
 
 
 def test_jitter_of_the_loop_is_taken_back(arm_file: Callable[..., Path]) -> None:
-    found = late_loop.measure(load_config(arm_file()), 400e-6)
+    found = late_loop.measure(load_config(arm_file()), 800e-6)
     assert found["real"]["residual_ticks"] < 0.30
-    assert found["nominal"]["residual_ticks"] > 0.45, "or this test could not fail"
+    assert found["nominal"]["residual_ticks"] > 0.7, "or this test could not fail"
     assert found["real"]["worst_error"] < 0.02, "as without jitter, in the 2 s that this test has"
-    assert found["real"]["held_out_rms"] < 0.5 * found["nominal"]["held_out_rms"]
+    assert found["real"]["held_out_rms"] < 0.7 * found["nominal"]["held_out_rms"], "0.2 to 0.6 with other multisines"
 
 
 @pytest.mark.parametrize(

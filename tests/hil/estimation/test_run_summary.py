@@ -33,7 +33,7 @@ def test_lost_samples_are_named_by_joint_and_cause() -> None:
     samples["missing"] = False
     samples["time_after_read"][:30] = samples["time_before_write"][:30]
     said = lost_samples(samples, ("a", "b"))
-    assert "too late" in said and "cable" not in said
+    assert "computer was late" in said and "cable" not in said
 
 
 @pytest.mark.parametrize(("pilot", "expected"), [(True, "raise the velocity_limit of"), (False, "raise peak_torque")])

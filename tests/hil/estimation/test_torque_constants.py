@@ -77,4 +77,4 @@ def test_runs_of_planar_and_spatial_arms_follow_the_same_rule(ratio: float, cont
     for config, said in zip((planar, spatial), found, strict=True):
         assert bool(said) is contradictory
         first, second = (joint.name for joint in config.joints[:2])
-        assert all(f"torque constants of {first} and {second} contradict each other" in each for each in said)
+        assert all(f"torque constants of {first} and {second} disagree" in each for each in said)

@@ -9,8 +9,8 @@ from benchmarks.fault_campaign.judge import fed_by_another
 from benchmarks.spatial.chain_faults import NAMES, figures, inject
 from hil.fakes.bus.faults import Fault, FaultKind
 
-EACH = 2
-FIRST = 3000, 3002
+EACH = 3
+FIRST = 3000, 3003
 RATE = 200
 
 

@@ -154,7 +154,7 @@ def test_a_second_path_in_which_a_joint_does_not_move_is_done_without(
     monkeypatch.setattr(chain_search, "can_be_estimated", lambda _: is_enough)
     with nullcontext() if is_enough else pytest.raises(DidNotMove, match="knee"):
         assert chain_search._full(search) == "Torque is off."
-    assert search.play.call_count == 3 and ("second path" in str(said.call_args)) is is_enough
+    assert search.play.call_count == 3 and ("uses only that path" in str(said.call_args)) is is_enough
     search.play.return_value = SafetyStop("knee is beyond its limit", Cause.POSITION)
     with pytest.raises(SafetyStop):
         chain_search._full(search)

@@ -102,7 +102,7 @@ def test_where_no_torque_is_safe_for_every_arm_the_pilot_starts_with_little(tmp_
     most = config.joints[0].goal_limit * config.joints[0].torque_per_goal
     assert found["first_run"]["peak_torque"][0] < 0.03 * most
     assert isinstance(rehearsal.found, DryRun)
-    assert "the pilot will find it" in " ".join(dry_run_lines(config, rehearsal.found.shown, rehearsal.found))
+    assert "the pilot will find one" in " ".join(dry_run_lines(config, rehearsal.found.shown, rehearsal.found))
 
 
 def test_an_upright_arm_without_room_is_refused_as_by_identify(tmp_path: Path) -> None:

@@ -1,0 +1,1 @@
+"""The paper that this project started from, on its own arm."""
