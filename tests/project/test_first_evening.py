@@ -38,7 +38,7 @@ def test_an_evening_is_judged() -> None:
 def test_all_but_the_long_commands_work_and_name_the_next(tmp_path: Path, identified: Path) -> None:
     shutil.copytree(identified, tmp_path / "first_run")
     repeated = {tuple(words): words for words in commands_of() if words[1] not in (*LONG, "setup")}
-    person = Person(tmp_path, PORT, forked=True)
+    person = Person(tmp_path, PORT)
     done = evening(person, list(repeated.values()))
     assert [shlex.join(each.words) for each in done if each.code] == [], done[-1].text
     assert all(each.next or each.words[1] == "export" for each in done)

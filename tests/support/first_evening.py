@@ -15,14 +15,12 @@ import signal
 import subprocess
 import sys
 import time
-import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from hil.cli.app import main
 from tests.support.paths import ROOT
 
 PAGE = ROOT / "docs" / "first_evening.md"
@@ -57,47 +55,17 @@ class Typed:
 
 
 @dataclass
-class Forked:
-    """A child of this process, with the part of the interface of `subprocess.Popen` that is used here."""
-
-    pid: int
-    returncode: int | None = None
-
-    def poll(self) -> int | None:
-        if self.returncode is None:
-            ended, status = os.waitpid(self.pid, os.WNOHANG)
-            self.returncode = os.waitstatus_to_exitcode(status) if ended else None
-        return self.returncode
-
-    def wait(self, timeout: float = 60.0) -> int:
-        deadline = time.monotonic() + timeout
-        while (code := self.poll()) is None:
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"process {self.pid} has not ended")
-            time.sleep(0.01)
-        return code
-
-    def kill(self) -> None:
-        os.kill(self.pid, signal.SIGKILL)
-
-
-Process = subprocess.Popen[bytes] | Forked
-
-
-@dataclass
 class Person:
     """Types in `folder`, and moves the joints of the fake arm at `port`: a device, or a fake:// URL.
 
     Behind a URL the arm exists in virtual time and only while a command runs, so no hand can move it.
 
-    forked: whether commands are forked from this process, which has loaded the libraries, rather than started anew.
     rest: joint angles at which the arm hangs [rad]. lengths_mm: as measured with a ruler, by joint. swings_deg: how far
     each joint may swing.
     """
 
     folder: Path
     port: str
-    forked: bool = False
     rest: Sequence[float] = (-np.pi / 2, 0.0)
     lengths_mm: Sequence[str] = ("147", "180")
     swings_deg: Sequence[str] = ("120", "150")
@@ -107,12 +75,11 @@ class Person:
         """Type one command and answer its questions until it ends. Raises TimeoutError."""
         typed = [self.port if word == PORT_ON_THE_PAGE else word for word in words]
         began = time.monotonic()
-        with _terminal(typed, self.folder, self.forked) as (process, terminal):
+        with _terminal(typed, self.folder) as (process, terminal):
             text = self._attend(process, terminal, began + patience_s)
-        assert process.returncode is not None
         return Typed(list(words), process.returncode, text, time.monotonic() - began)
 
-    def _attend(self, process: Process, terminal: int, deadline: float) -> str:
+    def _attend(self, process: subprocess.Popen[bytes], terminal: int, deadline: float) -> str:
         text, answered = "", 0
         while True:
             if time.monotonic() > deadline:
@@ -171,11 +138,14 @@ def fake_arm(config: Path, link: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 @contextlib.contextmanager
-def _terminal(words: Sequence[str], folder: Path, forked: bool) -> Iterator[tuple[Process, int]]:
+def _terminal(words: Sequence[str], folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
     """Start `hil ...` on a new pseudo-terminal; yields the process and the terminal's other end."""
     ours, theirs = pty.openpty()
     try:
-        process = _fork(words, folder, theirs) if forked else _start(words, folder, theirs)
+        command = [sys.executable, "-m", *words]
+        process = subprocess.Popen(
+            command, stdin=theirs, stdout=theirs, stderr=theirs, cwd=folder, env=_environment(), start_new_session=True
+        )
     finally:
         os.close(theirs)
     try:
@@ -185,40 +155,6 @@ def _terminal(words: Sequence[str], folder: Path, forked: bool) -> Iterator[tupl
         if process.poll() is None:
             process.kill()
             process.wait()
-
-
-def _start(words: Sequence[str], folder: Path, terminal: int) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", *words]
-    return subprocess.Popen(
-        command,
-        stdin=terminal,
-        stdout=terminal,
-        stderr=terminal,
-        cwd=folder,
-        env=_environment(),
-        start_new_session=True,
-    )
-
-
-def _fork(words: Sequence[str], folder: Path, terminal: int) -> Forked:
-    pid = os.fork()
-    if pid:
-        return Forked(pid)
-    code = 1
-    try:
-        os.login_tty(terminal)
-        sys.stdin, sys.stdout, sys.stderr = (open(number, mode) for number, mode in enumerate("rww"))  # noqa: PTH123, SIM115
-        os.chdir(folder)
-        os.environ.update(_environment())
-        sys.argv = list(words)
-        main()
-    except SystemExit as ended:
-        code = int(ended.code or 0)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        os._exit(code)  # nothing of the test session may run in the child
 
 
 def _environment() -> dict[str, str]:
