@@ -11,7 +11,7 @@ import pytest
 
 from hil.api.dry_run import dry_run
 from hil.config.schema import Config, load_config, parse_config
-from hil.dry_run import chain_prediction
+from hil.dry_run import amplitude, chain_prediction
 from hil.dry_run.amplitude import Amplitude, AmplitudeOptions, largest_amplitude
 from hil.dry_run.ensemble import Ensemble, earlier_result, prior_ensemble
 from hil.dry_run.prediction import GUARDED, Prediction, predict, quantities_of
@@ -64,7 +64,7 @@ def test_too_much_torque_is_refused_by_the_worst_arms_alone(known: Config, monke
         prediction = predict(config, plan, ensemble, briefly=briefly, **given)
         return replace(prediction, shares=np.maximum(prediction.shares, 0.0 if briefly else 1.0))
 
-    monkeypatch.setattr("hil.dry_run.amplitude.predict", never_safe)
+    monkeypatch.setattr(amplitude, "predict", never_safe)
     options = AmplitudeOptions(max_rounds=5)
     with pytest.raises(NoSafeTorque):
         largest_amplitude(known, prior_ensemble(known, 24), options=options)

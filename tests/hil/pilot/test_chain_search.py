@@ -12,7 +12,7 @@ import pytest
 
 import hil
 from hil.config.schema import Config, load_config, parse_config
-from hil.dry_run import chain_summary
+from hil.dry_run import chain_stop, chain_summary
 from hil.dry_run.chain_prediction import predict_chain
 from hil.dry_run.chain_prior import prior_arms
 from hil.dry_run.chain_summary import chain_dry_run_json, chain_dry_run_lines, unsafe
@@ -364,8 +364,8 @@ def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) ->
     for place in ("chain_shares.SEARCH_ARMS", "chain_shares.ARMS", "chain_rehearsal.ARMS"):
         monkeypatch.setattr(f"hil.pilot.{place}", 4 if "SEARCH" in place else 12)
     moments, stopped = 5, 3
-    monkeypatch.setattr("hil.dry_run.chain_stop.MOMENTS", moments)
-    monkeypatch.setattr("hil.dry_run.chain_stop.ARMS", stopped)
+    monkeypatch.setattr(chain_stop, "MOMENTS", moments)
+    monkeypatch.setattr(chain_stop, "ARMS", stopped)
     config, told = leg(), list[int]()
     designed = list[tuple[int, int]]()
     first = rehearse(config, 4, tell=lambda _, of: told.append(of), designing=lambda *each: designed.append(each))
