@@ -270,13 +270,13 @@ class Exchange:
         if before + takes > due:  # woken up late
             self.read_back_at = before + TRY_AGAIN_S
             return None
-        servos, has_answer = self._ask_back(read, before, due - before)
+        servos = self._ask_back(read, before, due - before)
         now = self._now()
         # Where nothing at all arrived, the reply may be late, and another one would be mistaken for it.
-        if None in servos and has_answer and back.may_repeat(now, takes):
+        if None in servos and self.heard.latest and back.may_repeat(now, takes):
             # The packet of another master may have destroyed the reply, and the next cycle overwrites what it wrote.
             self.awaited_until = now + takes + self._wire_s[read]
-            servos, _ = self._ask_back(read, now, self.awaited_until - now)
+            servos = self._ask_back(read, now, self.awaited_until - now)
         self.read_back_at = now
         if None in servos:
             self._expect_late()
@@ -289,8 +289,8 @@ class Exchange:
             self.read_status_next()  # it distinguishes lost goals from another master's
         return found
 
-    def _ask_back(self, read: GroupRead, start: float, timeout: float) -> tuple[list[Answer], bool]:
-        """Send the read at `start` [s]; return the answers that arrive in `timeout` [s], and whether anything did."""
+    def _ask_back(self, read: GroupRead, start: float, timeout: float) -> list[Answer]:
+        """Send the read at `start` [s]; return the answers that arrive within `timeout` [s]."""
         port = self._port
         expected = port.reply_time(timeout, len(read.request))
         if self._echoes:
@@ -306,7 +306,7 @@ class Exchange:
             # A master that writes between two cycles is heard here, and nowhere else if the next reply is complete.
             servos = read.search(received)[0]
             self.heard.beside(received, echoes=self._echoes)
-        return servos, bool(received)
+        return servos
 
     def cycle(self, goal_ticks: Sequence[int], *, between: bool = False) -> Reply:
         """Send one goal per servo and read all states; the answer of a servo that did not reply is None.

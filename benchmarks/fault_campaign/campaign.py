@@ -7,7 +7,7 @@ import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -33,7 +33,7 @@ from hil.dry_run.ensemble import prior_ensemble
 from hil.dry_run.stopping_distance import stopping_distance
 from hil.errors import HilError
 from hil.estimator.chain.excitation.fourier_path import design_path
-from hil.estimator.excitation.multisine import Multisine, design_multisine
+from hil.estimator.excitation.multisine import design_multisine
 from hil.plan import chain_plan
 from hil.plan import plan as plan_module
 from hil.plan.plan import make_plan
@@ -253,25 +253,14 @@ def _allowed(ready: Ready) -> Any:
     return _allowed_of(ready.path)
 
 
-@cache
-def _designed(rate: float, period: float, lines: Any, peaks: Any, seed: int) -> Multisine:
-    return design_multisine(rate, period, lines, peaks, seed)
-
-
-_designed_path = remembered(design_path)
+_designed, _designed_path = remembered(design_multisine), remembered(design_path)
 
 
 @contextlib.contextmanager
 def _quick() -> Iterator[None]:
     """Run with cached waves and paths, whose design takes as long as the run, and measure the bus only briefly."""
-
-    def recalled(
-        rate: float, period: float, lines: Sequence[Sequence[int]], peak_torque: Sequence[float], seed: int
-    ) -> Multisine:
-        return _designed(rate, period, tuple(map(tuple, lines)), tuple(peak_torque), seed)
-
     with (
-        mock.patch.object(plan_module, "design_multisine", recalled),
+        mock.patch.object(plan_module, "design_multisine", _designed),
         mock.patch.object(chain_plan, "design_path", _designed_path),
         mock.patch.object(bus_rate, "CYCLES", _CHECKED_CYCLES),
     ):

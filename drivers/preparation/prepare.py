@@ -135,9 +135,9 @@ def prepare_servo(joint: Joint, servo: Servo, others: set[int]) -> None:
         servo.write("Bus Watchdog", 0)  # goals are read-only while it is tripped
     if joint.mode is Mode.CURRENT:
         servo.write("Goal Current", 0)  # a change of mode leaves it at Current Limit
-    # Goal PWM also limits the output in current mode, and another program may have left it at zero.
-    if joint.mode is Mode.CURRENT and servo.read("Goal PWM") != servo.read("PWM Limit"):
-        servo.write("Goal PWM", servo.read("PWM Limit"))
+        # Goal PWM also limits the output in current mode, and another program may have left it at zero.
+        if servo.read("Goal PWM") != servo.read("PWM Limit"):
+            servo.write("Goal PWM", servo.read("PWM Limit"))
 
 
 def shuts_down(servo: Servo, error: HardwareError) -> bool:

@@ -258,9 +258,7 @@ class Instructions:
             for servo in self._answering(servo_id, now):
                 error, data = self._read(servo, address, length, now)
                 answers.append((servo_id, servo.return_delay_s, encode_status(servo_id, error | servo.alert, data)))
-            pieces = self._overlaid(answers)
-            replies += pieces
-            if len(pieces) != 1 or pieces[0][2] != answers[0][2]:
+            if not self._append(answers, replies):
                 break
         self._line.send(replies, now)
 
@@ -280,13 +278,17 @@ class Instructions:
                     part = whole + bytes((error | servo.alert, servo_id)) + data.ljust(length, b"\0")
                     part += crc(part).to_bytes(2, "little")
                     answers.append((servo_id, servo.return_delay_s, part[sent:]))
-            pieces = self._overlaid(answers)
-            replies += pieces
-            if len(pieces) != 1 or pieces[0][2] != answers[0][2]:
+            if not self._append(answers, replies):
                 break
             whole = part
             sent = len(whole)
         self._line.send(replies, now)
+
+    def _append(self, answers: list[Reply], replies: list[Reply]) -> bool:
+        """Append what servos with one ID send to `replies`; return whether the next servo hears one intact reply."""
+        pieces = self._overlaid(answers)
+        replies += pieces
+        return len(pieces) == 1 and pieces[0][2] == answers[0][2]
 
     def _answering(self, servo_id: int, now: float) -> list[EmulatedServo]:
         """Return the servos that answer a group read at this ID."""

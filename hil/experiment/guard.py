@@ -27,7 +27,7 @@ from hil.experiment.command_limits import CommandLimits
 from hil.experiment.deadlines import Deadlines
 from hil.experiment.joint_checks import JOINT, MOST_OUTSIDE_RAD, JointChecks
 from hil.experiment.silence import LATE_WAKE_UP_S, Silence
-from hil.experiment.status_check import WHY_LOST, StatusCheck
+from hil.experiment.status_check import StatusCheck
 from hil.plan.find_torque import how_to_find_torque
 from hil.plan.recent_motion import RecentMotion
 
@@ -128,7 +128,7 @@ class Guard:
         self._joints = _joint_records(config, planned, left_by_a_run)
         self._checks = JointChecks(self._joints, interval)
         self._apart = Apart()
-        self._status = StatusCheck(config, bears_errors=is_lowering)
+        self._status = StatusCheck(config, heard_instead, bears_errors=is_lowering)
         self._missing = self._silence.counts
         self._errors = [0] * len(config.joints)
         """Number of consecutive replies that contained both values and an error number, by joint."""
@@ -229,7 +229,8 @@ class Guard:
         self._stop(
             index,
             Cause.GOALS_LOST,
-            f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. {WHY_LOST}",
+            f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. "
+            f"{self._status.why_lost()}",
         )
 
     def _stop_for(self, fault: int, state: State) -> NoReturn:
@@ -503,9 +504,6 @@ class Guard:
 
     def _stop(self, index: int, cause: Cause, what: str) -> NoReturn:
         name = self._names[index]
-        if cause is Cause.GOALS_LOST:
-            # What arrives when nothing should destroys goals on the wire.
-            what = what.replace(WHY_LOST, self._heard_instead() or WHY_LOST)
         raise SafetyStop(f"{name[0].upper()}{name[1:]} {what}", cause)
 
 

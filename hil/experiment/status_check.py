@@ -6,7 +6,7 @@ registers are read back several times per 0.1 s (hil.drivers.bus), so each of th
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 
 from hil.config.schema import Config
@@ -36,17 +36,15 @@ _HELD_BEFORE = 4
 """If writes are lost, a servo may also hold one of this many goals that were sent before the latest matching status."""
 
 
-WHY_LOST = "Goals are being lost in transit, or the servo refuses them: check its cable and limits."
-"""Advice if nothing that was heard explains lost goals."""
-
-
 class StatusCheck:
     """Compares reported values with the commanded ones. `look` returns the fault, or None.
 
-    bears_errors: whether to tolerate a hardware error as long as the servo keeps its torque.
+    heard_instead: as for `Guard`. bears_errors: whether to tolerate a hardware error as long as the servo keeps its
+    torque.
     """
 
-    def __init__(self, config: Config, *, bears_errors: bool = False) -> None:
+    def __init__(self, config: Config, heard_instead: Callable[[], str] = str, *, bears_errors: bool = False) -> None:
+        self._heard_instead = heard_instead
         self._bears_errors = bears_errors
         self._armed = round(config.safety.watchdog / WATCHDOG_UNIT)
         self._may_be_unwatched = config.safety.allow_no_watchdog
@@ -149,7 +147,12 @@ class StatusCheck:
                 "Either another program or controller is commanding it (stop or unplug that one), or goals are being "
                 "corrupted on the bus (check the adapter and the cable)."
             )
-        return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {WHY_LOST}"
+        return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {self.why_lost()}"
+
+    def why_lost(self) -> str:
+        """Return why goals are lost: what arrives when nothing should destroys them on the wire."""
+        refused = "Goals are being lost in transit, or the servo refuses them: check its cable and limits."
+        return self._heard_instead() or refused
 
     def _never_sent(self, joint: int, held: float) -> bool:
         """Whether the goal that is held differs from every goal sent to any joint since a status last matched.

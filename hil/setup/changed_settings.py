@@ -64,15 +64,14 @@ def settings_now(bus: ServoBus) -> Settings:
     """
     found: dict[tuple[Joint, str], int] = {}
     for joint, servo in bus.drives.items():
-        known = [register for register in _REGISTERS if register in servo.table]
+        registers = _REGISTERS if joint.mode is Mode.CURRENT else [each for each in _REGISTERS if each != _GOAL_PWM]
+        known = [register for register in registers if register in servo.table]
         with suppress(DriverError):
             first = {register: servo.read(register, attempts=1) for register in known}
             again = {register: servo.read(register, attempts=1) for register in reversed(known)}
             if servo.read("ID", attempts=1) == servo.id:
                 same = [register for register in known if first[register] == again[register]]
-                found |= {(joint, register): first[register] for register in same}
-            if joint.mode is not Mode.CURRENT or not found.get((joint, _GOAL_PWM)):
-                found.pop((joint, _GOAL_PWM), None)
+                found |= {(joint, each): first[each] for each in same if each != _GOAL_PWM or first[each]}
     return found
 
 
