@@ -48,7 +48,7 @@ class Following:
     def __init__(self, config: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
         self._joint = _joint()
         self._joint["is_followed"] = True
-        following.begin(self._joint[0]["following"], config, planned, follow_share, follow_time)
+        following.begin(self._joint[0]["following"], self._joint[0]["goals"], config, planned, follow_share, follow_time)
         self._checks = JointChecks(self._joint, ANY)
 
     def look(self, goal: float, carried: float, seconds: float) -> float | None:
