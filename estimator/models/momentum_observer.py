@@ -19,10 +19,6 @@ widen the admissible range. A deviation that may become an alarm enters that est
 alarm; otherwise a joint that is held for a long time would widen the range until nothing exceeded it. While a joint
 stands still, its noise is lower, since most of the noise only arises in motion.
 
-No arm has a negative inertia or negative friction, and gravity pulls an arm that hangs at rest back to where it
-hangs. Parameters that leave these bounds are moved back to them, so that a disturbance cannot be learnt as an arm that
-cannot exist.
-
 What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which the
 gear's presliding softens every reversal, dry friction looks viscous but still holds the joint once it has stopped.
 
@@ -35,7 +31,7 @@ are not independent. Therefore each one has only a fraction of the full weight.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numba
@@ -60,7 +56,6 @@ FLOOR_SHARE = 0.25
 """A residual torque below this fraction of the largest planned torque never raises an alarm."""
 
 _COUNT = len(NAMES)
-_ANY_SIGN = (1, 4, 5)  # coupling and gravity, whose signs depend on how the angles are counted
 _STANDING = 0.05  # rad/s below which dry friction may hold a joint
 _STATIC = 1.5  # ratio of static to Coulomb friction
 _CERTAIN = 2.0  # standard deviations within which a torque that friction has held is known
@@ -96,8 +91,6 @@ _TAUGHT, _TEACHES, _SQUARED = 0, 2, 4
 # friction; whether the arm is hardly known.
 _HIGHEST = 4 + _COUNT + 2
 _HARDLY_KNOWN = _HIGHEST + 3
-# Sines and cosines of the angles at which the links hang, or only zeros.
-_HANGS = _HARDLY_KNOWN + 1
 
 
 class MomentumObserver:
@@ -111,7 +104,6 @@ class MomentumObserver:
     friction near standstill differs from the model.
     hardly_known: whether only the torque is known beforehand; if so, mean torques are also compared with the earlier
     model.
-    hangs_at: the joints' angles at which the arm hangs at rest [rad]; None if something else may hold it there.
     """
 
     def __init__(
@@ -123,7 +115,6 @@ class MomentumObserver:
         frictions: float = 0.0,
         *,
         hardly_known: bool = False,
-        hangs_at: Sequence[float] | None = None,
     ) -> None:
         joints = len(largest)
         if joints not in (1, 2) or covariance.shape != (_COUNT, _COUNT):
@@ -143,10 +134,7 @@ class MomentumObserver:
         drift = _LEAST_DRIFT**2 * np.diag(covariance)
         least_noise = (_FIRST_NOISE_SHARE * 0.1 * highest) ** 2
         friction = [FLOOR_SHARE * frictions]
-        hanging = np.zeros((2, 2))
-        if hangs_at is not None:
-            hanging[:, :joints] = np.sin(np.cumsum(hangs_at)), np.cos(np.cumsum(hangs_at))
-        further = (drift, least_noise, highest, friction, [float(hardly_known)], hanging.ravel())
+        further = (drift, least_noise, highest, friction, [float(hardly_known)])
         self._constants = np.concatenate(([joints, interval, *floor], *further))
         self._past = earlier_model.memory(_COUNT)
         self.memory = self._memory, self._rests, self._past, self._constants
@@ -252,30 +240,13 @@ def _learn(m: Any, row: Any, gain: Any, lacking: float, spread: float) -> None:
             m[_COVARIANCE + i, n] -= gain[i] * gain[n] / spread
 
 
-def _keep_possible(m: Any, k: Any) -> None:
-    """Keep inertias and friction from being negative, and gravity from pulling a hanging arm away from where it hangs.
-
-    A combination of parameters that has become negative is reset to zero, and the other parameters are adjusted
-    according to the covariance.
-    """
-    for i in range(10):
-        if i not in _ANY_SIGN:
-            _keep_positive(m, i, 1.0, i, 0.0)
-    for j in range(2):
-        _keep_positive(m, 4 + j, -k[_HANGS + j], 12 + j, k[_HANGS + 2 + j])
-
-
-def _keep_positive(m: Any, i: int, of_first: float, n: int, of_second: float) -> None:
-    """Keep a weighted sum of two parameters from being negative."""
-    value = of_first * m[_THETA, i] + of_second * m[_THETA, n]
-    if value >= 0.0:
-        return
-    first, second = m[_COVARIANCE + i], m[_COVARIANCE + n]
-    mixed = of_first * (of_first * first[i] + of_second * first[n])
-    variance = mixed + of_second * (of_first * second[i] + of_second * second[n])
-    if variance > 0.0:
-        for each in range(_COUNT):
-            m[_THETA, each] -= value / variance * (of_first * first[each] + of_second * second[each])
+def _keep_dissipative(m: Any) -> None:
+    """Reset friction that has become negative to zero, and adjust the other parameters according to the covariance."""
+    for i in range(6, 10):
+        if m[_THETA, i] < 0.0 and m[_COVARIANCE + i, i] > 0.0:
+            share = m[_THETA, i] / m[_COVARIANCE + i, i]
+            for n in range(_COUNT):
+                m[_THETA, n] -= share * m[_COVARIANCE + n, i]
 
 
 def _static_friction(m: Any, rest: Any, j: int) -> float:
@@ -462,15 +433,14 @@ def _observe_loop(
         if lesson and not is_beyond and not _is_suspect(rests[j]):
             taught_by = _LESSONS * (spread - left_open) + _STANDING_LESSONS * (1.0 - quiet) * rounding
             _learn(m, row, m[_GAIN], lacking, left_open + taught_by + holds * holds)
-            _keep_possible(m, k)
+            _keep_dissipative(m)
     return alarm
 
 
 _inner: Any = numba.njit(nogil=True, error_model="numpy")
 _regressors, _begin_anew, _filter = map(_inner, (_regressors, _begin_anew, _filter))
 _gain, _lacks, _learn = map(_inner, (_gain, _lacks, _learn))
-_keep_positive = _inner(_keep_positive)
-_keep_possible = _inner(_keep_possible)
+_keep_dissipative = _inner(_keep_dissipative)
 _withstood, _forget, _look_at_rest = standstill.withstood, standstill.forget, standstill.look
 _variance, _blocked, _is_suspect = standstill.variance, standstill.blocked, standstill.is_suspect
 _BACK, _compare, _describe = earlier_model.BACK, earlier_model.compare, earlier_model.describe

@@ -238,11 +238,7 @@ class ModelWatch:
         # A pilot's torque barely exceeds dry friction, whose behaviour near standstill is not modelled.
         is_described = arms is not None or config.arm.link_lengths is not None
         frictions = _FRICTIONS if is_described else _FRICTIONS_UNDESCRIBED
-        self._observer = MomentumObserver(
-            *(mean, covariance, largest, interval, frictions),
-            hardly_known=not is_described,
-            hangs_at=_hangs_at(config),
-        )
+        self._observer = MomentumObserver(mean, covariance, largest, interval, frictions, hardly_known=not is_described)
         self._names = [joint.joint.title for joint in config.joints]
         self._blocked_by = [causes_of_standstill(joint.joint) for joint in config.joints]
         # Goals held over several exchanges are steps, which the current and the velocity follow with a delay.
@@ -339,11 +335,6 @@ class ModelWatch:
                 "encoder has failed, something is pushing or holding it, or the arm is not the one described."
             )
         raise SafetyStop(said, Cause.UNEXPECTED)
-
-
-def _hangs_at(config: Config) -> list[float] | None:
-    """Angles at which gravity holds the arm [rad]; None where it does not, or a stabiliser holds the arm."""
-    return config.arm.rest_pose if config.stabiliser is None and config.arm.gravity > 0.0 else None
 
 
 def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:

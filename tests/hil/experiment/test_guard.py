@@ -295,6 +295,21 @@ def test_a_current_that_does_not_follow_is_off_or_that_of_another(arm: Arm, carr
     assert ("torque is off" in str(stop.value)) == (carried == 0.0)
 
 
+@pytest.mark.parametrize("moves", [0.0, 0.002])
+def test_readings_that_stay_the_same_under_other_goals_are_frozen(arm: Arm, moves: float) -> None:
+    """At first they answer to the goal, which then rises by less than may be missing from a healthy motor's current."""
+    guard, said = Guard(arm(), PLANNED), ""
+    try:
+        for n in range(400):
+            goal, angle = 0.1 + 0.2 * n / 400, moves * (n % 2)
+            guard.look(at(n, STILL._replace(goal_current=(0.0, goal), current=(0.0, 0.1), position=(-1.57, angle))))
+    except SafetyStop as stop:
+        assert stop.cause is Cause.NOT_FOLLOWING
+        said = str(stop)
+    wanted = "exactly the same position, velocity and current (0.100 A) for 318 ms, although its goal has changed by"
+    assert (wanted in said) == (moves == 0.0), said
+
+
 def test_late_deadlines_and_a_gap_that_trips_watchdogs(arm: Arm) -> None:
     guard = Guard(arm())
     for _ in range(20):
