@@ -2,7 +2,8 @@
 
 They are, in this order: a jump of the position, the limits of position and velocity, whether the motor carries the
 commanded current (`following`), whether position and velocity agree (`consistency`), whether the motor turns as
-commanded (`work`), and whether all readings are frozen although the goal changes (`following` again). Everything known about a joint is in one record of the type `JOINT`.
+commanded (`work`), and whether all readings are frozen although the goal changes (`following` again). Everything known
+about a joint is in one record of the type `JOINT`.
 """
 
 from collections.abc import Callable
