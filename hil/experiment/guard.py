@@ -265,9 +265,20 @@ class Guard:
                     index,
                     Cause.EARLY_MOTION,
                     f"moved before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
-                    f"is allowed. {self._still_swings()} Otherwise check whether a hand or a cable is pushing or "
-                    "holding it, whether its horn slips, or whether another program is commanding it.",
+                    f"is allowed. {self._still_swings()} {self._else_moved(state.velocity[index])}",
                 )
+
+    def _else_moved(self, velocity: float) -> str:
+        """Return what may have moved a joint before the start if it is not swinging; velocity: its velocity [rad/s]."""
+        if abs(velocity) < self._safety.rest_velocity:
+            return (
+                f"Otherwise, since it is not moving now ({velocity:+.2f} rad/s), check its encoder and magnet, and "
+                "whether its horn has slipped or something has moved it."
+            )
+        return (
+            f"Otherwise, since it moves at {velocity:+.2f} rad/s, check whether a hand or a cable pushes or holds it, "
+            "whether its horn slips, or whether another program is commanding it."
+        )
 
     def _still_swings(self) -> str:
         """Return advice for an arm that has not come to rest."""

@@ -360,6 +360,17 @@ def test_motion_before_the_start(arm: Arm) -> None:
         assert stop.value.cause is Cause.EARLY_MOTION
 
 
+@pytest.mark.parametrize(("velocity", "said"), [(0.02, "encoder and magnet"), (-0.2, "a hand or a cable pushes")])
+def test_a_joint_that_is_elsewhere_before_the_start_has_jumped_unless_it_moves(
+    arm: Arm, velocity: float, said: str
+) -> None:
+    guard = Guard(arm())
+    guard.rests_at(STILL.position)
+    with pytest.raises(SafetyStop) as stop:
+        guard.look_at_rest(STILL._replace(position=(-1.57, 1.57), velocity=(0.0, velocity)))
+    assert said in str(stop.value) and f"{velocity:+.2f} rad/s" in str(stop.value)
+
+
 def test_motion_that_does_not_repeat_may_need_less_torque(arm: Arm) -> None:
     with pytest.raises(SafetyStop, match=r"its load has changed.* Lower experiment\.peak_torque") as stop:
         Guard(arm()).does_not_repeat(1, 0.5)
