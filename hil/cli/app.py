@@ -16,6 +16,7 @@ import typer
 from hil import __version__
 from hil.cli import bus, data, dry_run, experiment, fake_command, init, results, runs, schema, study
 from hil.cli.errors import exit_code, message, stop_behind
+from hil.cli.output import readable_output, require_output
 from hil.cli.stopped import same_again
 from hil.cli.verbosity import with_verbosity
 from hil.errors import StopRequested
@@ -114,8 +115,9 @@ def _one_blas_thread() -> None:
 def main() -> NoReturn:
     """Run the command line; turn an expected error into a message on standard error and an exit code."""
     _one_blas_thread()
+    require_output()
     try:
-        with _code_as_asked():
+        with _code_as_asked(), readable_output():
             _built()()
     except Exception as raised:
         error = stop_behind(raised) or raised

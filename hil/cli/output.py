@@ -5,26 +5,40 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
-import typer
+
+def require_output() -> None:
+    """Exit if standard output is closed (`>&-`): the next file that is opened, such as a port, would take its place."""
+    if sys.stderr is None:
+        sys.stderr = Path(os.devnull).open("w")  # noqa: SIM115  # needed until the process ends
+    if sys.stdout is None:
+        print("hil: standard output is closed. To discard the output, redirect it to /dev/null.", file=sys.stderr)
+        sys.exit(1)
 
 
 @contextmanager
 def readable_output() -> Iterator[None]:
     """Treat a closed pipe (`| head -1`) as success; report a full disk as a failure."""
+    ended = SystemExit(0)
     try:
-        yield
+        try:
+            yield
+        except SystemExit as error:  # --help and --version end so; Python would write their output later
+            ended = error
         sys.stdout.flush()
     except BrokenPipeError:
         _drop_output()
-        raise typer.Exit(0) from None
+        raise ended from None
     except OSError as error:
         if error.errno != errno.ENOSPC or error.filename is not None:
             raise
         _drop_output()
         said = "hil: cannot write to standard output: no space left. Finished results are in their folder."
         print(said, file=sys.stderr)
-        raise typer.Exit(1) from None
+        sys.exit(ended.code or 1)
+    if ended.code:
+        raise ended
 
 
 def _drop_output() -> None:

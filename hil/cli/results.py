@@ -5,12 +5,15 @@ The modules that do the work are imported inside the commands, as in hil.cli.app
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hil.cli.options import RunPath
 from hil.cli.verbosity import is_quiet
+
+if TYPE_CHECKING:
+    from hil.report.chart import Figure
 
 
 def report(
@@ -29,13 +32,12 @@ def report(
     from hil.cli.views.result_table import what_next
     from hil.model_file import read_result
     from hil.report.pictures import save_pictures
-    from hil.report.run_data import RunData
 
     print(write_report(run, out))
-    data = None if png is None and svg is None else RunData.load(run)
+    shown = [] if png is None and svg is None else figures_of(run)
     for kind, folder in (("png", png), ("svg", svg)):
-        if folder is not None and data is not None:
-            print(f"{len(save_pictures(data, folder, kind))} figures in {folder}")
+        if folder is not None:
+            print(f"{len(save_pictures(shown, folder, kind))} figures in {folder}")
     if not is_quiet():  # on standard error, so that the page's path stays alone on standard output
         print(what_next(read_result(run), run), file=sys.stderr)
 
@@ -92,3 +94,13 @@ def write_report(run: Path, out: Path | None = None) -> Path:
     path = out or run / page.FILE_NAME
     page.write_report(RunData.load(run), path)
     return path
+
+
+def figures_of(run: Path) -> "list[Figure]":
+    """The figures of a run's report."""
+    from hil.report.pictures import figures
+    from hil.report.recording_page import recording_figures
+    from hil.report.run_data import RunData
+    from hil.runs.recording_folder import is_recording_folder
+
+    return recording_figures(run) if is_recording_folder(run) else figures(RunData.load(run))

@@ -1,6 +1,7 @@
 """CSV files as written by other programs: any delimiter, decimal commas, byte order mark, comments, a line of units."""
 
 import csv
+import re
 from datetime import datetime
 from pathlib import Path
 
@@ -12,16 +13,37 @@ from hil.recordings.units import unit_of
 from hil.runs.file_size import MOST_CSV_BYTES
 
 _REMARKS = ("#", "%", "//")
+_ANNOUNCED = re.compile(r'\s*"?sep=(.)"?\s*', re.IGNORECASE)
+"""A first line that names the delimiter, as Excel reads and writes it."""
+_OTHER_KINDS = (
+    (re.compile(r"\s*<(!|\?xml|html|table)", re.IGNORECASE), "HTML or XML"),
+    (re.compile(r'\s*(\{|\[\s*[\[{"\d-])'), "JSON"),
+)
 
 
 def read_csv_table(path: Path) -> Table:
     """Read the table in `path`. Raises CsvError. An empty field or `nan` is a missing value."""
-    lines = [(number, line) for number, line in enumerate(_text(path).splitlines(), start=1) if line.strip()]
+    text = _text(path)
+    if kind := _other_kind(text):
+        raise CsvError(f"{path} cannot be read: it is {kind}, whatever its name. Export the data as CSV.")
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    try:
+        return _table(path, lines)
+    except csv.Error as error:  # a field beyond the limit of Python's reader
+        number, _ = max(lines, key=lambda each: len(each[1]))
+        raise CsvError(
+            f"{path}, line {number}: a field has more than {csv.field_size_limit():,} characters, so it is no number."
+        ) from error
+
+
+def _table(path: Path, lines: list[tuple[int, str]]) -> Table:
     remarks = [line for _, line in lines if line.lstrip().startswith(_REMARKS)]
     rows = [(number, line) for number, line in lines if not line.lstrip().startswith(_REMARKS)]
+    announced = _ANNOUNCED.fullmatch(rows[0][1]) if rows else None
+    rows = rows[1:] if announced else rows
     if not rows:
         raise CsvError(f"{path} is empty; it needs a header line and at least one line of numbers.")
-    delimiter = _delimiter([line for _, line in rows])
+    delimiter = announced[1] if announced else _delimiter([line for _, line in rows])
     header, rows = _header(path, rows, remarks, delimiter)
     double = {name for name in header if header.count(name) > 1}
     if double:
@@ -33,7 +55,7 @@ def read_csv_table(path: Path) -> Table:
         units = {name: field.strip(" []()") for name, field in named if field.strip(" []()")}
         fields = fields[1:]
     if not fields:
-        raise CsvError(f"{path} is empty; it needs a header line and at least one line of numbers.")
+        raise CsvError(f"{path} has no line of numbers, only a header.")
     wide = len(header)
     if all(len(row) == wide + 1 and not row[-1].strip() for _, row in fields):  # each line ends in a delimiter
         fields = [(number, row[:-1]) for number, row in fields]
@@ -62,6 +84,11 @@ def _text(path: Path) -> str:
     if "\0" in text:
         raise CsvError(f"{path} cannot be read: it is not a text file but a binary one. Export it as CSV.")
     return text
+
+
+def _other_kind(text: str) -> str:
+    """The format of a text that is not a table, by its first characters; "" for a table."""
+    return next((kind for pattern, kind in _OTHER_KINDS if pattern.match(text)), "")
 
 
 def _delimiter(lines: list[str]) -> str | None:

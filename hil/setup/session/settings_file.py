@@ -9,6 +9,7 @@ port.
 import json
 import os
 import re
+import threading
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -19,6 +20,8 @@ from hil.errors import RunFolderError
 
 SCHEMA = 1
 _LONGEST_NAME = 80
+_ATTEMPTS = 3
+"""Attempts to write a file whose folder is removed meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -111,20 +114,31 @@ def forget(kept: Kept) -> None:
 
 
 def write_durably(path: Path, value: object) -> None:
-    """Write a JSON file completely and flush it to disk. Raises RunFolderError."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("w", encoding="utf-8") as file:
-            json.dump(value, file, indent=2)
-            file.write("\n")
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        folder = os.open(path.parent, os.O_RDONLY)
+    """Write a JSON file completely and flush it to disk. Raises RunFolderError.
+
+    Another thread may write the same file at the same time, and another program may remove the folder.
+    """
+    for left in reversed(range(_ATTEMPTS)):
         try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-    except OSError as error:
-        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+            _write(path, value)
+        except OSError as error:
+            if isinstance(error, FileNotFoundError) and left:
+                continue
+            raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+        return
+
+
+def _write(path: Path, value: object) -> None:
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}.partial")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with temporary.open("w", encoding="utf-8") as file:
+        json.dump(value, file, indent=2)
+        file.write("\n")
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

@@ -15,6 +15,7 @@ import pytest
 import hil
 from hil.api.dry_run import dry_run
 from hil.errors import ConfigError, CsvError, MissingExtra, ResultError, RunFolderError
+from hil.estimation.changes.diff import diff_runs
 from hil.results.result import SettledResult
 from hil.setup.preflight import Level, check_arm
 from tests.support.command_line import hil as command
@@ -71,6 +72,7 @@ def test_all_samples_and_csv_files_are_estimated_too(identified: Path, tmp_path:
     found = hil.estimate(identified, all_samples=True)
     assert isinstance(found, hil.Estimation) and found.run == identified
     assert isinstance(hil.load_run(identified).result, hil.Estimation)
+    assert "gravity_1" in {change.name for change in diff_runs(identified, identified).changes}, "it has the joints"
     gravity = found.parameters["gravity_1"].value
     assert gravity == pytest.approx(whole.parameters["gravity_1"].value, rel=0.05)
     with pytest.raises(CsvError, match=r"a\.csv cannot be read"):

@@ -142,7 +142,7 @@ def test_missing_replies_and_an_undetermined_parameter_are_drawn_and_said(identi
 def test_pictures_stand_alone_as_svg_and_png(identified: Path, tmp_path: Path) -> None:
     data = RunData.load(identified)
     count = len(figures(data))
-    svgs = save_pictures(data, tmp_path / "pictures", "svg")
+    svgs = save_pictures(figures(data), tmp_path / "pictures", "svg")
     assert len(svgs) == len(set(svgs)) == count
     for path in svgs:
         assert ET.parse(path).getroot().tag.endswith("svg")

@@ -1,8 +1,10 @@
 """What a killed program left is restored by the next one, and what was changed since stays."""
 
 import os
+import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +52,29 @@ def test_settings_are_found_by_their_adapter_whatever_its_port_is_called_now(mon
     assert settings_file.load("/dev/ttyUSB1", 1, "XM430-W350") == kept
     settings_file.forget(kept)
     assert settings_file.load("/dev/ttyUSB1", 1, "XM430-W350") is None
+
+
+def test_threads_that_save_at_once_and_a_folder_removed_meanwhile_are_no_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each thread of a program may run its own copy of one fake arm, whose settings have one file."""
+    settings = {"Operating Mode": 3}
+
+    def save(_: int) -> None:
+        settings_file.forget(settings_file.keep("fake://arm.toml", 1, "XM430-W350", settings, {}))
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(save, range(200)))
+    assert not list(settings_file.state_folder().iterdir())
+    removed = iter([True, False])
+
+    def removing(descriptor: int) -> None:
+        if next(removed, False):
+            shutil.rmtree(settings_file.state_folder())
+
+    monkeypatch.setattr(os, "fsync", removing)
+    kept = settings_file.keep("fake://arm.toml", 1, "XM430-W350", settings, {})
+    assert settings_file.load("fake://arm.toml", 1, "XM430-W350") == kept
 
 
 class _Gone(BaseException):
