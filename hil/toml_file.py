@@ -9,6 +9,8 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+_LONGEST = 80  # characters of a path in its message
+
 
 class TomlFileError(ValueError):
     """A file that cannot be read or is not TOML; the text is the whole message and names the file."""
@@ -19,6 +21,12 @@ def load_toml(path: Path) -> dict[str, Any]:
     return parse_toml(read_toml_text(path), path)
 
 
+def shortened(path: Path | str) -> str:
+    """The beginning of a path that is too long for a message."""
+    said = str(path)
+    return f"{said[:_LONGEST]}{'...' * (len(said) > _LONGEST)}"
+
+
 def read_toml_text(path: Path) -> str:
     """The text of a file, without a byte order mark. Raises TomlFileError."""
     try:
@@ -27,6 +35,8 @@ def read_toml_text(path: Path) -> str:
         raise TomlFileError(f"{path} cannot be read: it is {_encoding_of(path, error)}.") from error
     except OSError as error:
         raise TomlFileError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except ValueError as error:
+        raise TomlFileError(f"{str(path)!r} cannot be read: a file name cannot contain a null character.") from error
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:

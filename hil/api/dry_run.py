@@ -7,7 +7,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from hil.api.configuration import ConfigLike, loaded
+from hil.api import progress
+from hil.api.configuration import ConfigLike, as_path, loaded
 from hil.api.progress import OnProgress, Progress, ignore
 from hil.config.schema import Config
 from hil.dry_run.chain_summary import ChainDryRun, chain_dry_run_json
@@ -127,8 +128,8 @@ def dry_run(
         hil.drivers.errors.DriverError: `servos` is true and the servos do not answer.
     """
     checked, shown = loaded(config)
-    on_progress(Progress("simulation", "Simulating"))
-    former = None if result is None else Path(result)
+    progress.checked(on_progress)(Progress("simulation", "Simulating"))
+    former = None if result is None else as_path(result, "result")
     if checked.is_chain:
         if former is not None:
             raise ConfigError(

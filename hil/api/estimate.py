@@ -1,14 +1,16 @@
 """`hil.estimate`: estimate parameters from a recording, without touching an arm."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, suppress
 from datetime import datetime
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
+from hil.api.configuration import as_path
 from hil.api.experiment import unused_path, write_run_report
-from hil.api.progress import OnProgress, Progress, ignore
+from hil.api.progress import OnProgress, Progress, checked, ignore
 from hil.api.run import Estimation, Identification, Run, estimation, identification
 from hil.errors import RecordingCutShort
 from hil.estimation.settled_estimate import estimate_run
@@ -57,17 +59,14 @@ def estimate(
         ConfigError: `config` is wrong.
         RecordingCutShort: the run holds no settled period; `all_samples` does not need one.
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
+        TypeError: an argument is of the wrong type.
         ValueError: run folders and other recordings are mixed, or there are several run folders.
     """
-    if isinstance(recording, Run):
-        paths = [recording.path]
-    elif isinstance(recording, str | PathLike):
-        paths = [Path(recording)]
-    else:
-        paths = [Path(each) for each in recording]
+    checked(on_progress)
+    paths = _paths(recording)
     if are_recordings(paths):
         on_progress(Progress("estimation", "Estimating by multiple shooting"))
-        return _from_files(paths, None if config is None else Path(config), out)
+        return _from_files(paths, None if config is None else as_path(config, "config"), out)
     if is_recording_folder(paths[0]):
         on_progress(Progress("estimation", "Estimating by multiple shooting"))
         return _again(paths[0])
@@ -83,6 +82,17 @@ def estimate(
         raise
     write_run_report(run)
     return identification(result, run.path)
+
+
+def _paths(recording: Any) -> list[Path]:
+    """The paths that the argument of `estimate` gives. Raises TypeError."""
+    if isinstance(recording, Run):
+        return [recording.path]
+    several = isinstance(recording, Iterable) and not isinstance(recording, str | bytes)
+    given = list(recording) if several else [recording]
+    if all(isinstance(each, str | PathLike) for each in given):
+        return [Path(each) for each in given]
+    raise TypeError(f"recording must be a run folder, a Run, or one or more recordings, not {recording!r}.")
 
 
 def are_recordings(paths: Sequence[Path]) -> bool:

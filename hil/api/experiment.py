@@ -8,7 +8,7 @@ from datetime import datetime
 from os import PathLike
 from pathlib import Path
 
-from hil.api.configuration import ConfigLike, loaded
+from hil.api.configuration import ConfigLike, as_path, loaded
 from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Identification, Run, identification, load_run
 from hil.clearance.doubts import doubts
@@ -56,13 +56,14 @@ def identify(
             the prior is used.
         on_progress: called with a `Progress` about 20 times a second while the arm moves; on a real bus, in a separate
             thread. It cannot disturb the experiment: reports that arrive too fast are dropped. If it raises, the
-            exception is logged and it is not called again.
+            exception is logged and it is not called again; a KeyboardInterrupt stops the run.
 
     Returns:
         The result, with the run folder as `run`. The report is in that folder too.
 
     Raises:
         ConfigError: the configuration is wrong.
+        TypeError: an argument is of the wrong type.
         RunFolderError: `out` is not empty or cannot be written.
         ExperimentError: the experiment could not be finished; the subclass says why, for example SafetyStop when a
             limit was exceeded.
@@ -72,9 +73,9 @@ def identify(
     checked, shown = loaded(config)
     if take_over:
         checked = _taking_over(checked)
-    earlier = None if start_from is None else _earlier(checked, shown, Path(start_from))
-    run = new_run_folder(checked, shown, out)
     tell = forgiving(on_progress)
+    earlier = None if start_from is None else _earlier(checked, shown, as_path(start_from, "start_from"))
+    run = new_run_folder(checked, shown, out)
 
     def watch(stream: StreamProgress) -> None:
         tell(Progress("experiment", stream=stream))
@@ -117,8 +118,8 @@ def record(
             f"{shown}: with experiment.pilot = true, each step's torque depends on the previous step's estimate, which "
             "only `hil identify` makes. To record only, set experiment.peak_torque and pilot = false."
         )
-    run = new_run_folder(checked, shown, out)
     tell = forgiving(on_progress)
+    run = new_run_folder(checked, shown, out)
     with _discarding(run, "record", shown):
         _tell_doubts(checked, tell)
         torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))
@@ -176,7 +177,11 @@ def _taking_over(config: Config) -> Config:
 
 def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None) -> RunFolder:
     """The folder `out`, or a new one in runs/ named after the time and the arm. Raises RunFolderError."""
-    path = unused_path(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}") if out is None else Path(out)
+    path = (
+        unused_path(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}")
+        if out is None
+        else as_path(out, "out")
+    )
     log.info("run folder %s", path)
     return RunFolder.create(path, config)
 

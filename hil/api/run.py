@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.api.configuration import as_path
 from hil.arm_model import ArmModel
 from hil.config.schema import Config
 from hil.errors import ResultError
@@ -83,9 +84,12 @@ class Identification(SettledResult):
 
         Raises:
             ExportError: the format cannot hold this arm, or a package for it is not installed.
+            TypeError: `kind` is not a string.
         """
         from hil.export.formats import export
 
+        if not isinstance(kind, str):
+            raise TypeError(f'kind must be the name of one format, such as "urdf", not {kind!r}.')
         return export(self.run, kind, None if out is None else Path(out), link_length)
 
 
@@ -112,7 +116,7 @@ class Estimation(ShootingResult):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Run:
-    """A recorded run.
+    """A recorded run. It holds arrays and so is equal only to itself: compare `result` instead.
 
     config: the configuration, with the experiment that was actually run. record: the contents of run.json. samples:
     every sample taken (dtype: hil.runs.recording.sample_type). events: pairs (time on the port's clock [s], what
@@ -184,7 +188,7 @@ def load_run(path: str | PathLike[str]) -> Run:
         ResultError: its result.json is damaged, or was written by a newer version of hil.
         ConfigError: its copy of the configuration is no longer valid.
     """
-    run = RunFolder.open(Path(path))
+    run = RunFolder.open(as_path(path, "path"))
     config = run.load_config()
     return Run(
         run.path,

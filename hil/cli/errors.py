@@ -2,12 +2,13 @@
 
 import errno
 
+from hil.toml_file import shortened
+
 _OF_THE_MACHINE = frozenset({errno.EMFILE, errno.ENFILE})
 """Operating-system errors that do not depend on the input: too many open files."""
 
 _OF_A_PATH = frozenset({errno.ENAMETOOLONG, errno.EACCES})
 """Errors that even checking whether a file exists may raise."""
-_LONGEST = 80  # characters of a path in their message
 
 
 def exit_code(error: Exception) -> int | None:
@@ -42,8 +43,7 @@ def message(error: Exception) -> str:
     """
     said = str(error)
     if isinstance(error, OSError) and _is_of_a_path(error):
-        path = str(error.filename)
-        said = f"{path[:_LONGEST]}{'...' * (len(path) > _LONGEST)}: {error.strerror}."
+        said = f"{shortened(str(error.filename))}: {error.strerror}."
     lines = [f"hil: {said}"]
     cause = None if error.__suppress_context__ else error.__context__
     if isinstance(cause, Exception) and exit_code(cause) is not None and str(cause) != str(error):

@@ -39,7 +39,7 @@ from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import arm_names, find_arm
 from hil.next_step import command
 from hil.toml_errors import describe
-from hil.toml_file import TomlFileError, load_toml, parse_toml, read_toml_text
+from hil.toml_file import TomlFileError, load_toml, parse_toml, read_toml_text, shortened
 from hil.unit_hints import in_other_units
 
 __all__ = [
@@ -321,9 +321,16 @@ class Config(Table):
 
 
 def load_config(path: str | PathLike[str]) -> Config:
-    """Read and check a TOML file, or the bundled one with that name. Raises ConfigError."""
-    path = find_config(Path(path))
-    if path.is_dir():
+    """Read and check a TOML file, or the bundled one with that name. Raises ConfigError, TypeError."""
+    if not isinstance(path, str | PathLike):
+        raise TypeError(f"path must be a TOML file or the name of a bundled configuration, not {path!r}.")
+    path = Path(path)
+    try:
+        path = find_config(path)
+        is_folder = path.is_dir()
+    except OSError as error:  # a name that is too long, or a folder that may not be searched
+        raise ConfigError(f"{shortened(path)}: {error.strerror}.") from error
+    if is_folder:
         if path == Path():
             raise ConfigError(". cannot be read: it is the current folder (as is an empty name). Name a TOML file.")
         within = [*path.glob("*.toml")]

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import datetime
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,12 @@ class RunSummary:
         return asdict(self) | {"path": str(self.path), "started": started}
 
 
-def find_runs(folder: Path) -> list[RunSummary]:
+def find_runs(folder: str | PathLike[str]) -> list[RunSummary]:
     """The runs in `folder`, or `folder` itself if it is a run, oldest first; pilot steps count as part of their run.
 
     Raises RunFolderError if the folder does not exist.
     """
+    folder = Path(folder)
     if not folder.is_dir():
         raise RunFolderError(
             f"{folder} is not a folder. `hil identify` creates its runs in runs/ in the current folder."
