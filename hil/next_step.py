@@ -1,5 +1,6 @@
 """The command to type next: from `hil scan` to `hil export`, each command names its successor in its last line."""
 
+import os
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +16,18 @@ def next_step(*words: object) -> str:
 
 def command(*words: object) -> str:
     """A `hil` command as typed in a shell, with every word quoted that the shell would split or expand."""
-    return shlex.join(["hil", *map(str, words)])
+    return " ".join(["hil", *(_quoted(str(word)) for word in words)])
+
+
+def _quoted(word: str) -> str:
+    """Quote a word; one with characters that no terminal shows, such as a name that is not UTF-8, as $'...' (bash)."""
+    if word.isprintable():
+        return shlex.quote(word)
+    shown = (
+        each if each.isprintable() and each not in "\\'" else "".join(f"\\x{byte:02x}" for byte in os.fsencode(each))
+        for each in word
+    )
+    return f"$'{''.join(shown)}'"
 
 
 def steps_of(path: Path) -> list[Path]:

@@ -15,7 +15,7 @@ import typer
 
 from hil import __version__
 from hil.cli import bus, data, dry_run, experiment, fake_command, init, results, runs, schema, study
-from hil.cli.errors import exit_code, message, stop_behind
+from hil.cli.errors import Command, exit_code, message, stop_behind
 from hil.cli.output import readable_output, require_output
 from hil.cli.stopped import same_again
 from hil.cli.verbosity import with_verbosity
@@ -93,7 +93,7 @@ def _code_as_asked() -> Iterator[None]:
 
 
 for _name, (_command, _example) in COMMANDS.items():
-    app.command(_name, epilog=f"Example: hil {_name} {_example}")(with_verbosity(_command))
+    app.command(_name, cls=Command, epilog=f"Example: hil {_name} {_example}")(with_verbosity(_command))
 
 
 @cache

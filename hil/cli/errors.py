@@ -1,6 +1,10 @@
 """Conversion of exceptions to messages and exit codes."""
 
 import errno
+from typing import Any
+
+import typer
+from typer.core import TyperCommand
 
 from hil.toml_file import shortened
 
@@ -50,6 +54,21 @@ def message(error: Exception) -> str:
         lines.append(f"Preceded by: {cause}")
     text = "\n".join([*lines, *getattr(error, "__notes__", [])])
     return "".join(each if each.isprintable() or each in "\n\t" else ascii(each)[1:-1] for each in text)
+
+
+class Command(TyperCommand):
+    """A subcommand whose errors about a value show that value, which typer's own may not do."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            details = getattr(error.__cause__, "errors", list)()  # pydantic's
+            if details:
+                from hil.toml_errors import what_is_wrong
+
+                error.message = f"{details[0]['input']} {what_is_wrong(details[0])}."
+            raise
 
 
 def stop_behind(error: BaseException) -> Exception | None:

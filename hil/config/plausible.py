@@ -96,7 +96,9 @@ def _angles(key: str, values: Sequence[float], most: float = _MOST_TURN_RAD) -> 
         shown = ", ".join(f"{value:g}" for value in values)
         turns = max(abs(value) for value in values) / (2 * math.pi)
         hint = in_other_units(values, "rad", lambda value: abs(value) <= most)
-        yield f"{key} = [{shown}] rad: that is up to {turns:.2g} turns" + (f". {hint}" if hint else "")
+        allowed = f"angles of up to {most:.4g} rad ({most / (2 * math.pi):g} turns)"
+        said = f"{key} = [{shown}] rad: that is up to {turns:.2g} turns; {allowed} are allowed"
+        yield f"{said}. {hint}" if hint else said
 
 
 def _length(key: str, length: float) -> Iterator[str]:

@@ -215,6 +215,8 @@ class Config(Table):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         count = len(self.joints)
+        if self.arm.urdf is None and (slips := [*chain_slips(self)]):  # first: the lists' lengths depend on it
+            raise ValueError("; ".join(slips))
         _same_length("arm.rest_pose", self.arm.rest_pose, count)
         for key, values in self._per_joint():
             _same_length(key, values, count)

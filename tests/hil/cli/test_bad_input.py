@@ -18,6 +18,7 @@ from tests.support.command_line import hil
 from tests.support.paths import CONFIGS
 
 ARM = (CONFIGS / "fake_two_link_ideal.toml").read_text(encoding="utf-8")
+JOINT = ("[[joints]]" + ARM.split("[[joints]]")[1].split("\n[")[0] + "\n").replace("id = 1", "id = 3")
 CSV = "t,q1,tau1\n" + "".join(f"{0.01 * k:.2f},{0.001 * (k * k % 97):.4f},{0.1 * (k % 7):.2f}\n" for k in range(100))
 
 # Files of the folder in which every command runs, by name.
@@ -56,6 +57,8 @@ FILES: dict[str, bytes] = {
     "arm.npz": b"PK",
     "arm.jsonl": b"{}",
     "study.toml": b"[study]\n",
+    "seed.toml": ARM.replace("seed = 1\n", "seed = 9223372036854775808\n", 1).encode(),
+    "three.toml": ARM.replace("[[joints]]", f"{JOINT}[[joints]]", 1).encode(),
     "degrees.toml": ARM.replace("position_limit = [-3.1, 3.1]", "position_limit = [-178, 178]").encode(),
     "swapped.toml": ARM.replace("position_limit = [-4.2, 1.06]", "position_limit = [1.06, -4.2]").encode(),
     "negative.toml": ARM.replace("velocity_limit = 15.0", "velocity_limit = -15.0").encode(),
@@ -138,7 +141,11 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate good.csv --config broken.toml", 2, "not valid TOML"),
     ("estimate good.csv --config joints.toml", 2, "position"),
     ("estimate good.csv --config both.toml", 2, "torque and current are both given"),
-    ("estimate good.csv --config unit.toml", 2, "position_unit"),
+    (
+        "estimate good.csv --config unit.toml",
+        2,
+        "columns.position_unit = 'grad': must be one of 'rad', 'mrad', 'deg', 'turns' or 'ticks'.",
+    ),
     ("estimate good.csv --config columns.toml --out run", 2, "not empty"),
     ("estimate good.csv --config columns.toml --out file", 2, "file"),
     ("estimate good.csv run", 2, "not both"),
@@ -163,7 +170,13 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate run --config columns.toml", 2, "--config is for recordings"),
     ("estimate run/config.toml", 2, "give the folder of a run"),
     ("check run", 2, "did you mean run/config.toml"),
-    ("check degrees.toml", 2, "If it is in degrees"),
+    ("check degrees.toml", 2, "angles of up to 12.57 rad (2 turns) are allowed. If it is in degrees"),
+    ("check seed.toml", 2, "experiment.seed = 9223372036854775808: must be at most 9223372036854775807."),
+    ("check three.toml", 2, "three.toml: joints: 3 joints need arm.urdf"),
+    ("fake koch --fault lost_reply:probability=nan", 2, "probability = nan: must be a finite number."),
+    ("dry-run arm.toml --arms 3", 2, "Invalid value for '--arms': 3 must be at least 20."),
+    ("calibrate run run2 --mass nan", 2, "Invalid value for '--mass': nan must be a finite number."),
+    ("fake koch --seed x", 2, "Invalid value for '--seed': x must be a whole number."),
     ("check swapped.toml", 2, "the first value must be the smaller one"),
     ("check negative.toml", 2, "must be greater than 0"),
     ("check id.toml", 2, "must be a whole number"),
