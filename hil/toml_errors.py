@@ -210,13 +210,6 @@ def _meant(value: object, expected: str) -> str:
     return meant_name(value, re.findall(r"'([^']*)'", expected)) if isinstance(value, str) else ""
 
 
-def unprintable(text: str) -> str:
-    """Describe the first character of a text that cannot be printed; "" if there is none."""
-    bad = next((each for each in text if not each.isprintable()), "")
-    named = {"\n": "a line break", "\r": "a line break", "\t": "a tab"}
-    return named.get(bad, f"the unprintable character {bad!a}") if bad else ""
-
-
 def meant_name(given: str, names: Sequence[str]) -> str:
     """Return the intended name: the same except for case, spaces and dashes, or the most similar one; "" if none is
     similar. Short names that differ in a letter are different words: grad is not rad.

@@ -27,6 +27,13 @@ def shortened(path: Path | str) -> str:
     return f"{said[:_LONGEST]}{'...' * (len(said) > _LONGEST)}"
 
 
+def unprintable(text: str) -> str:
+    """Describe the first character of a text that cannot be printed; "" if there is none."""
+    bad = next((each for each in text if not each.isprintable()), "")
+    named = {"\n": "a line break", "\r": "a line break", "\t": "a tab"}
+    return named.get(bad, f"the unprintable character {bad!a}") if bad else ""
+
+
 def read_toml_text(path: Path) -> str:
     """The text of a file, without a byte order mark. Raises TomlFileError."""
     try:

@@ -56,6 +56,12 @@ def message(error: Exception) -> str:
     return "".join(each if each.isprintable() or each in "\n\t" else ascii(each)[1:-1] for each in text)
 
 
+def _details(cause: BaseException | None) -> list[Any]:
+    """The details of an error of pydantic's; none for any other."""
+    errors = getattr(cause, "errors", None)
+    return errors() if callable(errors) else []
+
+
 class Command(TyperCommand):
     """A subcommand whose errors about a value show that value, which typer's own may not do."""
 
@@ -63,8 +69,7 @@ class Command(TyperCommand):
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
-            details = getattr(error.__cause__, "errors", list)()  # pydantic's
-            if details:
+            if details := _details(error.__cause__):
                 from hil.toml_errors import what_is_wrong
 
                 error.message = f"{details[0]['input']} {what_is_wrong(details[0])}."

@@ -7,7 +7,7 @@ from pydantic import Field, PositiveFloat, field_validator, model_validator
 from hil.config.table import BusId, OneOrList, Range, Table
 from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import SERVO_MODELS, Mode, servo_model, with_article
-from hil.toml_errors import unprintable
+from hil.toml_file import unprintable
 
 USUAL_TORQUE_SPREAD = 0.1
 """Relative standard deviation of the torque constant among servos of one model."""

@@ -16,7 +16,7 @@ from hil.errors import ResultError, RunFolderError
 from hil.model_file import read_result
 from hil.next_step import command, only_steps, steps_of
 from hil.runs.run_folder import write_json
-from hil.toml_errors import unprintable
+from hil.toml_file import unprintable
 
 NOTE_FILE = "note.json"
 _LONGEST = 2000

@@ -49,7 +49,7 @@ def test_a_ratio_beyond_the_uncertainty_of_torque_constants_is_a_contradiction(
 
 def test_turns_and_torque_constants_are_said_plainly() -> None:
     angle = np.linspace(0.0, 25.0, 100)
-    recording = Recording(0.01 * np.arange(100), np.zeros((1, 100)), angle[None], np.array([1e-3]))
+    recording = Recording(0.01 * np.arange(100), np.ones((1, 100)), angle[None], np.array([1e-3]))
     (turns,) = _turns([recording], 0, "Joint 1")
     assert turns == "Joint 1 seems to have moved 4 turns. If it did not, the unit of its positions is wrong."
     config = load_config(CONFIGS / "fake_two_link.toml")
