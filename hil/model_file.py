@@ -17,7 +17,7 @@ from hil.estimator.models.terms import RIGID_BODY, base_names, extra_names
 from hil.next_step import command, only_steps, steps_of
 from hil.results.json_form import FormError, from_json
 from hil.results.parts import ArmFacts, ChainFacts, Quantity
-from hil.results.result import SCHEMA, Result, SettledResult, is_of_shooting, result_from_json
+from hil.results.result import SCHEMA, Result, SettledResult, result_from_json
 from hil.toml_file import TomlFileError, parse_toml, read_toml_text
 
 
@@ -37,8 +37,8 @@ def _read(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         if file.suffix.lower() != ".json":
             raise ResultError(
-                f"{file} is not a model file of hil. Give a run folder, its result.json, or a file that hil export "
-                "wrote with --format toml or json."
+                f"{file} is not a model file of hil. Give a run folder, its result.json, or the TOML or JSON file of "
+                "hil export."
             ) from error
         raise ResultError(f"{file} is incomplete or damaged: {error}. Recreate it with hil estimate RUN.") from error
     if not isinstance(result, dict) or "schema" not in result:
@@ -90,14 +90,8 @@ def read_settled_result(path: Path) -> SettledResult:
 
 def read_model(path: str | PathLike[str]) -> ArmModel:
     """Read the identified arm of a run folder or file; see `hil.load_model`. Raises ResultError."""
-    found = _read(Path(path))
-    if "arm" not in found and is_of_shooting(found):
-        raise ResultError(
-            f"{_file(Path(path))} is an estimate from all samples by an older hil, which did not store the arm's "
-            "joints in it. Run hil estimate again, with --all-samples unless you want the settled periods only."
-        )
     try:
-        saved = from_json(_SavedModel, found)
+        saved = from_json(_SavedModel, _read(Path(path)))
     except FormError as error:
         raise _damaged(Path(path), error) from error
     return _model(saved.arm, {**saved.parameters, **saved.extra}, saved.chain, Path(path))

@@ -20,14 +20,12 @@ def command(*words: object) -> str:
 
 
 def _quoted(word: str) -> str:
-    """Quote a word; one with characters that no terminal shows, such as a name that is not UTF-8, as $'...' (bash)."""
+    """Quote a word, as $'...' (bash) if it has characters that cannot be printed."""
     if word.isprintable():
         return shlex.quote(word)
-    shown = (
-        each if each.isprintable() and each not in "\\'" else "".join(f"\\x{byte:02x}" for byte in os.fsencode(each))
-        for each in word
-    )
-    return f"$'{''.join(shown)}'"
+    plain = bytes(range(32, 127)).translate(None, b"\\'")
+    shown = "".join(chr(byte) if byte in plain else f"\\x{byte:02x}" for byte in os.fsencode(word))
+    return f"$'{shown}'"
 
 
 def steps_of(path: Path) -> list[Path]:

@@ -29,7 +29,6 @@ _EXPECTED = {
     "model_type": "must be a table",
     "model_attributes_type": "must be a table",
 }
-_NOT_FINITE = ("nan", "inf", "-inf", "+inf")
 _BOUNDS = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}
 
 
@@ -126,7 +125,7 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
 def what_is_wrong(detail: Any) -> str:
     """Say what a value must be, for one of pydantic's errors."""
     kind, value = detail["type"], detail["input"]
-    if kind in _BOUNDS and str(value).strip().lower() in _NOT_FINITE:  # which no bound describes
+    if kind in _BOUNDS and str(value).lower() in ("nan", "inf", "-inf"):
         kind = "finite_number"
     return _EXPECTED.get(kind) or _constraint(kind, detail.get("ctx", {}), value) or str(detail["msg"])
 
@@ -212,7 +211,7 @@ def _meant(value: object, expected: str) -> str:
 
 def meant_name(given: str, names: Sequence[str]) -> str:
     """Return the intended name: the same except for case, spaces and dashes, or the most similar one; "" if none is
-    similar. Short names that differ in a letter are different words: grad is not rad.
+    similar. Short names are not similar: grad is not rad.
     """
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
     bare = re.sub(r"[^a-z0-9]", "", given.lower())

@@ -9,8 +9,6 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-_LONGEST = 80  # characters of a path in its message
-
 
 class TomlFileError(ValueError):
     """A file that cannot be read or is not TOML; the text is the whole message and names the file."""
@@ -21,17 +19,9 @@ def load_toml(path: Path) -> dict[str, Any]:
     return parse_toml(read_toml_text(path), path)
 
 
-def shortened(path: Path | str) -> str:
-    """The beginning of a path that is too long for a message."""
-    said = str(path)
-    return f"{said[:_LONGEST]}{'...' * (len(said) > _LONGEST)}"
-
-
-def unprintable(text: str) -> str:
-    """Describe the first character of a text that cannot be printed; "" if there is none."""
-    bad = next((each for each in text if not each.isprintable()), "")
-    named = {"\n": "a line break", "\r": "a line break", "\t": "a tab"}
-    return named.get(bad, f"the unprintable character {bad!a}") if bad else ""
+def shortened(path: str) -> str:
+    """A path, or the beginning of one that is too long for a message."""
+    return path if len(path) <= 80 else f"{path[:80]}..."
 
 
 def read_toml_text(path: Path) -> str:
@@ -43,7 +33,7 @@ def read_toml_text(path: Path) -> str:
     except OSError as error:
         raise TomlFileError(f"{path} cannot be read: {error.strerror or error}.") from error
     except ValueError as error:
-        raise TomlFileError(f"{str(path)!r} cannot be read: a file name cannot contain a null character.") from error
+        raise TomlFileError(f"{str(path)!r} cannot be read: {error}.") from error
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:

@@ -9,13 +9,6 @@ ConfigLike = str | PathLike[str] | Config
 """A TOML file, the name of a bundled configuration, or a loaded configuration."""
 
 
-def as_path(value: object, argument: str) -> Path:
-    """Return the path that an argument gives. Raises TypeError, which names the argument."""
-    if not isinstance(value, str | PathLike):
-        raise TypeError(f"{argument} must be a path, not {value!r}.")
-    return Path(value)
-
-
 def loaded(config: ConfigLike) -> tuple[Config, Path]:
     """Load and check the configuration; also return its path as the caller wrote it. Raises ConfigError, TypeError."""
     if isinstance(config, Config):

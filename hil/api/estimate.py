@@ -1,6 +1,6 @@
 """`hil.estimate`: estimate parameters from a recording, without touching an arm."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, suppress
 from datetime import datetime
@@ -8,9 +8,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from hil.api.configuration import as_path
 from hil.api.experiment import unused_path, write_run_report
-from hil.api.progress import OnProgress, Progress, checked, ignore
+from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Estimation, Identification, Run, estimation, identification
 from hil.errors import RecordingCutShort
 from hil.estimation.settled_estimate import estimate_run
@@ -62,19 +61,19 @@ def estimate(
         TypeError: an argument is of the wrong type.
         ValueError: run folders and other recordings are mixed, or there are several run folders.
     """
-    checked(on_progress)
+    tell = forgiving(on_progress)
     paths = _paths(recording)
     if are_recordings(paths):
-        on_progress(Progress("estimation", "Estimating by multiple shooting"))
-        return _from_files(paths, None if config is None else as_path(config, "config"), out)
+        tell(Progress("estimation", "Estimating by multiple shooting"))
+        return _from_files(paths, None if config is None else Path(config), out)
     if is_recording_folder(paths[0]):
-        on_progress(Progress("estimation", "Estimating by multiple shooting"))
+        tell(Progress("estimation", "Estimating by multiple shooting"))
         return _again(paths[0])
     run = RunFolder.open(paths[0])
     if all_samples:
-        on_progress(Progress("estimation", "Estimating by multiple shooting"))
+        tell(Progress("estimation", "Estimating by multiple shooting"))
         return estimation(estimate_unsettled(run), run.path)
-    on_progress(Progress("estimation", "Estimating"))
+    tell(Progress("estimation", "Estimating"))
     try:
         result = estimate_run(run, executor)
     except RecordingCutShort as error:
@@ -88,11 +87,10 @@ def _paths(recording: Any) -> list[Path]:
     """The paths that the argument of `estimate` gives. Raises TypeError."""
     if isinstance(recording, Run):
         return [recording.path]
-    several = isinstance(recording, Iterable) and not isinstance(recording, str | bytes)
-    given = list(recording) if several else [recording]
-    if all(isinstance(each, str | PathLike) for each in given):
-        return [Path(each) for each in given]
-    raise TypeError(f"recording must be a run folder, a Run, or one or more recordings, not {recording!r}.")
+    try:
+        return [Path(each) for each in ([recording] if isinstance(recording, str | PathLike) else recording)]
+    except TypeError:
+        raise TypeError(f"recording must be a run folder, a Run, or recordings, not {recording!r}.") from None
 
 
 def are_recordings(paths: Sequence[Path]) -> bool:

@@ -8,7 +8,7 @@ from datetime import datetime
 from os import PathLike
 from pathlib import Path
 
-from hil.api.configuration import ConfigLike, as_path, loaded
+from hil.api.configuration import ConfigLike, loaded
 from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Identification, Run, identification, load_run
 from hil.clearance.doubts import doubts
@@ -63,7 +63,6 @@ def identify(
 
     Raises:
         ConfigError: the configuration is wrong.
-        TypeError: an argument is of the wrong type.
         RunFolderError: `out` is not empty or cannot be written.
         ExperimentError: the experiment could not be finished; the subclass says why, for example SafetyStop when a
             limit was exceeded.
@@ -74,7 +73,7 @@ def identify(
     if take_over:
         checked = _taking_over(checked)
     tell = forgiving(on_progress)
-    earlier = None if start_from is None else _earlier(checked, shown, as_path(start_from, "start_from"))
+    earlier = None if start_from is None else _earlier(checked, shown, Path(start_from))
     run = new_run_folder(checked, shown, out)
 
     def watch(stream: StreamProgress) -> None:
@@ -177,11 +176,7 @@ def _taking_over(config: Config) -> Config:
 
 def new_run_folder(config: Config, shown: Path, out: str | PathLike[str] | None) -> RunFolder:
     """The folder `out`, or a new one in runs/ named after the time and the arm. Raises RunFolderError."""
-    path = (
-        unused_path(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}")
-        if out is None
-        else as_path(out, "out")
-    )
+    path = unused_path(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{shown.stem}") if out is None else Path(out)
     log.info("run folder %s", path)
     return RunFolder.create(path, config)
 

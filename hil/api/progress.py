@@ -43,11 +43,11 @@ OnProgress = Callable[[Progress], None]
 def forgiving(listener: OnProgress) -> OnProgress:
     """Wrap a callback so that its first exception is logged and it is not called again.
 
-    A StopRequested raised during the callback (Ctrl-C, for example) does not count as its failure and is passed on, as
-    is a KeyboardInterrupt: from another thread, it reaches the main one. Raises TypeError if the listener cannot be
-    called.
+    A StopRequested or KeyboardInterrupt raised during the callback (Ctrl-C, for example) does not count as its failure
+    and is passed on, the latter to the main thread. Raises TypeError if the listener cannot be called.
     """
-    checked(listener)
+    if not callable(listener):
+        raise TypeError(f"on_progress must be a function of one Progress, not {listener!r}.")
     owner, failed = threading.current_thread(), False
 
     def tell(progress: Progress) -> None:
@@ -62,19 +62,12 @@ def forgiving(listener: OnProgress) -> OnProgress:
             if threading.current_thread() is owner:
                 raise
             failed = True
-            _thread.interrupt_main()  # an exception would end this thread only
-        except (Exception, SystemExit):  # sys.exit() would end the run on a fake bus only
+            _thread.interrupt_main()
+        except (Exception, SystemExit):
             failed = True
             log.exception("on_progress raised an exception; it will not be called again")
 
     return tell
-
-
-def checked(listener: OnProgress) -> OnProgress:
-    """Return the callback. Raises TypeError if it cannot be called."""
-    if not callable(listener):
-        raise TypeError(f"on_progress must be a function of one Progress, not {listener!r}.")
-    return listener
 
 
 def ignore(_: Progress) -> None:

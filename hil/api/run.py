@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.api.configuration import as_path
 from hil.arm_model import ArmModel
 from hil.config.schema import Config
 from hil.errors import ResultError
@@ -188,7 +187,7 @@ def load_run(path: str | PathLike[str]) -> Run:
         ResultError: its result.json is damaged, or was written by a newer version of hil.
         ConfigError: its copy of the configuration is no longer valid.
     """
-    run = RunFolder.open(as_path(path, "path"))
+    run = RunFolder.open(Path(path))
     config = run.load_config()
     return Run(
         run.path,

@@ -41,7 +41,7 @@ def _root(
 ) -> None:
     del allow_code  # handled in main, wherever it appeared on the command line
     if version:
-        print(f"hil {__version__}")
+        print(f"hil {__version__}", flush=True)
         raise typer.Exit
 
 

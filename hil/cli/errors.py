@@ -56,23 +56,19 @@ def message(error: Exception) -> str:
     return "".join(each if each.isprintable() or each in "\n\t" else ascii(each)[1:-1] for each in text)
 
 
-def _details(cause: BaseException | None) -> list[Any]:
-    """The details of an error of pydantic's; none for any other."""
-    errors = getattr(cause, "errors", None)
-    return errors() if callable(errors) else []
-
-
 class Command(TyperCommand):
-    """A subcommand whose errors about a value show that value, which typer's own may not do."""
+    """A subcommand whose errors show the wrong value."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
-            if details := _details(error.__cause__):
+            cause: Any = error.__cause__
+            if hasattr(cause, "errors"):  # pydantic's
                 from hil.toml_errors import what_is_wrong
 
-                error.message = f"{details[0]['input']} {what_is_wrong(details[0])}."
+                detail = cause.errors()[0]
+                error.message = f"{detail['input']} {what_is_wrong(detail)}."
             raise
 
 

@@ -5,40 +5,31 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 
 def require_output() -> None:
-    """Exit if standard output is closed (`>&-`): the next file that is opened, such as a port, would take its place."""
-    if sys.stderr is None:
-        sys.stderr = Path(os.devnull).open("w")  # noqa: SIM115  # needed until the process ends
+    """Exit if standard output is closed (`>&-`): the next file to be opened would take its place."""
     if sys.stdout is None:
-        print("hil: standard output is closed. To discard the output, redirect it to /dev/null.", file=sys.stderr)
+        print("hil: standard output is closed. Redirect it, for example to /dev/null.", file=sys.stderr)
         sys.exit(1)
 
 
 @contextmanager
 def readable_output() -> Iterator[None]:
     """Treat a closed pipe (`| head -1`) as success; report a full disk as a failure."""
-    ended = SystemExit(0)
     try:
-        try:
-            yield
-        except SystemExit as error:  # --help and --version end so; Python would write their output later
-            ended = error
+        yield
         sys.stdout.flush()
     except BrokenPipeError:
         _drop_output()
-        raise ended from None
+        sys.exit(0)
     except OSError as error:
         if error.errno != errno.ENOSPC or error.filename is not None:
             raise
         _drop_output()
         said = "hil: cannot write to standard output: no space left. Finished results are in their folder."
         print(said, file=sys.stderr)
-        sys.exit(ended.code or 1)
-    if ended.code:
-        raise ended
+        sys.exit(1)
 
 
 def _drop_output() -> None:

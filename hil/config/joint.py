@@ -7,7 +7,6 @@ from pydantic import Field, PositiveFloat, field_validator, model_validator
 from hil.config.table import BusId, OneOrList, Range, Table
 from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import SERVO_MODELS, Mode, servo_model, with_article
-from hil.toml_file import unprintable
 
 USUAL_TORQUE_SPREAD = 0.1
 """Relative standard deviation of the torque constant among servos of one model."""
@@ -41,8 +40,8 @@ class JointConfig(Table):
     @classmethod
     def _printable(cls, name: str) -> str:
         """Reject control characters, line breaks and surrogates: names appear in terminals, XML, HTML and CSV."""
-        if bad := unprintable(name):
-            raise ValueError(f"must not contain {bad}")
+        if not name.isprintable():
+            raise ValueError("must not contain line breaks, tabs or other unprintable characters")
         return name
 
     @field_validator("zero_ticks", mode="before")

@@ -323,15 +323,12 @@ class Config(Table):
 
 
 def load_config(path: str | PathLike[str]) -> Config:
-    """Read and check a TOML file, or the bundled one with that name. Raises ConfigError, TypeError."""
-    if not isinstance(path, str | PathLike):
-        raise TypeError(f"path must be a TOML file or the name of a bundled configuration, not {path!r}.")
-    path = Path(path)
+    """Read and check a TOML file, or the bundled one with that name. Raises ConfigError."""
     try:
-        path = find_config(path)
+        path = find_config(Path(path))
         is_folder = path.is_dir()
-    except OSError as error:  # a name that is too long, or a folder that may not be searched
-        raise ConfigError(f"{shortened(path)}: {error.strerror}.") from error
+    except OSError as error:
+        raise ConfigError(f"{shortened(str(path))}: {error.strerror}.") from error
     if is_folder:
         if path == Path():
             raise ConfigError(". cannot be read: it is the current folder (as is an empty name). Name a TOML file.")

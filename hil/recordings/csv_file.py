@@ -15,28 +15,18 @@ from hil.runs.file_size import MOST_CSV_BYTES
 _REMARKS = ("#", "%", "//")
 _ANNOUNCED = re.compile(r'\s*"?sep=(.)"?\s*', re.IGNORECASE)
 """A first line that names the delimiter, as Excel reads and writes it."""
-_OTHER_KINDS = (
-    (re.compile(r"\s*<(!|\?xml|html|table)", re.IGNORECASE), "HTML or XML"),
-    (re.compile(r'\s*(\{|\[\s*[\[{"\d-])'), "JSON"),
-)
+_NO_TABLE = re.compile(r'\s*(<(!|\?xml|html|table)|\{|\[\s*[\[{"\d-])', re.IGNORECASE)
 
 
 def read_csv_table(path: Path) -> Table:
     """Read the table in `path`. Raises CsvError. An empty field or `nan` is a missing value."""
     text = _text(path)
-    if kind := _other_kind(text):
-        raise CsvError(f"{path} cannot be read: it is {kind}, whatever its name. Export the data as CSV.")
+    if _NO_TABLE.match(text):
+        raise CsvError(f"{path} cannot be read: it is HTML, XML or JSON. Export the data as CSV.")
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
-    try:
-        return _table(path, lines)
-    except csv.Error as error:  # a field beyond the limit of Python's reader
-        number, _ = max(lines, key=lambda each: len(each[1]))
-        raise CsvError(
-            f"{path}, line {number}: a field has more than {csv.field_size_limit():,} characters, so it is no number."
-        ) from error
-
-
-def _table(path: Path, lines: list[tuple[int, str]]) -> Table:
+    if long := [number for number, line in lines if len(line) > csv.field_size_limit()]:
+        most = f"{csv.field_size_limit():,}"
+        raise CsvError(f"{path}, line {long[0]}: more than {most} characters, too many for a row of a table.")
     remarks = [line for _, line in lines if line.lstrip().startswith(_REMARKS)]
     rows = [(number, line) for number, line in lines if not line.lstrip().startswith(_REMARKS)]
     announced = _ANNOUNCED.fullmatch(rows[0][1]) if rows else None
@@ -84,11 +74,6 @@ def _text(path: Path) -> str:
     if "\0" in text:
         raise CsvError(f"{path} cannot be read: it is not a text file but a binary one. Export it as CSV.")
     return text
-
-
-def _other_kind(text: str) -> str:
-    """The format of a text that is not a table, by its first characters; "" for a table."""
-    return next((kind for pattern, kind in _OTHER_KINDS if pattern.match(text)), "")
 
 
 def _delimiter(lines: list[str]) -> str | None:

@@ -9,9 +9,6 @@ import numpy as np
 from hil.drawing import new_figure
 from hil.report.chart import Chart, Figure, Matrix, Series
 
-_LEGEND_ROW = 14.0
-"""Height of a row of the legend [points]."""
-
 
 def save_png(figure: Figure, path: Path) -> None:
     """Save one figure. Raises MissingExtra if matplotlib is not installed, and OSError if writing fails."""
@@ -24,7 +21,7 @@ def draw_figures(figures: Sequence[Figure], dpi: int = 90) -> Any:
     canvas = new_figure(8.8, sum(heights), dpi)
     rows = canvas.subplots(len(figures), 1, squeeze=False, height_ratios=heights)
     for axes, figure in zip(rows[:, 0], figures, strict=True):
-        axes.set_title(figure.title, fontsize=11, pad=6.0 + _LEGEND_ROW * _legend(figure)[0])
+        axes.set_title(figure.title, fontsize=11)
         if isinstance(figure, Chart):
             _draw_chart(axes, figure)
         else:
@@ -39,17 +36,8 @@ def _draw_chart(axes: Any, chart: Chart) -> None:
     axes.set_ylabel(chart.y_label)
     axes.set_yscale("log" if chart.log_y else "linear")
     axes.grid(color="#e3e6ea")
-    rows, columns = _legend(chart)
-    if rows:  # above the axes, so that it hides no curve
-        above = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": columns}
-        axes.legend(fontsize=8, frameon=False, borderaxespad=0.2, **above)
-
-
-def _legend(figure: Figure) -> tuple[int, int]:
-    """Rows and columns of the legend that fit the width of the figure; no rows without a named curve."""
-    names = [series.name for series in figure.series if series.name] if isinstance(figure, Chart) else []
-    columns = max(1, int(570.0 / (45.0 + 4.7 * max(map(len, names), default=0))))  # points
-    return -(-len(names) // columns), columns
+    if any(series.name for series in chart.series):  # beside the axes, so that the legend hides no curve
+        axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _draw_series(axes: Any, series: Series) -> None:

@@ -146,15 +146,11 @@ class ShootingResult(Result):
     notes: tuple[str, ...] = ()
 
 
-def is_of_shooting(value: Mapping[str, Any]) -> bool:
-    """Whether an object of the form of result.json is the result of multiple shooting."""
-    fit = value.get("fit")
-    return isinstance(fit, dict) and "residual_rms_rad" in fit
-
-
 def result_from_json(value: Mapping[str, Any]) -> Result:
     """Convert an object of the form of result.json to a result. Raises FormError."""
-    kind: type[Result] = ShootingResult if is_of_shooting(value) else SettledResult
+    fit = value.get("fit")
+    shooting = isinstance(fit, dict) and "residual_rms_rad" in fit
+    kind: type[Result] = ShootingResult if shooting else SettledResult
     found = from_json(kind, value)
     missing = [name for name in found.covariance.names if name not in found.quantities]
     if missing:

@@ -16,7 +16,6 @@ from hil.errors import ResultError, RunFolderError
 from hil.model_file import read_result
 from hil.next_step import command, only_steps, steps_of
 from hil.runs.run_folder import write_json
-from hil.toml_file import unprintable
 
 NOTE_FILE = "note.json"
 _LONGEST = 2000
@@ -109,8 +108,10 @@ def write_note(path: Path, note: Note) -> None:
     if len(note.name) > _LONGEST or len(note.text) > _LONGEST:
         raise RunFolderError(f"A name or note may have at most {_LONGEST} characters.")
     for key, value in asdict(note).items():
-        if bad := unprintable(value):
-            raise RunFolderError(f"--{key} {value!a} must not contain {bad}.")
+        if not value.isprintable():
+            raise RunFolderError(
+                f"--{key} {value!a} must not contain line breaks, tabs or other unprintable characters."
+            )
     write_json(path / NOTE_FILE, asdict(note))
 
 

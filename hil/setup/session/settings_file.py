@@ -20,8 +20,6 @@ from hil.errors import RunFolderError
 
 SCHEMA = 1
 _LONGEST_NAME = 80
-_ATTEMPTS = 3
-"""Attempts to write a file whose folder is removed meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -116,16 +114,15 @@ def forget(kept: Kept) -> None:
 def write_durably(path: Path, value: object) -> None:
     """Write a JSON file completely and flush it to disk. Raises RunFolderError.
 
-    Another thread may write the same file at the same time, and another program may remove the folder.
+    Another thread may write the file too, and another program may remove its folder.
     """
-    for left in reversed(range(_ATTEMPTS)):
+    try:
         try:
             _write(path, value)
-        except OSError as error:
-            if isinstance(error, FileNotFoundError) and left:
-                continue
-            raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
-        return
+        except FileNotFoundError:
+            _write(path, value)
+    except OSError as error:
+        raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
 
 
 def _write(path: Path, value: object) -> None:
