@@ -152,6 +152,9 @@ CAUSES: dict[str, frozenset[str]] = {
 }
 """Causes that a message may name for each fault. The host cannot distinguish a jammed joint from a dead encoder."""
 
+BESIDE: dict[str, frozenset[str]] = {Kind.RAISED_LIMIT: frozenset({SETTING, STRANGER})}
+"""What a message may say beside the cause of a stop: a change that another program did make, but that stops nothing."""
+
 _OF_FIELD = {
     "position": _READINGS | {LIMIT, POSE},
     "velocity": _READINGS | {LIMIT},
@@ -226,6 +229,11 @@ def causes_of(drawn: Drawn) -> frozenset[str]:
         is_forged = each.kind in FORGED - {Kind.SWAP, Kind.WRONG_ID}
         own.append(_OF_FIELD[each.field] if is_forged and each.field in _OF_FIELD else CAUSES[each.kind])
     return frozenset().union(*own)
+
+
+def true_beside(drawn: Drawn) -> frozenset[str]:
+    """What a message may say of these faults although none of it is the cause of a stop."""
+    return frozenset().union(*(BESIDE.get(kind, ()) for kind in drawn.kinds)) - causes_of(drawn)
 
 
 def draw(seed: object, until: float, ids: Sequence[int], often_since: float | None = None) -> Drawn:

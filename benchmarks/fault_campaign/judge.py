@@ -24,7 +24,7 @@ from benchmarks.fault_campaign.attack import (
     request_among,
     request_in,
 )
-from benchmarks.fault_campaign.draw import HARMLESS, SHIFTED, UNHEARD, WORDS, Drawn, causes_of
+from benchmarks.fault_campaign.draw import HARMLESS, SHIFTED, UNHEARD, WORDS, Drawn, causes_of, true_beside
 from benchmarks.fault_campaign.middle import Traffic
 from benchmarks.fault_campaign.twin import Heard, has_healthy_twin, may_be_wired_otherwise
 from benchmarks.fault_campaign.witness import STEP_S
@@ -260,7 +260,7 @@ def judge_words(drawn: Drawn, text: str) -> tuple[bool, bool]:
     if not right:
         return True, False  # none of the faults had to stop the run, so the message is not judged
     told = offered & right
-    return bool(told) and len(told) * 3 >= len(offered), bool(offered) and not told
+    return bool(told) and len(told) * 3 >= len(offered - true_beside(drawn)), bool(offered) and not told
 
 
 def causes_in(text: str) -> set[str]:

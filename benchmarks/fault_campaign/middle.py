@@ -155,6 +155,8 @@ class Middle(FakeSerial):
                 if byte:
                     self._take(byte)
                     continue
+            elif self._raw:
+                self._give_up_waiting()
             else:
                 clock.wait_until(until)
                 if not self.is_open or self.bus.cable_is_out:
@@ -179,6 +181,12 @@ class Middle(FakeSerial):
         for wait, data in self._changed(packet, now):
             due = max(due, now + wait)
             self._queue.append((due, data))
+
+    def _give_up_waiting(self) -> None:
+        """Pass on a packet whose rest will not come, as when a servo is silent; held back, it would seem to be late."""
+        now = self.clock.now()
+        self._queue.append((max(now, self._queue[-1][0]) if self._queue else now, bytes(self._raw)))
+        self._raw.clear()
 
     def _changed(self, packet: bytes, now: float) -> Iterator[tuple[float, bytes]]:
         """The (delay [s], bytes) pairs that a reply turns into."""

@@ -115,7 +115,8 @@ def compare(past: Any, j: int, back: int, count: int, floor: float, rounding: fl
     beyond = abs(mean) - held * then[model + 2 + j]
     if beyond <= floor:
         return 0.0
-    variance = then[model + j] + rounding * min(filter_s / seconds, 1.0)
+    # Only the filtered momenta at both ends enter the mean of a derivative: rounding inside that time cancels.
+    variance = then[model + j] + 2.0 * rounding * (filter_s / seconds) ** 2
     for i in range(count):
         own = (now[at + _ROW + i] - then[at + _ROW + i]) / seconds
         if own != 0.0:

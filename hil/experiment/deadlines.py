@@ -101,7 +101,8 @@ class Deadlines:
         """Say what the servos' watchdogs did during the gap."""
         if seconds < self._watchdog:
             return ""
-        return f" The servos' watchdogs act after {1e3 * self._watchdog:.0f} ms, so the arm had no current by then."
+        # Whether another program had disarmed them cannot be asked afterwards: cutting torque disarms them too.
+        return f" Watchdogs that were still armed had ended the current after {1e3 * self._watchdog:.0f} ms."
 
 
 def _told(seconds: float) -> str:

@@ -18,6 +18,11 @@ Successive errors may be related, so each sample is weighted by the time that it
 one of thousands of looks either: the unweighted sum must reach h = `LEAST_RATIO` too, which that of a healthy motor
 does with a probability of at most exp(-h) from any one look on.
 
+While a joint stands still, its readings may also freeze at the commanded current, and the goal may take seconds to get
+far from it. But a motor's current follows its goal: if all three readings stay exactly the same although the goals
+that they may answer to (those of the last `ANSWERS_S`) have become others, they are frozen. A constant error of the
+sensor cancels in this comparison.
+
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
 that it keeps for a joint is a record of the type `MEMORY`.
 """
@@ -29,7 +34,7 @@ import numpy as np
 
 from hil.config.joint import JointConfig
 
-__all__ = ["MEMORY", "begin", "look"]
+__all__ = ["GOALS", "MEMORY", "begin", "is_frozen", "look"]
 
 GAIN_ERROR = 0.2
 """Largest scale error of a current sensor."""
@@ -55,6 +60,23 @@ LEAST_RATIO = 10.0
 _FEWEST = 2
 """Minimum number of samples that differ from the goal, however low the rate."""
 
+ANSWERS_S, _BLOCKS = 0.03, 3
+"""A reading may answer to any goal of this time [s], which is divided into so many blocks."""
+
+_BLOCK_S = 0.99 * ANSWERS_S / _BLOCKS  # at 100 Hz, a sample is a block despite rounding errors
+
+GOALS = np.dtype(
+    [(name, "f8") for name in ("most", "carried", "same_for", "age", "lowest", "highest")]
+    + [("low", "f8", (_BLOCKS + 1,)), ("high", "f8", (_BLOCKS + 1,))]
+)
+"""Constant and state of the check for frozen readings of one joint.
+
+most: largest change of the goal under which all readings may stay the same [A or V]. carried, same_for: current, and
+how long all readings have been the same [s]. age: age of the latest block [s]. low, high: smallest and largest goal in
+each block, the latest first. lowest, highest: the smallest upper and the largest lower end of the range of goals that
+one of these readings may answer to.
+"""
+
 MEMORY = np.dtype(
     [
         *((name, "f8") for name in ("per_square", "allowed", "share", "follow_time")),
@@ -70,8 +92,8 @@ differs_for, differs: duration [s] and number of samples of a deviation.
 """
 
 
-def begin(memory: Any, joint: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
-    """Set the constants of `memory`, a zero-filled record.
+def begin(memory: Any, goals: Any, joint: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
+    """Set the constants of `memory` and `goals`, zero-filled records.
 
     planned: the joint's largest goal [A, or V under PWM]. follow_share, follow_time: the [safety] settings of the same
     names.
@@ -82,6 +104,8 @@ def begin(memory: Any, joint: JointConfig, planned: float, follow_share: float, 
     memory["allowed"] = max(follow_share * planned, ALLOWED_TICKS * tick)
     memory["share"] = follow_share
     memory["follow_time"] = follow_time
+    # An error in proportion to the goal makes the current change less; rounding hides up to one tick.
+    goals["most"] = (max(SIGMA_SHARE * planned, ALLOWED_TICKS * tick) + tick) / (1.0 - GAIN_ERROR)
 
 
 def look(memory: Any, goal: float, carried: float, seconds: float) -> float:
@@ -116,4 +140,26 @@ def look(memory: Any, goal: float, carried: float, seconds: float) -> float:
     return -1.0
 
 
-look = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(look)  # type: ignore[call-overload]
+def is_frozen(goals: Any, goal: float, carried: float, seconds: float, stands: bool) -> bool:
+    """Process a reply; return whether all readings have stayed the same although the goals have become others.
+
+    goal, carried, seconds: as for `look`. stands: whether position and velocity are exactly those of the last reply,
+    and no reply was missed in between.
+    """
+    goals.age += seconds
+    if goals.age >= _BLOCK_S:
+        for block in range(_BLOCKS, 0, -1):
+            goals.low[block], goals.high[block] = goals.low[block - 1], goals.high[block - 1]
+        goals.age, goals.low[0], goals.high[0] = 0.0, goal, goal
+    goals.low[0], goals.high[0] = min(goals.low[0], goal), max(goals.high[0], goal)
+    low, high = goals.low.min(), goals.high.max()
+    if not stands or carried != goals.carried:
+        goals.carried, goals.same_for, goals.lowest, goals.highest = carried, 0.0, high, low
+        return False
+    goals.same_for += seconds
+    goals.lowest, goals.highest = min(goals.lowest, high), max(goals.highest, low)
+    return bool(goals.highest - goals.lowest > goals.most)
+
+
+_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
+look, is_frozen = map(_inner, (look, is_frozen))

@@ -243,6 +243,7 @@ class Guard:
             self._not_followed,
             self._disagree,
             self._turns_the_wrong_way,
+            self._frozen,
         )
         said[check](index, state)
 
@@ -264,9 +265,20 @@ class Guard:
                     index,
                     Cause.EARLY_MOTION,
                     f"moved before the start: {now - first:+.3f} rad without any current; at most {EARLY_MOTION_RAD} "
-                    f"is allowed. {self._still_swings()} Otherwise check whether a hand or a cable is pushing or "
-                    "holding it, whether its horn slips, or whether another program is commanding it.",
+                    f"is allowed. {self._still_swings()} {self._else_moved(state.velocity[index])}",
                 )
+
+    def _else_moved(self, velocity: float) -> str:
+        """Return what may have moved a joint before the start if it is not swinging; velocity: its velocity [rad/s]."""
+        if abs(velocity) < self._safety.rest_velocity:
+            return (
+                f"Otherwise, since it is not moving now ({velocity:+.2f} rad/s), check its encoder and magnet, and "
+                "whether its horn has slipped or something has moved it."
+            )
+        return (
+            f"Otherwise, since it moves at {velocity:+.2f} rad/s, check whether a hand or a cable pushes or holds it, "
+            "whether its horn slips, or whether another program is commanding it."
+        )
 
     def _still_swings(self) -> str:
         """Return advice for an arm that has not come to rest."""
@@ -394,6 +406,17 @@ class Guard:
             f"{self._why_not_followed(index, state)}",
         )
 
+    def _frozen(self, index: int, state: State) -> NoReturn:
+        goals, unit = self._joints[index]["goals"], self._units[index]
+        self._stop(
+            index,
+            Cause.NOT_FOLLOWING,
+            f"has reported exactly the same position, velocity and current ({state.current[index]:.3f} {unit}) for "
+            f"{1e3 * goals['same_for']:.0f} ms, although its goal has changed by more than {goals['most']:.3f} {unit}: "
+            "its readings are frozen, its torque is off, or its goals do not arrive. Check the servo, and whether a "
+            "device between adapter and servo repeats its replies.",
+        )
+
     def _out_of_voltage(self, index: int, goal: float, carried: float, velocity: float) -> NoReturn:
         unit = self._units[index]
         self._stop(
@@ -517,7 +540,7 @@ def _joint_records(config: Config, planned: Sequence[float], left_by_a_run: bool
         record["may_start_outside"] = left_by_a_run
         record["is_followed"] = not _measures_supply(joint)
         record["is_worked"] = config.stabiliser is None
-        following.begin(record["following"], joint, peak, safety.follow_share, safety.follow_time)
+        following.begin(record["following"], record["goals"], joint, peak, safety.follow_share, safety.follow_time)
         work.begin(record["work"], joint.torque_per_goal, peak)
     return joints
 

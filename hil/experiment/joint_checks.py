@@ -1,8 +1,9 @@
 """Checks of every joint in every exchange, in one compiled loop because there is little time between samples.
 
 They are, in this order: a jump of the position, the limits of position and velocity, whether the motor carries the
-commanded current (`following`), whether position and velocity agree (`consistency`), and whether the motor turns as
-commanded (`work`). Everything known about a joint is in one record of the type `JOINT`.
+commanded current (`following`), whether position and velocity agree (`consistency`), whether the motor turns as
+commanded (`work`), and whether all readings are frozen although the goal changes (`following` again). Everything known
+about a joint is in one record of the type `JOINT`.
 """
 
 from collections.abc import Callable
@@ -17,8 +18,8 @@ from hil.estimator.compiled import compiled, only_version
 from hil.experiment import consistency, following, work
 
 FINE = -1
-CHECKS = 6
-JUMP, POSITION, VELOCITY, FOLLOWING, CONSISTENCY, WORK = range(CHECKS)
+CHECKS = 7
+JUMP, POSITION, VELOCITY, FOLLOWING, CONSISTENCY, WORK, FROZEN = range(CHECKS)
 
 JUMP_ALLOWANCE_RAD = 0.01
 """Allowance for rounding and the noise of a worn encoder [rad]."""
@@ -45,6 +46,7 @@ JOINT = np.dtype(
         *((name, "f8") for name in ("position", "seen_at", "found_outside")),
         *((name, "f8") for name in ("moved", "seconds", "most", "found")),
         ("following", following.MEMORY),
+        ("goals", following.GOALS),
         ("consistency", consistency.MEMORY),
         ("work", work.MEMORY),
     ],
@@ -138,6 +140,7 @@ def _fault(
     if not -joint.fastest <= velocity <= joint.fastest:
         return VELOCITY
     joint.position, joint.seen_at = position, now
+    stands = position == former and velocity == joint.consistency.velocity and missed == 0
     if joint.is_followed:
         joint.found = following.look(joint.following, goal, current, seconds)
         if joint.found >= 0.0:
@@ -153,6 +156,8 @@ def _fault(
         joint.found = work.look(joints, index, goal, joint.moved if is_known else 0.0)
         if joint.found >= 0.0:
             return WORK
+    if joint.is_followed and following.is_frozen(joint.goals, goal, current, seconds, stands):
+        return FROZEN
     return FINE
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from hil.config.joint import JointConfig
 from hil.drivers.state import State
 from hil.experiment import following
-from hil.experiment.joint_checks import CONSISTENCY, FINE, FOLLOWING, JOINT, JointChecks
+from hil.experiment.joint_checks import CONSISTENCY, FINE, FOLLOWING, FROZEN, JOINT, JointChecks
 
 ANY = 1e9
 """A limit that is never reached."""
@@ -48,7 +48,9 @@ class Following:
     def __init__(self, config: JointConfig, planned: float, follow_share: float, follow_time: float) -> None:
         self._joint = _joint()
         self._joint["is_followed"] = True
-        following.begin(self._joint[0]["following"], config, planned, follow_share, follow_time)
+        following.begin(
+            self._joint[0]["following"], self._joint[0]["goals"], config, planned, follow_share, follow_time
+        )
         self._checks = JointChecks(self._joint, ANY)
 
     def look(self, goal: float, carried: float, seconds: float) -> float | None:
@@ -58,3 +60,14 @@ class Following:
         found = self._checks.look(_state(0.0, goal=goal, current=carried), 0.0)
         assert found in (FINE, FOLLOWING)
         return float(self._joint["found"][0]) if found == FOLLOWING else None
+
+    def froze(self, goal: float, carried: float, seconds: float, position: float = 0.0) -> bool:
+        """Process a reply, `seconds` after the previous one; return whether its readings are frozen."""
+        self._joint["seen_at"] = 0.0
+        self._checks.interval = seconds
+        return self._checks.look(_state(0.0, position, goal=goal, current=carried), 0.0) == FROZEN
+
+    @property
+    def most_under_same(self) -> float:
+        """Largest change of the goal under which all readings may stay the same [A or V]."""
+        return float(self._joint["goals"]["most"][0])

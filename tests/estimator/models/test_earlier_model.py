@@ -54,7 +54,7 @@ def limit(back: int, lessons: int = 40, velocity: float = 1.0, stands: float = 0
         row @ COVARIANCE @ row
         + ((earlier_model.RELATIVE_STD * row * THETA) ** 2).sum()
         + NOISE
-        + ROUNDING * FILTER_S / seconds
+        + 2.0 * ROUNDING * (FILTER_S / seconds) ** 2
     )
     held = max(stands, np.exp(-velocity * seconds / earlier_model.ELASTIC_RAD))
     return float(earlier_model.TIMES * np.sqrt(variance) + held * FRICTION)

@@ -184,7 +184,7 @@ CASES: list[tuple[str, int, str]] = [
     ("identify millimetres.toml", 2, "If it is in mm"),
     ("estimate page.csv", 2, "page.csv cannot be read: it is HTML, XML or JSON"),
     ("estimate lines.csv", 2, "lines.csv cannot be read: it is HTML, XML or JSON"),
-    ("estimate long.csv", 2, "long.csv, line 102: more than 131,072 characters, too many for a row of a table."),
+    ("estimate long.csv", 2, "long.csv, line 102: 131072 characters are the most that can be read."),
     ("estimate zip.csv", 2, "a binary one"),
     ("estimate milliseconds.csv", 2, "Is time in seconds?"),
     ("estimate no_numbers.csv", 2, "no numbers"),

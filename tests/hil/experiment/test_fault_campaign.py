@@ -34,11 +34,11 @@ PARTS = 2
 
 NAMED = 0.95
 
-UNSAFE = frozenset({("first_time", 400, "pushed and slow_replies"), ("paper_two_link", 100, "pushed")})
+UNSAFE = frozenset({("first_time", 400, "pushed and slow_replies")})
 """Draws known to be unsafe, by configuration, rate [Hz] and faults; the aim is none.
 
-Both are forces on arms whose masses are unknown. One acts from the moment at which torque is switched on, and is learnt
-as part of the arm; the other is found after 0.13 s instead of 0.1 s (docs/safety.md).
+A force on an arm whose masses are unknown that acts from the first torque on, in proportion to it: it is learnt as part
+of the arm, all of whose parameters stay within two standard deviations of what is known beforehand (docs/safety.md).
 """
 
 RATES_IN_TURN = ((100, 1000), (100, 400), (20, 400))
@@ -129,6 +129,17 @@ def test_a_motor_that_is_turned_round_brakes_itself_as_any_motor_does(mode: int,
     witness.disturb(0, Attack(Kind.WEAK, 1.0, 2.0, amount=-1.0))
     assert witness._driven_by((-0.3,), 1.5) == pytest.approx([felt])
     assert witness.current == pytest.approx((sensed,))
+
+
+def test_a_message_may_also_name_a_harmless_change_but_not_only_that() -> None:
+    late = Attack(Kind.SPLIT, 1.0, 2.0, amount=0.03)
+    drawn = Drawn((Attack(Kind.RAISED_LIMIT, 0.5, 0.5), late), ())
+    changed = (
+        "Another program changed the settings of a servo during the run (joint 2: Current Limit is 480 and was 240)."
+    )
+    cause = "missed 6 replies in a row. Check the adapter and whether other programs keep this computer busy."
+    assert judge_words(drawn, f"{cause} {changed}") == (True, False)
+    assert judge_words(drawn, changed) == (False, True), "it is true, but not why the run was stopped"
 
 
 def test_a_healthy_twin_is_found_for_a_healthy_arm_and_a_stuck_one_but_not_for_one_that_freezes_in_motion() -> None:

@@ -4,12 +4,14 @@ import math
 from collections.abc import Callable
 from random import Random
 
+import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config, load_config
+from hil.experiment.following import GOALS, MEMORY, begin, is_frozen
 from tests.support.one_joint import Following
 from tests.support.paths import CONFIGS
 
@@ -204,3 +206,59 @@ def test_a_reply_may_be_measured_before_or_after_the_motor_has_the_goal() -> Non
     follow = following()
     for number in range(60):
         assert follow.look(0.5 if number % 2 else -0.5, 0.4 if number % 4 < 2 else -0.4, STEP) is None
+
+
+@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("turns", [False, True])
+def test_readings_that_stay_the_same_while_their_goal_becomes_another_are_frozen(
+    name: str, rate: int, turns: bool
+) -> None:
+    """The goal grows slowly. While the joint turns, another check has to judge."""
+    config, planned = joints(name)[0]
+    follow, start, slope = Following(config, planned, 1.0, 9.0), 0.2 * planned, 0.2 * planned
+    for index in range(2 * rate):
+        goal = start + slope * index / rate
+        if follow.froze(goal, start, 1 / rate, 0.001 * (index % 2) * turns):
+            break
+    assert (index == 2 * rate - 1) == turns
+    if not turns:
+        # Once for the first reading, once for the latest one, and less than a block each.
+        waited = 2 * slope * max(0.045, 4 / rate)
+        assert follow.most_under_same < goal - start < follow.most_under_same + waited < 0.2 * planned
+
+
+@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("rate", RATES)
+def test_a_step_of_the_goal_after_a_rest_that_a_reply_cannot_show_yet_is_no_sign_of_frozen_readings(
+    name: str, rate: int
+) -> None:
+    """A servo may take up to 30 ms, or until the next reply, to follow."""
+    config, planned = joints(name)[0]
+    follow, late = Following(config, planned, 1.0, 9.0), max(1, round(0.029 * rate))
+    goals = [0.0] * rate + [planned] * rate + [0.3 * planned] * rate + [-planned, planned] * late + [0.0] * rate
+    for index, goal in enumerate(goals):
+        assert not follow.froze(goal, goals[max(0, index - late)], 1 / rate)
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("gain", [0.8, 1.0, 1.2])
+def test_a_current_that_follows_in_ticks_is_not_frozen(rate: int, gain: float) -> None:
+    """Without noise, with an error in proportion to the goal and hardly any current below three ticks."""
+    config, planned = joints("xm430_two_link")[0]
+    follow, tick = Following(config, planned, 1.0, 9.0), 2.69e-3
+    for share in (1.0, 0.1, 0.02):
+        for index in range(4 * rate):
+            goal = share * planned * math.sin(2.0 * index / rate)
+            sensed = round(gain * goal / tick)
+            assert not follow.froze(goal, tick * sensed * (abs(sensed) > 2), 1 / rate)
+
+
+def test_after_a_missed_reply_the_readings_begin_anew() -> None:
+    config, planned = joints("xm430_two_link")[0]
+    goals = np.zeros(1, GOALS)
+    begin(np.zeros(1, MEMORY)[0], goals[0], config, planned, 0.3, 0.05)
+    for index in range(100):
+        goal = 0.5 * planned * index / 100
+        found = is_frozen(goals[0], goal, 0.1, 0.01, index % 20 > 0)
+        assert not found

@@ -295,6 +295,21 @@ def test_a_current_that_does_not_follow_is_off_or_that_of_another(arm: Arm, carr
     assert ("torque is off" in str(stop.value)) == (carried == 0.0)
 
 
+@pytest.mark.parametrize("moves", [0.0, 0.002])
+def test_readings_that_stay_the_same_under_other_goals_are_frozen(arm: Arm, moves: float) -> None:
+    """At first they answer to the goal, which then rises by less than may be missing from a healthy motor's current."""
+    guard, said = Guard(arm(), PLANNED), ""
+    try:
+        for n in range(400):
+            goal, angle = 0.1 + 0.2 * n / 400, moves * (n % 2)
+            guard.look(at(n, STILL._replace(goal_current=(0.0, goal), current=(0.0, 0.1), position=(-1.57, angle))))
+    except SafetyStop as stop:
+        assert stop.cause is Cause.NOT_FOLLOWING
+        said = str(stop)
+    wanted = "exactly the same position, velocity and current (0.100 A) for 318 ms, although its goal has changed by"
+    assert (wanted in said) == (moves == 0.0), said
+
+
 def test_late_deadlines_and_a_gap_that_trips_watchdogs(arm: Arm) -> None:
     guard = Guard(arm())
     for _ in range(20):
@@ -343,6 +358,17 @@ def test_motion_before_the_start(arm: Arm) -> None:
         with pytest.raises(SafetyStop, match=rf"'elbow' \(ID 2.*moved before the start: \+0\.060.*{advice}") as stop:
             guard.look_at_rest(STILL._replace(position=(-1.57, 0.06)))
         assert stop.value.cause is Cause.EARLY_MOTION
+
+
+@pytest.mark.parametrize(("velocity", "said"), [(0.02, "encoder and magnet"), (-0.2, "a hand or a cable pushes")])
+def test_a_joint_that_is_elsewhere_before_the_start_has_jumped_unless_it_moves(
+    arm: Arm, velocity: float, said: str
+) -> None:
+    guard = Guard(arm())
+    guard.rests_at(STILL.position)
+    with pytest.raises(SafetyStop) as stop:
+        guard.look_at_rest(STILL._replace(position=(-1.57, 1.57), velocity=(0.0, velocity)))
+    assert said in str(stop.value) and f"{velocity:+.2f} rad/s" in str(stop.value)
 
 
 def test_motion_that_does_not_repeat_may_need_less_torque(arm: Arm) -> None:
