@@ -23,9 +23,8 @@ def _quoted(word: str) -> str:
     """Quote a word, as $'...' (bash) if it has characters that cannot be printed."""
     if word.isprintable():
         return shlex.quote(word)
-    plain = bytes(range(32, 127)).translate(None, b"\\'")
-    shown = "".join(chr(byte) if byte in plain else f"\\x{byte:02x}" for byte in os.fsencode(word))
-    return f"$'{shown}'"
+    # Python writes bytes in the same way, in single quotes if a double one is among them.
+    return "$" + repr(os.fsencode(word) + b'"')[1:-2] + "'"
 
 
 def steps_of(path: Path) -> list[Path]:

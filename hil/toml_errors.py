@@ -10,8 +10,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hil.unit_hints import allowed_by, in_other_units, unit_of
 
-_LEAST_GUESSED = 5  # characters
-
 UNSAID = "~"
 """Prefix of the alternatives' names that pydantic adds to a location although the file does not contain them."""
 
@@ -215,7 +213,7 @@ def meant_name(given: str, names: Sequence[str]) -> str:
     """
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
     bare = re.sub(r"[^a-z0-9]", "", given.lower())
-    long = [name for name in plain if len(name) >= _LEAST_GUESSED]
+    long = [name for name in plain if len(name) > 4]
     near = [bare] if bare in plain else difflib.get_close_matches(bare, long, n=1, cutoff=0.75)
     return plain[near[0]] if near else ""
 
@@ -232,7 +230,7 @@ def _in_thousands(expected: str, value: object) -> str:
 
 
 def _bound(value: float) -> str:
-    """Write 12.566370614359172 as 12.57, 0.000001 as 1e-06, and leave 100, 0.05 and whole numbers as they are."""
+    """Write 12.566370614359172 as 12.57 and leave 100, 0.05 and whole numbers as they are."""
     return f"{value:.4g}" if isinstance(value, float) and len(str(value)) > 9 else str(value)
 
 

@@ -83,7 +83,6 @@ class Identification(SettledResult):
 
         Raises:
             ExportError: the format cannot hold this arm, or a package for it is not installed.
-            TypeError: `kind` is not a string.
         """
         from hil.export.formats import export
 

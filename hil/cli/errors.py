@@ -63,8 +63,8 @@ class Command(TyperCommand):
         try:
             return super().parse_args(ctx, args)
         except typer.BadParameter as error:
-            cause: Any = error.__cause__
-            if hasattr(cause, "errors"):  # pydantic's
+            cause: Any = error.__cause__  # pydantic's
+            if cause:
                 from hil.toml_errors import what_is_wrong
 
                 detail = cause.errors()[0]

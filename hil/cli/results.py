@@ -5,15 +5,12 @@ The modules that do the work are imported inside the commands, as in hil.cli.app
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from hil.cli.options import RunPath
 from hil.cli.verbosity import is_quiet
-
-if TYPE_CHECKING:
-    from hil.report.chart import Figure
 
 
 def report(
@@ -31,7 +28,7 @@ def report(
     """Write the report of a run: one self-contained HTML page with verdict, parameters and figures."""
     from hil.cli.views.result_table import what_next
     from hil.model_file import read_result
-    from hil.report.pictures import save_pictures
+    from hil.report.pictures import figures_of, save_pictures
 
     print(write_report(run, out))
     shown = [] if png is None and svg is None else figures_of(run)
@@ -94,13 +91,3 @@ def write_report(run: Path, out: Path | None = None) -> Path:
     path = out or run / page.FILE_NAME
     page.write_report(RunData.load(run), path)
     return path
-
-
-def figures_of(run: Path) -> "list[Figure]":
-    """The figures of a run's report."""
-    from hil.report.pictures import figures
-    from hil.report.recording_page import recording_figures
-    from hil.report.run_data import RunData
-    from hil.runs.recording_folder import is_recording_folder
-
-    return recording_figures(run) if is_recording_folder(run) else figures(RunData.load(run))

@@ -16,8 +16,7 @@ from hil.dry_run.stopping_distance import Stopping, Way
 from hil.estimator.selection.verdict import percent
 from hil.printing import print_fitting, say
 
-_NOTHING_RAD = 0.005
-"""An overshoot below this is practically none; two decimals would show it as 0.00 rad."""
+_NOTHING_RAD = 0.005  # two decimals would show 0.00 rad
 
 
 @dataclass(frozen=True)

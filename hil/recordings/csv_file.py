@@ -1,7 +1,6 @@
 """CSV files as written by other programs: any delimiter, decimal commas, byte order mark, comments, a line of units."""
 
 import csv
-import re
 from datetime import datetime
 from pathlib import Path
 
@@ -13,26 +12,23 @@ from hil.recordings.units import unit_of
 from hil.runs.file_size import MOST_CSV_BYTES
 
 _REMARKS = ("#", "%", "//")
-_ANNOUNCED = re.compile(r'\s*"?sep=(.)"?\s*', re.IGNORECASE)
-"""A first line that names the delimiter, as Excel reads and writes it."""
-_NO_TABLE = re.compile(r'\s*(<(!|\?xml|html|table)|\{|\[\s*[\[{"\d-])', re.IGNORECASE)
 
 
 def read_csv_table(path: Path) -> Table:
     """Read the table in `path`. Raises CsvError. An empty field or `nan` is a missing value."""
     text = _text(path)
-    if _NO_TABLE.match(text):
+    if text.lstrip().startswith(("<!", "<?", "<html", "{", "[{")):
         raise CsvError(f"{path} cannot be read: it is HTML, XML or JSON. Export the data as CSV.")
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
     if long := [number for number, line in lines if len(line) > csv.field_size_limit()]:
         raise CsvError(f"{path}, line {long[0]}: {csv.field_size_limit()} characters are the most that can be read.")
     remarks = [line for _, line in lines if line.lstrip().startswith(_REMARKS)]
     rows = [(number, line) for number, line in lines if not line.lstrip().startswith(_REMARKS)]
-    announced = _ANNOUNCED.fullmatch(rows[0][1]) if rows else None
+    announced = rows[0][1][4:5] if rows and rows[0][1].lower().startswith("sep=") else ""  # as Excel writes it
     rows = rows[1:] if announced else rows
     if not rows:
         raise CsvError(f"{path} is empty; it needs a header line and at least one line of numbers.")
-    delimiter = announced[1] if announced else _delimiter([line for _, line in rows])
+    delimiter = announced or _delimiter([line for _, line in rows])
     header, rows = _header(path, rows, remarks, delimiter)
     double = {name for name in header if header.count(name) > 1}
     if double:

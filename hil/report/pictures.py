@@ -7,8 +7,10 @@ from hil.errors import RunFolderError
 from hil.report.chart import Figure
 from hil.report.page import figures_in, sections
 from hil.report.png import save_png
+from hil.report.recording_page import recording_figures
 from hil.report.run_data import RunData
 from hil.report.svg import WIDE, draw_svg
+from hil.runs.recording_folder import is_recording_folder
 
 
 def save_pictures(shown: Sequence[Figure], folder: Path, kind: str) -> list[Path]:
@@ -31,3 +33,8 @@ def save_pictures(shown: Sequence[Figure], folder: Path, kind: str) -> list[Path
 def figures(data: RunData) -> list[Figure]:
     """All figures of the report, in order."""
     return figures_in(sections(data))
+
+
+def figures_of(run: Path) -> list[Figure]:
+    """All figures of the report of a run, or of an estimate from other tools' recordings."""
+    return recording_figures(run) if is_recording_folder(run) else figures(RunData.load(run))
