@@ -23,7 +23,7 @@ def _quoted(word: str) -> str:
     """Quote a word, as $'...' (bash) if it has characters that cannot be printed."""
     if word.isprintable():
         return shlex.quote(word)
-    # Python writes bytes in the same way, in single quotes if a double one is among them.
+    # Python writes bytes alike, and in single quotes if a double one is among them.
     return "$" + repr(os.fsencode(word) + b'"')[1:-2] + "'"
 
 

@@ -58,7 +58,6 @@ def estimate(
         ConfigError: `config` is wrong.
         RecordingCutShort: the run holds no settled period; `all_samples` does not need one.
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
-        TypeError: an argument is of the wrong type.
         ValueError: run folders and other recordings are mixed, or there are several run folders.
     """
     tell = forgiving(on_progress)
@@ -84,7 +83,6 @@ def estimate(
 
 
 def _paths(recording: Any) -> list[Path]:
-    """The paths that the argument of `estimate` gives. Raises TypeError."""
     if isinstance(recording, Run):
         return [recording.path]
     try:

@@ -44,7 +44,7 @@ def forgiving(listener: OnProgress) -> OnProgress:
     """Wrap a callback so that its first exception is logged and it is not called again.
 
     A StopRequested or KeyboardInterrupt raised during the callback (Ctrl-C, for example) does not count as its failure
-    and is passed on, the latter to the main thread. Raises TypeError if the listener cannot be called.
+    and is passed on.
     """
     if not callable(listener):
         raise TypeError(f"on_progress must be a function of one Progress, not {listener!r}.")

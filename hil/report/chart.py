@@ -11,7 +11,6 @@ Array = NDArray[np.float64]
 # Okabe and Ito's colours, distinguishable for colour-blind readers.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8a8f98"
 OF_JOINTS = (BLUE, ORANGE, GREEN, "#CC79A7", "#56B4E9", "#E69F00", GREY)
-"""One colour for each joint of the longest arm, from the base outwards."""
 
 Kind = Literal["line", "broad", "dashed", "points", "dots", "area", "steps"]
 
