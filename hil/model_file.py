@@ -35,6 +35,11 @@ def _read(path: Path) -> dict[str, Any]:
     except TomlFileError as error:
         raise ResultError(f"{error}\nRecreate it with hil export RUN --format toml.") from error
     except (ValueError, RecursionError) as error:
+        if file.suffix.lower() != ".json":
+            raise ResultError(
+                f"{file} is not a model file of hil. Give a run folder, its result.json, or the TOML or JSON file of "
+                "hil export."
+            ) from error
         raise ResultError(f"{file} is incomplete or damaged: {error}. Recreate it with hil estimate RUN.") from error
     if not isinstance(result, dict) or "schema" not in result:
         raise ResultError(f"{file} is not a result file of hil: it has no schema.")

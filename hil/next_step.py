@@ -1,5 +1,6 @@
 """The command to type next: from `hil scan` to `hil export`, each command names its successor in its last line."""
 
+import os
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +16,15 @@ def next_step(*words: object) -> str:
 
 def command(*words: object) -> str:
     """A `hil` command as typed in a shell, with every word quoted that the shell would split or expand."""
-    return shlex.join(["hil", *map(str, words)])
+    return " ".join(["hil", *(_quoted(str(word)) for word in words)])
+
+
+def _quoted(word: str) -> str:
+    """Quote a word, as $'...' (bash) if it has characters that cannot be printed."""
+    if word.isprintable():
+        return shlex.quote(word)
+    # Python writes bytes alike, and in single quotes if a double one is among them.
+    return "$" + repr(os.fsencode(word) + b'"')[1:-2] + "'"
 
 
 def steps_of(path: Path) -> list[Path]:

@@ -17,6 +17,8 @@ _EXPECTED = {
     "float_type": "must be a number",
     "int_type": "must be a whole number",
     "int_from_float": "must be a whole number",
+    "int_parsing": "must be a whole number",
+    "float_parsing": "must be a number",
     "bool_type": "must be true or false",
     "string_type": "must be text in quotes",
     "list_type": "must be a list [...]",
@@ -114,9 +116,16 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
         # The message about a whole table already names its keys.
         about = key if isinstance(detail["input"], dict | BaseModel) else f"{key} = {_shown(detail['input'])}"
         return f"{about}: {context['error']}" if key else str(context["error"])
-    message = _exact_length(detail, root) or _EXPECTED.get(kind) or _constraint(kind, context, detail["input"])
-    message = message or str(detail["msg"])
+    message = _exact_length(detail, root) or what_is_wrong(detail)
     return f"{key} = {_shown(detail['input'])}: {message}{_unit_hint(detail, root)}{_brackets_hint(key, detail)}"
+
+
+def what_is_wrong(detail: Any) -> str:
+    """Say what a value must be, for one of pydantic's errors."""
+    kind, value = detail["type"], detail["input"]
+    if kind in _BOUNDS and str(value).lower() in ("nan", "inf", "-inf"):
+        kind = "finite_number"
+    return _EXPECTED.get(kind) or _constraint(kind, detail.get("ctx", {}), value) or str(detail["msg"])
 
 
 def _exact_length(detail: Any, root: type[BaseModel]) -> str:
@@ -200,10 +209,12 @@ def _meant(value: object, expected: str) -> str:
 
 def meant_name(given: str, names: Sequence[str]) -> str:
     """Return the intended name: the same except for case, spaces and dashes, or the most similar one; "" if none is
-    similar.
+    similar. Short names are not similar: grad is not rad.
     """
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
-    near = difflib.get_close_matches(re.sub(r"[^a-z0-9]", "", given.lower()), list(plain), n=1, cutoff=0.75)
+    bare = re.sub(r"[^a-z0-9]", "", given.lower())
+    long = [name for name in plain if len(name) > 4]
+    near = [bare] if bare in plain else difflib.get_close_matches(bare, long, n=1, cutoff=0.75)
     return plain[near[0]] if near else ""
 
 
@@ -219,8 +230,8 @@ def _in_thousands(expected: str, value: object) -> str:
 
 
 def _bound(value: float) -> str:
-    """Write 12.566370614359172 as 12.57 and leave 100 and 0.05 as they are."""
-    return f"{value:.4g}" if len(str(value)) > 9 else str(value)
+    """Write 12.566370614359172 as 12.57 and leave 100, 0.05 and whole numbers as they are."""
+    return f"{value:.4g}" if isinstance(value, float) and len(str(value)) > 9 else str(value)
 
 
 def _key(location: Sequence[str | int]) -> str:

@@ -19,6 +19,11 @@ def load_toml(path: Path) -> dict[str, Any]:
     return parse_toml(read_toml_text(path), path)
 
 
+def shortened(path: str) -> str:
+    """A path, or the beginning of one that is too long for a message."""
+    return path if len(path) <= 80 else f"{path[:80]}..."
+
+
 def read_toml_text(path: Path) -> str:
     """The text of a file, without a byte order mark. Raises TomlFileError."""
     try:
@@ -27,6 +32,8 @@ def read_toml_text(path: Path) -> str:
         raise TomlFileError(f"{path} cannot be read: it is {_encoding_of(path, error)}.") from error
     except OSError as error:
         raise TomlFileError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except ValueError as error:
+        raise TomlFileError(f"{str(path)!r} cannot be read: {error}.") from error
 
 
 def parse_toml(text: str, path: Path) -> dict[str, Any]:

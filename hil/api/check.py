@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.api.configuration import ConfigLike, loaded
-from hil.api.progress import OnProgress, Progress, ignore
+from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.results.display import html_table
 from hil.setup.preflight import Finding, Level, check_arm
 
@@ -71,5 +71,5 @@ def check(config: ConfigLike, *, on_progress: OnProgress = ignore) -> CheckRepor
         ConfigError: the configuration is wrong.
     """
     checked, shown = loaded(config)
-    on_progress(Progress("check", "Checking the arm"))
+    forgiving(on_progress)(Progress("check", "Checking the arm"))
     return CheckReport(shown, tuple(check_arm(checked)))

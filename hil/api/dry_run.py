@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.api.configuration import ConfigLike, loaded
-from hil.api.progress import OnProgress, Progress, ignore
+from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.config.schema import Config
 from hil.dry_run.chain_summary import ChainDryRun, chain_dry_run_json
 from hil.dry_run.prediction import Prediction, quantities_of
@@ -127,7 +127,8 @@ def dry_run(
         hil.drivers.errors.DriverError: `servos` is true and the servos do not answer.
     """
     checked, shown = loaded(config)
-    on_progress(Progress("simulation", "Simulating"))
+    report = forgiving(on_progress)
+    report(Progress("simulation", "Simulating"))
     former = None if result is None else Path(result)
     if checked.is_chain:
         if former is not None:
@@ -137,11 +138,11 @@ def dry_run(
 
         def tell(done: int, of: int) -> None:
             if done % max(1, of // 20) == 0:
-                on_progress(Progress("simulation", f"Simulated {done} of {of} motions"))
+                report(Progress("simulation", f"Simulated {done} of {of} motions"))
 
         def designing(done: int, of: int) -> None:
             if done % max(1, of // 4) == 0:
-                on_progress(Progress("simulation", f"Designing a path: {done} of {of} steps"))
+                report(Progress("simulation", f"Designing a path: {done} of {of} steps"))
 
         return Rehearsal(shown, checked, rehearse(checked, arms, servos, tell, designing))
     rehearsed = rehearse_in_steps if checked.experiment.pilot else simulate

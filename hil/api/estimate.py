@@ -6,9 +6,10 @@ from contextlib import ExitStack, suppress
 from datetime import datetime
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from hil.api.experiment import unused_path, write_run_report
-from hil.api.progress import OnProgress, Progress, ignore
+from hil.api.progress import OnProgress, Progress, forgiving, ignore
 from hil.api.run import Estimation, Identification, Run, estimation, identification
 from hil.errors import RecordingCutShort
 from hil.estimation.settled_estimate import estimate_run
@@ -59,23 +60,19 @@ def estimate(
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
         ValueError: run folders and other recordings are mixed, or there are several run folders.
     """
-    if isinstance(recording, Run):
-        paths = [recording.path]
-    elif isinstance(recording, str | PathLike):
-        paths = [Path(recording)]
-    else:
-        paths = [Path(each) for each in recording]
+    tell = forgiving(on_progress)
+    paths = _paths(recording)
     if are_recordings(paths):
-        on_progress(Progress("estimation", "Estimating by multiple shooting"))
+        tell(Progress("estimation", "Estimating by multiple shooting"))
         return _from_files(paths, None if config is None else Path(config), out)
     if is_recording_folder(paths[0]):
-        on_progress(Progress("estimation", "Estimating by multiple shooting"))
+        tell(Progress("estimation", "Estimating by multiple shooting"))
         return _again(paths[0])
     run = RunFolder.open(paths[0])
     if all_samples:
-        on_progress(Progress("estimation", "Estimating by multiple shooting"))
+        tell(Progress("estimation", "Estimating by multiple shooting"))
         return estimation(estimate_unsettled(run), run.path)
-    on_progress(Progress("estimation", "Estimating"))
+    tell(Progress("estimation", "Estimating"))
     try:
         result = estimate_run(run, executor)
     except RecordingCutShort as error:
@@ -83,6 +80,15 @@ def estimate(
         raise
     write_run_report(run)
     return identification(result, run.path)
+
+
+def _paths(recording: Any) -> list[Path]:
+    if isinstance(recording, Run):
+        return [recording.path]
+    try:
+        return [Path(each) for each in ([recording] if isinstance(recording, str | PathLike) else recording)]
+    except TypeError:
+        raise TypeError(f"recording must be a run folder, a Run, or recordings, not {recording!r}.") from None
 
 
 def are_recordings(paths: Sequence[Path]) -> bool:

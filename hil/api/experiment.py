@@ -56,7 +56,7 @@ def identify(
             the prior is used.
         on_progress: called with a `Progress` about 20 times a second while the arm moves; on a real bus, in a separate
             thread. It cannot disturb the experiment: reports that arrive too fast are dropped. If it raises, the
-            exception is logged and it is not called again.
+            exception is logged and it is not called again; a KeyboardInterrupt stops the run.
 
     Returns:
         The result, with the run folder as `run`. The report is in that folder too.
@@ -72,9 +72,9 @@ def identify(
     checked, shown = loaded(config)
     if take_over:
         checked = _taking_over(checked)
+    tell = forgiving(on_progress)
     earlier = None if start_from is None else _earlier(checked, shown, Path(start_from))
     run = new_run_folder(checked, shown, out)
-    tell = forgiving(on_progress)
 
     def watch(stream: StreamProgress) -> None:
         tell(Progress("experiment", stream=stream))
@@ -117,8 +117,8 @@ def record(
             f"{shown}: with experiment.pilot = true, each step's torque depends on the previous step's estimate, which "
             "only `hil identify` makes. To record only, set experiment.peak_torque and pilot = false."
         )
-    run = new_run_folder(checked, shown, out)
     tell = forgiving(on_progress)
+    run = new_run_folder(checked, shown, out)
     with _discarding(run, "record", shown):
         _tell_doubts(checked, tell)
         torque = run_experiment(checked, run, shown, lambda stream: tell(Progress("experiment", stream=stream)))

@@ -1,6 +1,8 @@
 """Progress reports of long-running functions."""
 
+import _thread
 import logging
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -41,9 +43,12 @@ OnProgress = Callable[[Progress], None]
 def forgiving(listener: OnProgress) -> OnProgress:
     """Wrap a callback so that its first exception is logged and it is not called again.
 
-    A StopRequested raised during the callback (Ctrl-C, for example) does not count as its failure and is passed on.
+    A StopRequested or KeyboardInterrupt raised during the callback (Ctrl-C, for example) does not count as its failure
+    and is passed on.
     """
-    failed = False
+    if not callable(listener):
+        raise TypeError(f"on_progress must be a function of one Progress, not {listener!r}.")
+    owner, failed = threading.current_thread(), False
 
     def tell(progress: Progress) -> None:
         nonlocal failed
@@ -53,7 +58,12 @@ def forgiving(listener: OnProgress) -> OnProgress:
             listener(progress)
         except StopRequested:
             raise
-        except Exception:
+        except KeyboardInterrupt:
+            if threading.current_thread() is owner:
+                raise
+            failed = True
+            _thread.interrupt_main()
+        except (Exception, SystemExit):
             failed = True
             log.exception("on_progress raised an exception; it will not be called again")
 

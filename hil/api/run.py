@@ -86,6 +86,8 @@ class Identification(SettledResult):
         """
         from hil.export.formats import export
 
+        if not isinstance(kind, str):
+            raise TypeError(f'kind must be the name of one format, such as "urdf", not {kind!r}.')
         return export(self.run, kind, None if out is None else Path(out), link_length)
 
 
@@ -112,7 +114,7 @@ class Estimation(ShootingResult):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Run:
-    """A recorded run.
+    """A recorded run. It holds arrays and so is equal only to itself: compare `result` instead.
 
     config: the configuration, with the experiment that was actually run. record: the contents of run.json. samples:
     every sample taken (dtype: hil.runs.recording.sample_type). events: pairs (time on the port's clock [s], what

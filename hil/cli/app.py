@@ -15,7 +15,8 @@ import typer
 
 from hil import __version__
 from hil.cli import bus, data, dry_run, experiment, fake_command, init, results, runs, schema, study
-from hil.cli.errors import exit_code, message, stop_behind
+from hil.cli.errors import Command, exit_code, message, stop_behind
+from hil.cli.output import readable_output, require_output
 from hil.cli.stopped import same_again
 from hil.cli.verbosity import with_verbosity
 from hil.errors import StopRequested
@@ -40,7 +41,7 @@ def _root(
 ) -> None:
     del allow_code  # handled in main, wherever it appeared on the command line
     if version:
-        print(f"hil {__version__}")
+        print(f"hil {__version__}", flush=True)
         raise typer.Exit
 
 
@@ -92,7 +93,7 @@ def _code_as_asked() -> Iterator[None]:
 
 
 for _name, (_command, _example) in COMMANDS.items():
-    app.command(_name, epilog=f"Example: hil {_name} {_example}")(with_verbosity(_command))
+    app.command(_name, cls=Command, epilog=f"Example: hil {_name} {_example}")(with_verbosity(_command))
 
 
 @cache
@@ -114,8 +115,9 @@ def _one_blas_thread() -> None:
 def main() -> NoReturn:
     """Run the command line; turn an expected error into a message on standard error and an exit code."""
     _one_blas_thread()
+    require_output()
     try:
-        with _code_as_asked():
+        with _code_as_asked(), readable_output():
             _built()()
     except Exception as raised:
         error = stop_behind(raised) or raised

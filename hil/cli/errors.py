@@ -1,13 +1,18 @@
 """Conversion of exceptions to messages and exit codes."""
 
 import errno
+from typing import Any
+
+import typer
+from typer.core import TyperCommand
+
+from hil.toml_file import shortened
 
 _OF_THE_MACHINE = frozenset({errno.EMFILE, errno.ENFILE})
 """Operating-system errors that do not depend on the input: too many open files."""
 
 _OF_A_PATH = frozenset({errno.ENAMETOOLONG, errno.EACCES})
 """Errors that even checking whether a file exists may raise."""
-_LONGEST = 80  # characters of a path in their message
 
 
 def exit_code(error: Exception) -> int | None:
@@ -42,14 +47,29 @@ def message(error: Exception) -> str:
     """
     said = str(error)
     if isinstance(error, OSError) and _is_of_a_path(error):
-        path = str(error.filename)
-        said = f"{path[:_LONGEST]}{'...' * (len(path) > _LONGEST)}: {error.strerror}."
+        said = f"{shortened(str(error.filename))}: {error.strerror}."
     lines = [f"hil: {said}"]
     cause = None if error.__suppress_context__ else error.__context__
     if isinstance(cause, Exception) and exit_code(cause) is not None and str(cause) != str(error):
         lines.append(f"Preceded by: {cause}")
     text = "\n".join([*lines, *getattr(error, "__notes__", [])])
     return "".join(each if each.isprintable() or each in "\n\t" else ascii(each)[1:-1] for each in text)
+
+
+class Command(TyperCommand):
+    """A subcommand whose errors show the wrong value."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            cause: Any = error.__cause__  # pydantic's
+            if cause:
+                from hil.toml_errors import what_is_wrong
+
+                detail = cause.errors()[0]
+                error.message = f"{detail['input']} {what_is_wrong(detail)}."
+            raise
 
 
 def stop_behind(error: BaseException) -> Exception | None:

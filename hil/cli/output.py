@@ -6,7 +6,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import typer
+
+def require_output() -> None:
+    """Exit if standard output is closed (`>&-`): the next file to be opened would take its place."""
+    if sys.stdout is None:
+        print("hil: standard output is closed. Redirect it, for example to /dev/null.", file=sys.stderr)
+        sys.exit(1)
 
 
 @contextmanager
@@ -17,14 +22,14 @@ def readable_output() -> Iterator[None]:
         sys.stdout.flush()
     except BrokenPipeError:
         _drop_output()
-        raise typer.Exit(0) from None
+        sys.exit(0)
     except OSError as error:
         if error.errno != errno.ENOSPC or error.filename is not None:
             raise
         _drop_output()
         said = "hil: cannot write to standard output: no space left. Finished results are in their folder."
         print(said, file=sys.stderr)
-        raise typer.Exit(1) from None
+        sys.exit(1)
 
 
 def _drop_output() -> None:

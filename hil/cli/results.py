@@ -28,14 +28,13 @@ def report(
     """Write the report of a run: one self-contained HTML page with verdict, parameters and figures."""
     from hil.cli.views.result_table import what_next
     from hil.model_file import read_result
-    from hil.report.pictures import save_pictures
-    from hil.report.run_data import RunData
+    from hil.report.pictures import figures_of, save_pictures
 
     print(write_report(run, out))
-    data = None if png is None and svg is None else RunData.load(run)
+    shown = [] if png is None and svg is None else figures_of(run)
     for kind, folder in (("png", png), ("svg", svg)):
-        if folder is not None and data is not None:
-            print(f"{len(save_pictures(data, folder, kind))} figures in {folder}")
+        if folder is not None:
+            print(f"{len(save_pictures(shown, folder, kind))} figures in {folder}")
     if not is_quiet():  # on standard error, so that the page's path stays alone on standard output
         print(what_next(read_result(run), run), file=sys.stderr)
 

@@ -40,8 +40,8 @@ class JointConfig(Table):
     @classmethod
     def _printable(cls, name: str) -> str:
         """Reject control characters, line breaks and surrogates: names appear in terminals, XML, HTML and CSV."""
-        if bad := [each for each in name if not each.isprintable()]:
-            raise ValueError(f"{name!a}: {bad[0]!a} is not a printable character")
+        if not name.isprintable():
+            raise ValueError("must not contain line breaks, tabs or other unprintable characters")
         return name
 
     @field_validator("zero_ticks", mode="before")

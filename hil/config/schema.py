@@ -39,7 +39,7 @@ from hil.fakes.description import FakeArm, beside, found_beside
 from hil.fakes.names import arm_names, find_arm
 from hil.next_step import command
 from hil.toml_errors import describe
-from hil.toml_file import TomlFileError, load_toml, parse_toml, read_toml_text
+from hil.toml_file import TomlFileError, load_toml, parse_toml, read_toml_text, shortened
 from hil.unit_hints import in_other_units
 
 __all__ = [
@@ -215,6 +215,8 @@ class Config(Table):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         count = len(self.joints)
+        if self.arm.urdf is None and (slips := [*chain_slips(self)]):  # first: the lists' lengths depend on it
+            raise ValueError("; ".join(slips))
         _same_length("arm.rest_pose", self.arm.rest_pose, count)
         for key, values in self._per_joint():
             _same_length(key, values, count)
@@ -322,8 +324,12 @@ class Config(Table):
 
 def load_config(path: str | PathLike[str]) -> Config:
     """Read and check a TOML file, or the bundled one with that name. Raises ConfigError."""
-    path = find_config(Path(path))
-    if path.is_dir():
+    try:
+        path = find_config(Path(path))
+        is_folder = path.is_dir()
+    except OSError as error:
+        raise ConfigError(f"{shortened(str(path))}: {error.strerror}.") from error
+    if is_folder:
         if path == Path():
             raise ConfigError(". cannot be read: it is the current folder (as is an empty name). Name a TOML file.")
         within = [*path.glob("*.toml")]

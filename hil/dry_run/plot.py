@@ -37,6 +37,8 @@ def plot(config: Config, prediction: Prediction) -> Any:
         for bound in prediction.quantile[:2, index]:
             axis.axhline(bound, color="tab:orange", linewidth=1, linestyle="--")
         axis.set_ylabel(f"{joint.name} [rad]")
-    axes[0].set_title("Simulated arms, limits (red) and 99 % of the predicted peaks (dashed)", fontsize=10, loc="left")
+    axes[0].set_title(
+        "Simulated arms, limits (red), and peaks that 99 % of the arms stay within (dashed)", fontsize=10, loc="left"
+    )
     axes[-1].set_xlabel("time [s]")
     return figure

@@ -16,6 +16,8 @@ from hil.dry_run.stopping_distance import Stopping, Way
 from hil.estimator.selection.verdict import percent
 from hil.printing import print_fitting, say
 
+_NOTHING_RAD = 0.005  # two decimals would show 0.00 rad
+
 
 @dataclass(frozen=True)
 class FirstRun:
@@ -171,18 +173,12 @@ def _table(config: Config, prediction: Prediction, run: DryRun) -> Table:
 
 def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
     """Explain the result in sentences, ending with the verdict."""
-    planned, passed = run.stopping.planned, run.stopping.passed
-    stopped = np.maximum(planned[Way.BRAKED], planned[Way.CUT])
     lines = [
         "99 %: in 99 of 100 arms, all peaks stay within these values. Chance: probability that this quantity, taken "
         "alone, exceeds its limit; at a position or velocity limit the guard stops the arm, whereas current is only "
         "clamped.",
         settling_text(config, shown),
-        f"If stopped at any moment, the arms overshoot their limits by up to {_each(config, stopped)}; if the program "
-        f"is killed or the cable unplugged, by up to {_each(config, planned[Way.SILENT])}.",
-        "If something drives an arm past a limit at these speeds, it overshoots the limit by up to "
-        f"{_each(config, passed[Way.BRAKED])} when braked, and by up to {_each(config, passed[Way.CUT])} when torque "
-        "is cut. Keep that much space clear.",
+        *_stops(config, run.stopping),
         *(
             []
             if run.largest is None
@@ -243,6 +239,31 @@ def _percent(chance: float) -> str:
     return "below 0.01 %" if chance < 1e-4 else percent(chance)
 
 
-def _each(config: Config, beyond: NDArray[np.float64]) -> str:
-    each = ["a turn or more" if value >= 2 * np.pi else f"{value:.2f} rad" for value in beyond]
-    return ", ".join(f"{joint.name} {far}" for joint, far in zip(config.joints, each, strict=True))
+def _stops(config: Config, stopping: Stopping) -> list[str]:
+    """Say how far each joint goes beyond its position limits when the arm is stopped."""
+    planned, passed = stopping.planned, stopping.passed
+    stopped, silent = np.maximum(planned[Way.BRAKED], planned[Way.CUT]), planned[Way.SILENT]
+    lines = []
+    if max(stopped.max(), silent.max()) < _NOTHING_RAD:
+        lines.append(
+            "Stopped at any moment, no joint overshoots its limits, not even if the program is killed or the cable "
+            "unplugged."
+        )
+    else:
+        lines += [
+            f"Stopped at any moment, {joint.name} overshoots its limits by {_far(stopped[index])}; if the program is "
+            f"killed or the cable unplugged, by {_far(silent[index])}."
+            for index, joint in enumerate(config.joints)
+        ]
+    lines += [
+        f"If something drives {joint.name} past a limit at these speeds, it overshoots by "
+        f"{_far(passed[Way.BRAKED][index])} when braked, by {_far(passed[Way.CUT][index])} when torque is cut."
+        for index, joint in enumerate(config.joints)
+    ]
+    return [*lines, "Keep that much space clear."]
+
+
+def _far(beyond: float) -> str:
+    if beyond < _NOTHING_RAD:
+        return "less than 0.01 rad"
+    return "a turn or more" if beyond >= 2 * np.pi else f"up to {beyond:.2f} rad"

@@ -56,7 +56,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
         "by as much."
     )
     unsure = [
-        f"{joint.name} {100 * joint.torque_per_goal_std / joint.torque_per_goal:.2g} %"
+        f"{100 * joint.torque_per_goal_std / joint.torque_per_goal:.2g} % ({joint.name})"
         for joint in joints
         if joint.torque_per_goal_std
     ]
@@ -64,7 +64,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
     ratios = [(joint, ratio) for joint, _, ratio in _ratios(names, extra)]
     if not ratios:
         known = (
-            "Every value also scales with its joint's torque constant, whose relative uncertainty is: "
+            "Every value is also proportional to its joint's torque constant, which is known to within "
             f"{', '.join(unsure)}."
         )
         return " ".join(sentence for sentence in (known if unsure else "", silent) if sentence)

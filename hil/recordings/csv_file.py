@@ -16,12 +16,19 @@ _REMARKS = ("#", "%", "//")
 
 def read_csv_table(path: Path) -> Table:
     """Read the table in `path`. Raises CsvError. An empty field or `nan` is a missing value."""
-    lines = [(number, line) for number, line in enumerate(_text(path).splitlines(), start=1) if line.strip()]
+    text = _text(path)
+    if text.lstrip().startswith(("<!", "<?", "<html", "{", "[{")):
+        raise CsvError(f"{path} cannot be read: it is HTML, XML or JSON. Export the data as CSV.")
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    if long := [number for number, line in lines if len(line) > csv.field_size_limit()]:
+        raise CsvError(f"{path}, line {long[0]}: {csv.field_size_limit()} characters are the most that can be read.")
     remarks = [line for _, line in lines if line.lstrip().startswith(_REMARKS)]
     rows = [(number, line) for number, line in lines if not line.lstrip().startswith(_REMARKS)]
+    announced = rows[0][1][4:5] if rows and rows[0][1].lower().startswith("sep=") else ""  # as Excel writes it
+    rows = rows[1:] if announced else rows
     if not rows:
         raise CsvError(f"{path} is empty; it needs a header line and at least one line of numbers.")
-    delimiter = _delimiter([line for _, line in rows])
+    delimiter = announced or _delimiter([line for _, line in rows])
     header, rows = _header(path, rows, remarks, delimiter)
     double = {name for name in header if header.count(name) > 1}
     if double:
@@ -33,7 +40,7 @@ def read_csv_table(path: Path) -> Table:
         units = {name: field.strip(" []()") for name, field in named if field.strip(" []()")}
         fields = fields[1:]
     if not fields:
-        raise CsvError(f"{path} is empty; it needs a header line and at least one line of numbers.")
+        raise CsvError(f"{path} has no line of numbers, only a header.")
     wide = len(header)
     if all(len(row) == wide + 1 and not row[-1].strip() for _, row in fields):  # each line ends in a delimiter
         fields = [(number, row[:-1]) for number, row in fields]

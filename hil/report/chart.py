@@ -10,6 +10,7 @@ Array = NDArray[np.float64]
 
 # Okabe and Ito's colours, distinguishable for colour-blind readers.
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8a8f98"
+OF_JOINTS = (BLUE, ORANGE, GREEN, "#CC79A7", "#56B4E9", "#E69F00", GREY)
 
 Kind = Literal["line", "broad", "dashed", "points", "dots", "area", "steps"]
 

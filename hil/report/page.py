@@ -63,6 +63,8 @@ def write_report(data: RunData, path: Path) -> None:
 
 def write_page(page: str, path: Path) -> None:
     """Write a page completely or not at all; raises RunFolderError."""
+    if path.is_dir():
+        raise RunFolderError(f"{path} is a folder: give the name of the file to write.")
     temporary = path.with_name(path.name + ".partial")
     try:
         temporary.write_text(page, encoding="utf-8")
@@ -104,9 +106,14 @@ def sections(data: RunData) -> list[Section]:
     return [section for make in SECTIONS if (section := make(data)) is not None]
 
 
+def figures_in(shown: Sequence[Section]) -> list[Figure]:
+    """All figures of these sections, in order."""
+    return [picture.figure for section in shown for picture in section.pictures]
+
+
 def _share_of_points(shown: Sequence[Section]) -> float:
     """Fraction of the points that each curve may have, so that a page with many joints stays small."""
-    charts = [picture.figure for section in shown for picture in section.pictures if isinstance(picture.figure, Chart)]
+    charts = [figure for figure in figures_in(shown) if isinstance(figure, Chart)]
     wanted = sum(min(len(series.x), WIDE.points) for chart in charts for series in chart.series)
     return min(1.0, MOST_POINTS / max(1, wanted))
 

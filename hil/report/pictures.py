@@ -1,21 +1,24 @@
 """The report's figures as separate files."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from hil.errors import RunFolderError
 from hil.report.chart import Figure
-from hil.report.page import sections
+from hil.report.page import figures_in, sections
 from hil.report.png import save_png
+from hil.report.recording_page import recording_figures
 from hil.report.run_data import RunData
 from hil.report.svg import WIDE, draw_svg
+from hil.runs.recording_folder import is_recording_folder
 
 
-def save_pictures(data: RunData, folder: Path, kind: str) -> list[Path]:
-    """Save every figure in `folder` as "png" or "svg"; return the paths. Raises MissingExtra, RunFolderError."""
+def save_pictures(shown: Sequence[Figure], folder: Path, kind: str) -> list[Path]:
+    """Save these figures in `folder` as "png" or "svg"; return the paths. Raises MissingExtra, RunFolderError."""
     saved = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for figure in figures(data):
+        for figure in shown:
             path = folder / f"{figure.name}.{kind}"
             if kind == "png":
                 save_png(figure, path)
@@ -29,4 +32,9 @@ def save_pictures(data: RunData, folder: Path, kind: str) -> list[Path]:
 
 def figures(data: RunData) -> list[Figure]:
     """All figures of the report, in order."""
-    return [picture.figure for section in sections(data) for picture in section.pictures]
+    return figures_in(sections(data))
+
+
+def figures_of(run: Path) -> list[Figure]:
+    """All figures of the report of a run, or of an estimate from other tools' recordings."""
+    return recording_figures(run) if is_recording_folder(run) else figures(RunData.load(run))

@@ -36,8 +36,8 @@ def _draw_chart(axes: Any, chart: Chart) -> None:
     axes.set_ylabel(chart.y_label)
     axes.set_yscale("log" if chart.log_y else "linear")
     axes.grid(color="#e3e6ea")
-    if any(series.name for series in chart.series):
-        axes.legend(fontsize=8, loc="best")
+    if any(series.name for series in chart.series):  # beside the axes, so that the legend hides no curve
+        axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _draw_series(axes: Any, series: Series) -> None:

@@ -7,8 +7,8 @@ import numpy as np
 
 from hil.arm_model import ArmModel
 from hil.model_file import model_of, read_usable_result
-from hil.report.chart import BLUE, GREEN, ORANGE, Chart, Series, thin
-from hil.report.page import FILE_NAME, render, write_page
+from hil.report.chart import BLUE, GREEN, ORANGE, Chart, Figure, Series, thin
+from hil.report.page import FILE_NAME, figures_in, render, write_page
 from hil.report.section import Folded, Picture, Section, Table
 from hil.report.sections.correlation import correlation_of
 from hil.report.sections.friction import friction_curve, friction_interval
@@ -35,17 +35,29 @@ def write_recording_report(folder: Path, out: Path | None = None) -> Path:
     """Write the report of a recording folder, by default into it; return its path. Raises RunFolderError,
     ResultError.
     """
-    result = read_usable_result(folder)
-    shown = _Shown(folder, load_record(folder), result, model_of(result, folder), load_recordings(folder))
-    sections = (
-        *(_verdict(shown), parameters_of(result), _prediction(shown), _friction(shown), correlation_of(result)),
-        _next(shown),
-        _provenance(shown),
-    )
+    shown = _load(folder)
     title = Path(shown.record.config or shown.record.files[0].path).stem
     path = out or folder / FILE_NAME
-    write_page(render(title, shown.record.started, [each for each in sections if each is not None]), path)
+    write_page(render(title, shown.record.started, _sections(shown)), path)
     return path
+
+
+def recording_figures(folder: Path) -> list[Figure]:
+    """All figures of that report, in order."""
+    return figures_in(_sections(_load(folder)))
+
+
+def _load(folder: Path) -> _Shown:
+    result = read_usable_result(folder)
+    return _Shown(folder, load_record(folder), result, model_of(result, folder), load_recordings(folder))
+
+
+def _sections(shown: _Shown) -> list[Section]:
+    sections = (
+        *(_verdict(shown), parameters_of(shown.result), _prediction(shown), _friction(shown)),
+        *(correlation_of(shown.result), _next(shown), _provenance(shown)),
+    )
+    return [each for each in sections if each is not None]
 
 
 def _verdict(shown: _Shown) -> Section:

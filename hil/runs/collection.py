@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import datetime
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,12 @@ class RunSummary:
         return asdict(self) | {"path": str(self.path), "started": started}
 
 
-def find_runs(folder: Path) -> list[RunSummary]:
+def find_runs(folder: str | PathLike[str]) -> list[RunSummary]:
     """The runs in `folder`, or `folder` itself if it is a run, oldest first; pilot steps count as part of their run.
 
     Raises RunFolderError if the folder does not exist.
     """
+    folder = Path(folder)
     if not folder.is_dir():
         raise RunFolderError(
             f"{folder} is not a folder. `hil identify` creates its runs in runs/ in the current folder."
@@ -106,8 +108,10 @@ def write_note(path: Path, note: Note) -> None:
     if len(note.name) > _LONGEST or len(note.text) > _LONGEST:
         raise RunFolderError(f"A name or note may have at most {_LONGEST} characters.")
     for key, value in asdict(note).items():
-        if bad := [each for each in value if not each.isprintable()]:
-            raise RunFolderError(f"--{key} {value!a}: {bad[0]!a} is not a printable character.")
+        if not value.isprintable():
+            raise RunFolderError(
+                f"--{key} {value!a} must not contain line breaks, tabs or other unprintable characters."
+            )
     write_json(path / NOTE_FILE, asdict(note))
 
 

@@ -138,6 +138,10 @@ def test_files_that_hold_no_model_are_refused_with_their_name(identified: Path, 
         load_model(identified)
     with pytest.raises(ResultError, match=r"nowhere cannot be read: No such file"):
         load_model(tmp_path / "nowhere")
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text("<robot/>", encoding="utf-8")
+    with pytest.raises(ResultError, match=r"arm\.urdf is not a model file of hil\. Give a run folder"):
+        load_model(urdf)
 
 
 def test_a_damaged_toml_file_is_read_like_any_other_toml(identified: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ two runs of an arm with some unmodelled friction differ by slightly more than th
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from os import PathLike
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -93,9 +94,13 @@ class Difference:
 
 
 def diff_runs(
-    before: Path, after: Path, false_alarms: float = FALSE_ALARMS, least_share: float = LEAST_SHARE
+    before: str | PathLike[str],
+    after: str | PathLike[str],
+    false_alarms: float = FALSE_ALARMS,
+    least_share: float = LEAST_SHARE,
 ) -> Difference:
     """Compare two run folders, result.json files or exported models of one arm. Raises ResultError."""
+    before, after = Path(before), Path(after)
     models = read_model(before), read_model(after)
     counts = [len(model.joints) for model in models]
     if counts[0] != counts[1]:

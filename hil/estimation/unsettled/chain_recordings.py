@@ -55,7 +55,7 @@ def estimate_chain_recordings(
     if refused:
         raise ConfigError(f"model.{refused[0]} = true: only planar arms support this term so far; remove it.")
     began = time.perf_counter()
-    arm = _described(config, recordings[0].joints)
+    arm = _described(config, recordings[0].joints, shown_path)
     gravity = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, -config.arm.gravity])
     base = BaseParameters.of(Chain(*arm.geometry, gravity), tilts=config.model.base_tilt)
     prior = Prior.of(base, arm.parameters)
@@ -108,7 +108,7 @@ def estimate_chain_recordings(
     return ChainEstimated(result, _predicted(recordings, found))
 
 
-def _described(config: RecordingConfig, joints: int) -> ArmDescription:
+def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescription:
     assert config.arm.urdf is not None  # ensured by the caller
     names = config.joint_names
     if names is None:
@@ -117,7 +117,9 @@ def _described(config: RecordingConfig, joints: int) -> ArmDescription:
             "columns.position, add a [[joints]] table with that joint's name, in order from the base outwards."
         )
     if len(names) != joints:
-        raise ConfigError(f"{len(names)} [[joints]] tables, but {joints} position columns: give one per joint.")
+        raise ConfigError(
+            f"{shown}: {len(names)} [[joints]] tables, but {joints} position columns: give one per joint."
+        )
     try:
         return read_arm(Path(config.arm.urdf), names)
     except ArmFileError as error:
@@ -166,7 +168,7 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     if found.simulated:
         worst = float(found.residual_over_noise.max())
         joint = arm.joints[int(np.argmax(found.residual_over_noise))].name
-        sentences.append(f"The residual of {joint} is the largest: {worst:.2f} times the noise of its angle.")
+        sentences.append(f"The largest residual, {joint}'s, is {worst:.2f} times the noise of its angle.")
         trust = trust if worst <= EXPLAINED else "with care"
         if found.systematic > SYSTEMATIC:
             trust = "with care"

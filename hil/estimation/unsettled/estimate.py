@@ -14,6 +14,7 @@ from hil.errors import ConfigError
 from hil.estimation.drive.currents import current_findings
 from hil.estimation.model_from_config import wanted_model
 from hil.estimation.plausibility import torque_scale_std
+from hil.estimation.result import arm_facts
 from hil.estimation.result_checks import describe_segment_choice, describe_verdict
 from hil.estimation.slips.position_jumps import jump_warnings
 from hil.estimation.torque_constants import Source, contradictions, ratios_of, ratios_said
@@ -93,7 +94,8 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
     given = Given(torque_scale_std(config), zeros=True, jumps=jumps, torque_source="constant")
     zeros, gravity = config.model.zeros, config.arm.gravity
     result = estimate_any([recording], config.model, 1.0, zeros, facts.config, gravity, given=given).result
-    result = replace(result, warnings=(*result.warnings, *current_findings(config, samples).warnings))
+    warnings = (*result.warnings, *current_findings(config, samples).warnings)
+    result = replace(result, arm=arm_facts(config), warnings=warnings)
     run.write_result(result)
     return result
 

@@ -102,7 +102,7 @@ def _turns(recordings: Sequence[Recording], joint: int, name: str) -> list[str]:
     turns = max(float(np.ptp(each.filled()[joint])) for each in recordings) / (2.0 * np.pi)
     if turns <= MANY_TURNS:
         return []
-    return [f"{name} moved through {turns:.0f} turns: if it did not, its positions are not in the stated unit."]
+    return [f"{name} seems to have moved {turns:.0f} turns. If it did not, the unit of its positions is wrong."]
 
 
 def _flat(recordings: Sequence[Recording], joint: int, name: str, unexplained: bool) -> list[str]:

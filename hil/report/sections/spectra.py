@@ -4,13 +4,12 @@ import numpy as np
 
 from hil.estimator.data.fourier import lines_of, noise_power
 from hil.plan.plan import IDENTIFY
-from hil.report.chart import BLUE, GREEN, GREY, ORANGE, Array, Chart, Series
+from hil.report.chart import BLUE, GREEN, GREY, OF_JOINTS, ORANGE, Array, Chart, Series
 from hil.report.run_data import RunData
 from hil.report.section import Picture, Section, Table
 from hil.report.words import steps
 from hil.runs.period_file import PlayedPeriod
 
-_COLOURS = (BLUE, ORANGE)
 _KINDS = {
     "excited": "excited",
     "odd": "odd, not excited (friction, gravity)",
@@ -59,8 +58,8 @@ def _excited(data: RunData) -> list[list[int]]:
 def _excitation(data: RunData, period: PlayedPeriod, excited: list[list[int]]) -> Picture:
     amplitude = 2 * np.abs(lines_of(period.torque))
     series = [
-        _points(f"torque of {name}", amplitude[joint], np.array(excited[joint]), period, _COLOURS[joint % 2])
-        for joint, name in enumerate(data.names)
+        _points(f"torque of {name}", amplitude[joint], np.array(excited[joint]), period, colour)
+        for joint, (name, colour) in enumerate(zip(data.names, OF_JOINTS, strict=False))
     ]
     chart = Chart("excitation", "Excitation", "frequency [Hz]", "torque amplitude [N m]", tuple(series))
     peaks = ", ".join(f"{name} {np.abs(period.torque[joint]).max():.3g} N m" for joint, name in enumerate(data.names))
@@ -79,7 +78,7 @@ def _response(period: PlayedPeriod, joint: int, name: str, excited: list[list[in
     ends = np.array([0.0, shown[-1] * _fundamental(period)])
     series = [
         _points("not excited", amplitude, silent, period, GREY),
-        _points("excited in the other joint", amplitude, others, period, GREEN),
+        _points("excited in another joint", amplitude, others, period, GREEN),
         _points("excited in this joint", amplitude, own, period, BLUE),
         Series("noise", ends, np.full(2, noise), ORANGE, "dashed"),
     ]

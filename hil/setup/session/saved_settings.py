@@ -75,7 +75,7 @@ class SavedSettings:
             self.kept[joint] = settings_file.keep(url, joint.id, model, settings, changed, since)
         except RunFolderError as error:
             self._say(
-                f"The settings of {joint} cannot be saved ({error}). If this program is killed, the servo's Operating "
+                f"The settings of {joint} cannot be saved: {error} If this program is killed, the servo's Operating "
                 f"Mode {settings['Operating Mode']} and Current Limit must be restored by hand."
             )
             self.kept[joint] = Kept(url, joint.id, model, settings, changed, 0, "")

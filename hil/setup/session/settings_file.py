@@ -9,6 +9,7 @@ port.
 import json
 import os
 import re
+import threading
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -111,20 +112,30 @@ def forget(kept: Kept) -> None:
 
 
 def write_durably(path: Path, value: object) -> None:
-    """Write a JSON file completely and flush it to disk. Raises RunFolderError."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    """Write a JSON file completely and flush it to disk. Raises RunFolderError.
+
+    Another thread may write the file too, and another program may remove its folder.
+    """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("w", encoding="utf-8") as file:
-            json.dump(value, file, indent=2)
-            file.write("\n")
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        folder = os.open(path.parent, os.O_RDONLY)
         try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+            _write(path, value)
+        except FileNotFoundError:
+            _write(path, value)
     except OSError as error:
         raise RunFolderError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _write(path: Path, value: object) -> None:
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}.partial")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with temporary.open("w", encoding="utf-8") as file:
+        json.dump(value, file, indent=2)
+        file.write("\n")
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

@@ -15,7 +15,9 @@ import pytest
 import hil
 from hil.api.dry_run import dry_run
 from hil.errors import ConfigError, CsvError, MissingExtra, ResultError, RunFolderError
+from hil.estimation.changes.diff import diff_runs
 from hil.results.result import SettledResult
+from hil.runs.collection import find_runs
 from hil.setup.preflight import Level, check_arm
 from tests.support.command_line import hil as command
 from tests.support.edits import FEWER_SAMPLES, QUICK
@@ -71,6 +73,7 @@ def test_all_samples_and_csv_files_are_estimated_too(identified: Path, tmp_path:
     found = hil.estimate(identified, all_samples=True)
     assert isinstance(found, hil.Estimation) and found.run == identified
     assert isinstance(hil.load_run(identified).result, hil.Estimation)
+    assert "gravity_1" in {change.name for change in diff_runs(identified, identified).changes}, "it has the joints"
     gravity = found.parameters["gravity_1"].value
     assert gravity == pytest.approx(whole.parameters["gravity_1"].value, rel=0.05)
     with pytest.raises(CsvError, match=r"a\.csv cannot be read"):
@@ -235,6 +238,40 @@ def test_the_log_is_under_hil_and_silent_unless_asked(
 def test_what_names_no_configuration_is_a_type_error_that_says_what_does(nothing: Any) -> None:
     with pytest.raises(TypeError, match=r"config must be a TOML file.* not "):
         hil.check(nothing)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda run: hil.estimate(None), "recording must be a run folder"),
+        (lambda run: hil.estimate([None]), "recording must be a run folder"),
+        (lambda run: hil.estimate("run", on_progress=5), "on_progress must be a function of one Progress, not 5"),
+        (lambda run: hil.check("fake_two_link", on_progress=5), "on_progress must be a function"),
+        (lambda run: hil.identify("fake_two_link", on_progress=5), "on_progress must be a function"),
+        (lambda run: hil.dry_run("fake_two_link", on_progress=5), "on_progress must be a function"),
+        (lambda run: run.result.export(None), "kind must be the name of one format"),
+        (lambda run: run.result.export(["urdf", "mjcf"]), "kind must be the name of one format"),
+    ],
+)
+def test_an_argument_of_the_wrong_type_is_named(
+    call: Callable[[Any], object], said: str, identified_once: Path
+) -> None:
+    with pytest.raises(TypeError, match=said):
+        call(hil.load_run(identified_once))
+    assert not Path("runs").exists()
+
+
+def test_names_that_no_file_can_have_are_configuration_errors() -> None:
+    with pytest.raises(ConfigError, match=r"'a\\x00b' cannot be read: embedded null byte"):
+        hil.load_config("a\0b")
+    with pytest.raises(ConfigError, match=r"^x{80}\.\.\.: File name too long\.$"):
+        hil.load_config("x" * 5000)
+
+
+def test_a_loaded_run_equals_itself_and_its_result_every_copy(identified_once: Path) -> None:
+    first, second = hil.load_run(identified_once), hil.load_run(identified_once)
+    assert first in [first] and first != second and len({first, second}) == 2 and first.result == second.result
+    assert [each.path for each in find_runs(str(identified_once))] == [identified_once]
 
 
 def test_check_says_that_the_pilot_takes_precedence_over_a_torque() -> None:

@@ -1,6 +1,7 @@
 """What stopped an arm, and the state of its torque, is what the caller gets: no hint takes its place."""
 
 import re
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -8,12 +9,13 @@ from typing import Any
 import pytest
 
 from hil.api import experiment
-from hil.api.progress import Progress, forgiving
+from hil.api.progress import OnProgress, Progress, forgiving
 from hil.drivers.errors import BusShared
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
 from hil.estimation import after_a_stop
 from hil.estimator.errors import RecordingError
 from hil.plan.plan import IDENTIFY
+from hil.runs.background import Background
 from tests.support.paths import CONFIGS
 
 
@@ -97,6 +99,27 @@ def test_a_stop_inside_a_progress_callback_is_a_stop(caplog: pytest.LogCaptureFi
         with pytest.raises(StopRequested):
             tell(Progress("experiment", "THE ARM MOVES AGAIN"))
     assert not caplog.records
+
+
+def test_exit_in_a_progress_callback_is_logged_and_an_interrupt_reaches_the_main_thread(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted = threading.Event()
+    monkeypatch.setattr("_thread.interrupt_main", interrupted.set)
+
+    def ends(how: type[BaseException]) -> OnProgress:
+        def listener(_: Progress) -> None:
+            raise how
+
+        return forgiving(listener)
+
+    ends(SystemExit)(Progress("experiment"))
+    assert "will not be called again" in caplog.text and not interrupted.is_set()
+    with pytest.raises(KeyboardInterrupt):
+        ends(KeyboardInterrupt)(Progress("experiment"))
+    background = Background(ends(KeyboardInterrupt), 4)
+    background.put(Progress("experiment"))
+    assert background.close(5.0) == [] and interrupted.is_set()
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,9 @@ def test_a_name_that_is_markup_is_a_name(
 
 @pytest.mark.parametrize("name", ["a\\u0007b", "a\\nb", "\\u001b[31m", "\\u202e", "\\u200b"])
 def test_control_characters_are_no_name(arm: Callable[..., Config], name: str) -> None:
-    with pytest.raises(ConfigError, match=r"name = .*not a printable character"):
+    with pytest.raises(
+        ConfigError, match=r"name = .*: must not contain line breaks, tabs or other unprintable characters"
+    ):
         arm(('name = "elbow"', f'name = "{name}"'))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -72,6 +73,14 @@ def test_a_reader_that_closes_early_and_a_full_disk_are_no_traceback(identified:
     with Path("/dev/full").open("w") as full_disk:
         full = subprocess.run(command, stdout=full_disk, stderr=subprocess.PIPE, text=True, check=False)
     assert full.returncode == 1 and "no space left" in full.stderr and "Traceback" not in full.stderr
+
+
+def test_nowhere_to_write_is_one_message() -> None:
+    """As `hil --help > /dev/full` and `hil schema >&-` do."""
+    command = f"{shlex.quote(sys.executable)} -m hil"
+    for line, said in (("--help > /dev/full", "no space left"), ("schema >&-", "standard output is closed")):
+        found = subprocess.run(f"{command} {line}", shell=True, stderr=subprocess.PIPE, text=True, check=False)
+        assert found.returncode == 1 and said in found.stderr and found.stderr.count("\n") == 1
 
 
 def test_no_figure_is_cut_in_a_narrow_terminal(

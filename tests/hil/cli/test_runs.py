@@ -21,12 +21,15 @@ def test_runs_are_listed_with_their_notes(identified: Path, capsys: pytest.Captu
 
 
 @pytest.mark.parametrize("option", ["--name", "--text"])
-@pytest.mark.parametrize(("value", "bad"), [("a\x1b[31mX", r"'\x1b'"), ("a\nb", r"'\n'"), ("\udcff", r"'\udcff'")])
+@pytest.mark.parametrize("value", ["a\x1b[31mX", "a\nb", "\udcff"])
 def test_a_note_has_printable_characters_only(
-    identified: Path, option: str, value: str, bad: str, capsys: pytest.CaptureFixture[str]
+    identified: Path, option: str, value: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert hil("note", identified, option, value) == 2
-    assert capsys.readouterr().err == f"hil: {option} {value!a}: {bad} is not a printable character.\n"
+    assert (
+        capsys.readouterr().err
+        == f"hil: {option} {value!a} must not contain line breaks, tabs or other unprintable characters.\n"
+    )
     assert not (identified / "note.json").exists()
 
 

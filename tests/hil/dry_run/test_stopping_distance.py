@@ -10,6 +10,7 @@ from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.stopping_distance import LONGEST_S, Stopping, Way, beyond_when_passed, stopping_distance
+from hil.dry_run.summary import _stops
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.closed_loop import Feedback, respond, resting
 from hil.fakes.plants.arm import base_parameters
@@ -116,6 +117,32 @@ def test_a_plan_that_passes_a_limit_is_stopped_there() -> None:
     beyond = float((moved.position[0] - config.joints[0].position_limit[1]).max())
     ways = stopping_distance(config, harder, fake_itself(), SPEEDS)
     assert ways.planned[Way.BRAKED][0] < 0.5 * beyond
+
+
+@pytest.mark.parametrize(
+    ("planned", "first"),
+    [
+        (
+            0.001,
+            "Stopped at any moment, no joint overshoots its limits, not even if the program is killed or the cable ",
+        ),
+        (0.2, "Stopped at any moment, shoulder overshoots its limits by up to 0.20 rad; if the program is killed or "),
+    ],
+)
+def test_an_overshoot_is_said_joint_by_joint(planned: float, first: str) -> None:
+    stopping = Stopping(
+        {way: np.array([planned, 0.0]) for way in Way},
+        {Way.BRAKED: np.array([7.0, 0.001]), Way.CUT: np.array([7.0, 1.5]), Way.SILENT: np.zeros(2)},
+    )
+    said = _stops(short_config(CONFIG.read_text(encoding="utf-8")), stopping)
+    assert said[0].startswith(first)
+    assert said[-3] == (
+        "If something drives shoulder past a limit at these speeds, it overshoots by a turn or more when braked, by a "
+        "turn or more when torque is cut."
+    )
+    assert (
+        "elbow past a limit at these speeds, it overshoots by less than 0.01 rad when braked, by up to 1.5" in said[-2]
+    )
 
 
 def test_without_braking_braked_is_cut() -> None:

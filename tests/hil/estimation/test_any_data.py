@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hil.api.run import load_run
+from hil.errors import RunFolderError
 from hil.estimator.baselines import compare as peers
 from hil.runs.recording import load_samples
 from tests.support.command_line import hil
@@ -47,6 +49,11 @@ def test_a_real_arm_recorded_by_others(capsys: pytest.CaptureFixture[str]) -> No
     length, std = ratio(result)
     assert length == pytest.approx(0.2, rel=0.2) and abs(length - 0.2) < 3.0 * std
     assert max(result["fit"]["residual_rms_rad"]) < 0.05
+    (folder,) = Path("runs").iterdir()
+    assert hil("report", folder, "--svg", "pictures") == 0
+    assert {"position_1.svg", "torque_2.svg", "correlation.svg"} <= {path.name for path in Path("pictures").iterdir()}
+    with pytest.raises(RunFolderError, match=r"hil\.load_model"):
+        load_run(folder)
 
 
 @pytest.mark.slow

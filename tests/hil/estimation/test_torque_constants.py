@@ -10,8 +10,9 @@ from hil.config.experiment import ModelConfig
 from hil.config.schema import load_config
 from hil.estimation.chain_estimate import contradicting_torques
 from hil.estimation.plausibility import doubts
-from hil.estimation.torque_constants import contradictions, ratios_said
+from hil.estimation.torque_constants import contradictions, ratios_said, torque_constants_said
 from hil.estimation.unsettled.estimate import estimate_any
+from hil.estimation.unsettled.warnings import _turns
 from hil.estimator.data.recording import Recording
 from hil.results.parts import Quantity
 from tests.support.paths import CONFIGS
@@ -44,6 +45,18 @@ def test_a_ratio_beyond_the_uncertainty_of_torque_constants_is_a_contradiction(
     assert bool(said) is not contradictory
     assert all("elative to joint 1, joint 2 gives" in each for each in (*found, *said))
     assert all("The values of all joints are relative to the torque of joint 1" in each for each in (*found, *said))
+
+
+def test_turns_and_torque_constants_are_said_plainly() -> None:
+    angle = np.linspace(0.0, 25.0, 100)
+    recording = Recording(0.01 * np.arange(100), np.ones((1, 100)), angle[None], np.array([1e-3]))
+    (turns,) = _turns([recording], 0, "Joint 1")
+    assert turns == "Joint 1 seems to have moved 4 turns. If it did not, the unit of its positions is wrong."
+    config = load_config(CONFIGS / "fake_two_link.toml")
+    known = torque_constants_said(config.joints, {})
+    assert known.startswith(
+        "Every value is also proportional to its joint's torque constant, which is known to within 8.3 % (shoulder), "
+    )
 
 
 def test_a_recording_whose_first_torque_is_too_small_is_used_with_care_at_most() -> None:

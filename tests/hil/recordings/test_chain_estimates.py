@@ -84,6 +84,7 @@ def test_errors_that_repeat_with_the_motion_are_trusted_with_care(setup: bench.S
     )
     well = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
     assert well.trust == "yes"
+    assert well.sentences[0] == f"The largest residual, {setup.arm.joints[0]}'s, is 1.00 times the noise of its angle."
     found.names, found.value = (*found.names, "torque_scale_2"), np.append(found.value, 0.7)
     found.std = np.append(found.std, 1e-3)
     scaled = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
@@ -111,7 +112,7 @@ def test_measured_torque_gives_the_regression_and_says_so(setup: bench.Setup) ->
     ("urdf", "names", "said"),
     [
         ("", 4, "need arm.urdf"),
-        ('urdf = "arm.urdf"', 3, "3 .*4 position columns"),
+        ('urdf = "arm.urdf"', 3, r"arm\.toml: 3 .*4 position columns"),
         ('urdf = "absent.urdf"', 4, "absent.urdf"),
     ],
 )

@@ -74,6 +74,7 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         lambda: write("a.csv", before="# rig 3, Tuesday\n# 200 Hz\n"),
         lambda: write("a.csv", end=","),
         lambda: write("a.csv", delimiter=";", end=";"),
+        lambda: write("a.csv", delimiter=";", comma=",", before="sep=;\n"),
         lambda: write("a.csv", ("t [ms]", "q1 [deg]", "q2 [deg]", "tau1 [mNm]", "tau2 [mNm]"), deg(1e3, 1e3)),
         lambda: write(
             "a.csv", ("Time (s)", "Position 1 (°)", "Position 2 (°)", "Torque 1 (Nm)", "Torque 2 (Nm)"), deg()
@@ -146,7 +147,7 @@ def test_rows_that_can_be_put_right_are_and_it_is_said(
         (lambda rows: [f"1.3.2026,{row.partition(',')[2]}" for row in rows], "'time' is '1.3.2026'; .*ISO 8601"),
         (lambda rows: [f"-inf,{row.partition(',')[2]}" for row in rows], "'time' is '-inf'; it .* finite number\\.$"),
         (lambda rows: [*rows[:9], "1,2,3", *rows[9:]], "line 11: 3 fields for 5 columns"),
-        (lambda rows: [], "is empty"),
+        (lambda rows: [], "no line of numbers, only a header"),
     ],
 )
 def test_rows_that_cannot_are_named(change: Callable[[list[str]], list[str]], said: str) -> None:

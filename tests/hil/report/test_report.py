@@ -5,6 +5,7 @@ import re
 import time
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -12,12 +13,14 @@ import numpy as np
 import pytest
 
 from hil.errors import ResultError, RunFolderError
+from hil.report.chart import Chart
 from hil.report.page import make_page, render, sections, write_report
 from hil.report.pictures import figures, save_pictures
-from hil.report.png import save_png
+from hil.report.png import draw_figures, save_png
 from hil.report.run_data import RunData
 from hil.report.section import Section
 from hil.report.sections.parameters import _row
+from hil.report.sections.spectra import _excitation
 from hil.report.sections.verdict import verdict
 from hil.results.parts import Quantity
 
@@ -142,7 +145,7 @@ def test_missing_replies_and_an_undetermined_parameter_are_drawn_and_said(identi
 def test_pictures_stand_alone_as_svg_and_png(identified: Path, tmp_path: Path) -> None:
     data = RunData.load(identified)
     count = len(figures(data))
-    svgs = save_pictures(data, tmp_path / "pictures", "svg")
+    svgs = save_pictures(figures(data), tmp_path / "pictures", "svg")
     assert len(svgs) == len(set(svgs)) == count
     for path in svgs:
         assert ET.parse(path).getroot().tag.endswith("svg")
@@ -150,6 +153,20 @@ def test_pictures_stand_alone_as_svg_and_png(identified: Path, tmp_path: Path) -
     for figure in {type(figure): figure for figure in figures(data)}.values():
         save_png(figure, tmp_path / f"{figure.name}.png")
         assert (tmp_path / f"{figure.name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_each_joint_has_a_colour_and_the_legend_hides_no_curve() -> None:
+    torque = np.random.default_rng(1).normal(size=(7, 200))
+    period: Any = SimpleNamespace(torque=torque, position=torque, predicted=torque, rate=100.0)
+    data: Any = SimpleNamespace(fitted=period, names=[f"long_name_of_joint_{number}" for number in range(1, 8)])
+    figure = _excitation(data, period, [[number] for number in range(1, 8)]).figure
+    assert isinstance(figure, Chart) and len({series.colour for series in figure.series}) == 7
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'hil[png]'")
+    drawn = draw_figures([figure])
+    drawn.canvas.draw()
+    (axes,) = drawn.axes
+    legend = axes.get_legend().get_window_extent()
+    assert axes.bbox.x1 <= legend.x0 and legend.x1 <= drawn.bbox.x1
 
 
 def test_runs_that_are_not_whole_are_named(identified: Path, tmp_path: Path) -> None:

@@ -1,9 +1,12 @@
 """What a killed program left is restored by the next one, and what was changed since stays."""
 
 import os
+import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,6 +19,7 @@ from hil.fakes.bus.faults import Fault
 from hil.fakes.servo.servo import EmulatedServo
 from hil.setup.preflight import Level, check_arm
 from hil.setup.session import settings_file
+from hil.setup.session.saved_settings import SavedSettings
 from hil.setup.session.servo_session import servo_session
 from hil.setup.session.settings_file import settings_path
 from tests.support.bench import SHORT, Arm, Bench, play
@@ -50,6 +54,41 @@ def test_settings_are_found_by_their_adapter_whatever_its_port_is_called_now(mon
     assert settings_file.load("/dev/ttyUSB1", 1, "XM430-W350") == kept
     settings_file.forget(kept)
     assert settings_file.load("/dev/ttyUSB1", 1, "XM430-W350") is None
+
+
+def test_threads_that_save_at_once_and_a_folder_removed_meanwhile_are_no_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each thread of a program may run its own copy of one fake arm, whose settings have one file."""
+    settings = {"Operating Mode": 3}
+
+    def save(_: int) -> None:
+        settings_file.forget(settings_file.keep("fake://arm.toml", 1, "XM430-W350", settings, {}))
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(save, range(200)))
+    assert not list(settings_file.state_folder().iterdir())
+    removed = iter([True, False])
+
+    def removing(descriptor: int) -> None:
+        if next(removed, False):
+            shutil.rmtree(settings_file.state_folder())
+
+    monkeypatch.setattr(os, "fsync", removing)
+    kept = settings_file.keep("fake://arm.toml", 1, "XM430-W350", settings, {})
+    assert settings_file.load("fake://arm.toml", 1, "XM430-W350") == kept
+
+
+def test_settings_that_cannot_be_saved_are_said_in_one_sentence(
+    arm: Arm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    config, said = arm(SHORT), list[str]()
+    bus: Any = SimpleNamespace(port=SimpleNamespace(url=config.url))
+    settings = {"Operating Mode": 3, "Current Limit": 910}
+    SavedSettings(bus, said.append).save(config.bus.joints[0], settings, {})
+    assert "cannot be saved: " in said[0] and ".json cannot be written: Not a directory. If this program" in said[0]
 
 
 class _Gone(BaseException):
