@@ -46,6 +46,35 @@ class Signs:
         named = [f"the torque of joint {joint}" for joint, sign in enumerate(self.torque, start=1) if sign < 0]
         return (*named, *(f"the position of joint {joint}" for joint, sign in enumerate(self.position, 1) if sign < 0))
 
+    def said(self, joints: Sequence[str] = ()) -> str:
+        """The subject of a sentence on the reversed signs, such as "the signs of both torques".
+
+        joints: names of the joints, by default their numbers.
+        """
+        names = joints or [f"joint {number}" for number in range(1, len(self.torque) + 1)]
+        listed = [
+            _columns(kind, signs, names) for kind, signs in (("torque", self.torque), ("position", self.position))
+        ]
+        plural = "s" if self.are_several else ""
+        return f"the sign{plural} of {' and '.join(each for each in listed if each)}"
+
+    @property
+    def are_several(self) -> bool:
+        """Whether more than one column is reversed."""
+        return len(self.reversed_columns) > 1
+
+
+def _columns(kind: str, signs: Sequence[int], names: Sequence[str]) -> str:
+    """The reversed columns of one kind, as text; "" if there are none."""
+    found = [name for name, sign in zip(names, signs, strict=True) if sign < 0]
+    if len(found) < 2:
+        return f"the {kind} of {found[0]}" if found else ""
+    if len(found) == len(names):
+        return f"both {kind}s" if len(names) == 2 else f"all {kind}s"
+    common = "joints " if all(name.startswith("joint ") for name in found) else ""
+    short = [name.removeprefix("joint ") if common else name for name in found]
+    return f"the {kind}s of {common}{', '.join(short[:-1])} and {short[-1]}"
+
 
 @dataclass(frozen=True)
 class Suspicion:

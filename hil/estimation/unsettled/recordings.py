@@ -87,7 +87,7 @@ def _estimate_chain(
     """The result for a spatial arm; its URDF is kept next to the result."""
     read = _read(paths, config.columns)
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
-    found = estimate_chain_recordings(read.recordings, config, shown)
+    found = estimate_chain_recordings(read.recordings, config, shown, ", ".join(map(str, paths)))
     arm = _arm(read, config.arm.gravity)
     names = config.joint_names
     assert names is not None and config.arm.urdf is not None  # checked by the estimate

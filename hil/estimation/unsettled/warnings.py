@@ -61,12 +61,13 @@ def _signs(recordings: Sequence[Recording]) -> list[str]:
     suspicion = suspect_signs(recordings)
     if suspicion is None:
         return []
-    columns = " and ".join(suspicion.signs.reversed_columns)
+    subject, several = suspicion.signs.said(), suspicion.signs.are_several
+    seem, changed = ("seem", "these signs") if several else ("seems", "the sign")
     negative = f"; as given, {', '.join(suspicion.impossible)} would be negative" if suspicion.impossible else ""
     return [
-        f"The sign of {columns} seems to be reversed: with the sign changed, inverse dynamics leaves "
+        f"{subject.capitalize()} {seem} to be reversed: with {changed} changed, inverse dynamics leaves "
         f"{100 * suspicion.residual:.2g} % of the torque unexplained instead of {100 * suspicion.residual_given:.2g} %"
-        f"{negative}. Correct the sign in the file, or swap the columns."
+        f"{negative}. Correct that in the file, or swap the columns."
     ]
 
 
