@@ -154,7 +154,13 @@ def suspect_order(recordings: Sequence[Recording], torques: bool = True) -> tupl
         return None
     order = slice(None, None, -1 if torques else 1)
     other = [
-        replace(each, torque=each.torque[order].copy(), position=each.position[::-1].copy()) for each in recordings
+        replace(
+            each,
+            torque=each.torque[order].copy(),
+            position=each.position[::-1].copy(),
+            position_step=each.position_step[::-1].copy(),
+        )
+        for each in recordings
     ]
     zeros = turned_zeros(other)
     if zeros is not None:

@@ -125,7 +125,8 @@ def _left(estimate: ShootingEstimate, evidence: SegmentEvidence, trust: Trust) -
     seen = [each for each in evidence.candidates if each.evidence > 1.0 and each.explained > NOTICEABLE]
     if seen:
         part = seen[0].part.replace("_", " ")
-        said += f" A term for {part} would explain {100.0 * seen[0].explained:.0f} % of the residual."
+        article = "an" if part[0] in "aeiou" else "a"
+        said += f" Adding {article} {part} term would remove {100.0 * seen[0].explained:.0f} % of the residual."
     return said
 
 

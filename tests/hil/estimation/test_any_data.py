@@ -74,7 +74,7 @@ COLUMNS = (
         (CSV, COLUMNS.replace('"q2"]', '"elbow"]'), 2, "has no column 'elbow'; it has t, q1, q2, i1, i2"),
         (CSV, COLUMNS.replace("torque_constant = [1.8, 1.8]", ""), 2, "columns.torque_constant is missing"),
         (CSV, COLUMNS.replace('"deg"', '"degrees"'), 2, "position_unit"),
-        (CSV, COLUMNS.replace("[1.8, 1.8]", "[1.8]"), 2, "has 1 entries; position has 2"),
+        (CSV, COLUMNS.replace("[1.8, 1.8]", "[1.8]"), 2, "has 1 entry; position has 2"),
         (CSV, COLUMNS.replace('"deg"', '"turns"'), 2, "are these degrees or encoder"),
         (CSV, COLUMNS.replace('time = "t"', 'time = "t"\ntime_unit = "ms"'), 2, "jumps by"),
         (CSV, "[arm]\ngravity = 9.81\n", 2, "columns.torque_constant is missing"),
