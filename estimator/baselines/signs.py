@@ -28,6 +28,7 @@ multiple of the residual with the signs as given, and explains most of the torqu
 """
 
 MOST_LEFT = 0.5
+QUARTERS = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)  # rad: between the directions from which two angles are measured
 
 _POSITIVE = ("inertia", "viscous", "coulomb")
 _STANDARD_ERRORS = 3.0
@@ -116,21 +117,52 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
     return None if best is None else Suspicion(best[1], best[0], left, impossible)
 
 
-def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | None:
-    """Return evidence that joint 2's angle is measured from a fixed direction instead of from link 1.
+@dataclass(frozen=True)
+class Absolute:
+    """An angle of joint 2 that seems to be measured from a fixed direction instead of from link 1.
 
-    The result is the relative RMS of the worst joint's torque residual, first with angle 2 minus angle 1, then with the
-    angles as given; None if the angle difference does not explain the recordings much better.
+    residual, residual_given: relative RMS of the worst joint's torque residual, with the difference between the angles
+    and as given. turned: angle [rad] that must be added to this difference.
+    """
+
+    residual: float
+    residual_given: float
+    turned: float
+
+
+def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = ()) -> Absolute | None:
+    """Return evidence that joint 2's angle is absolute; None if that does not explain the recordings much better.
+
+    turned: angles [rad] that may have to be added to the difference between the angles, because they were measured from
+    other directions; quarter turns are always tried. The first that explains the recordings as well as any is chosen.
     """
     if recordings[0].joints != 2:
         return None
-    return _better_explained(
-        recordings,
-        [
-            replace(each, position=np.stack([each.position[0], each.position[1] - each.position[0]]))
-            for each in recordings
-        ],
-    )
+    found = []
+    for angle in (*turned, *QUARTERS):
+        evidence = _better_explained(recordings, [_difference(each, angle) for each in recordings])
+        if evidence is not None:
+            found.append(Absolute(*evidence, angle))
+    least = min((each.residual for each in found), default=np.inf)
+    return next((each for each in found if each.residual <= SAME_RESIDUAL * least), None)
+
+
+def suspect_absolute_unzeroed(recordings: Sequence[Recording]) -> Absolute | None:
+    """Return the same evidence for recordings whose zeros are unknown: those of the difference come from gravity."""
+    if recordings[0].joints != 2:
+        return None
+    apart = [_difference(each, 0.0) for each in recordings]
+    zeros = turned_zeros(apart)
+    if zeros is None:
+        return None
+    evidence = _better_explained(recordings, [replace(each, position=each.position + zeros[:, None]) for each in apart])
+    return None if evidence is None else Absolute(*evidence, 0.0)
+
+
+def _difference(recording: Recording, turned: float) -> Recording:
+    """Return the recording with the angle of joint 2 relative to that of joint 1, plus `turned` [rad]."""
+    first, second = recording.position
+    return replace(recording, position=np.stack([first, second - first + turned]))
 
 
 def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | None:

@@ -48,6 +48,12 @@ def causes(fitted: Fitted) -> tuple[str, ...]:
     return found or said or local_residual(*where)
 
 
+def are_known(fitted: Fitted, found: tuple[str, ...]) -> bool:
+    """Whether `found`, the sentences of `causes`, name a cause and not only where the residual is large."""
+    where = fitted.recordings, fitted.names, fitted.predicted, fitted.estimate.segment_length
+    return bool(found) and found != local_residual(*where)
+
+
 def _clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return tuple(
         f"{_unsigned(recordings, each.joint)}The torque of joint {each.joint} seems to have been limited to about "

@@ -71,7 +71,7 @@ def _estimate_planar(
     columns, gravity = read.columns, config.arm.gravity
     zeros = (columns.zeros_unknown or config.model.zeros) and gravity > 0.0
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
-    refuse_slips(read.recordings, ", ".join(map(str, paths)))
+    refuse_slips(read.recordings, ", ".join(map(str, paths)), columns.zero)
     jumps = jump_sentences(whole.recordings, whole.names, whole.stepped)
     given = Given(names=read.names, jumps=jumps, origin=tuple(columns.zero or ()))
     found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped, given)

@@ -59,6 +59,12 @@ def test_all_torques_reversed_shows_in_negative_inertia(recording: Recording) ->
 
 def test_the_words() -> None:
     assert Signs((1, -1), (1, -1)).reversed_columns == ("the torque of joint 2", "the position of joint 2")
+    assert Signs((1, -1), (1, 1)).said() == "the sign of the torque of joint 2"
+    assert Signs((-1, -1), (1, 1)).said() == "the signs of both torques"
+    assert Signs((1, -1), (1, -1)).said() == "the signs of the torque of joint 2 and the position of joint 2"
+    assert Signs((1, -1, -1), (1, 1, 1)).said() == "the signs of the torques of joints 2 and 3"
+    assert Signs((1, -1, -1), (1, 1, 1)).said(("a", "b", "c")) == "the signs of the torques of b and c"
+    assert Signs((-1, -1, -1), (1, 1, 1)).said() == "the signs of all torques"
 
 
 def test_too_short_a_recording_says_nothing(recording: Recording) -> None:
