@@ -12,6 +12,7 @@ from hil.errors import CsvError
 from hil.estimation.unsettled.slips import refuse_slips
 from hil.estimator.baselines import signs
 from hil.estimator.baselines.signs import Signs, suspect_signs
+from hil.estimator.baselines.torque_faults import suspect_uneven
 from hil.estimator.data.recording import Recording
 from hil.recordings.convert import convert
 from hil.recordings.csv_file import read_csv_table
@@ -97,3 +98,16 @@ def test_a_reversed_sign_that_explains_hardly_anything_is_not_offered(
 
     monkeypatch.setattr(signs, "_fit", fitted)
     assert (suspect_signs([recording]) is not None) is offered
+
+
+@pytest.mark.parametrize(("joint", "late", "early"), [(1, 2, 1), (0, 1, 2)])
+def test_a_joint_that_is_logged_later_than_the_other_is_named(joint: int, late: int, early: int) -> None:
+    motion = two_joints(10.0)
+    good = Recording(motion.time, motion.torque, motion.position, np.full(2, 0.0015), "held")
+    assert suspect_uneven([good]) is None
+    shifted = good.position.copy()
+    shifted[joint, 3:] = good.position[joint, :-3]
+    found = suspect_uneven([replace(good, position=shifted)])
+    assert found is not None
+    assert (found.late, found.early) == (late, early)
+    assert found.by == pytest.approx(0.015, abs=0.0051)
