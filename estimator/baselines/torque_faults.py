@@ -23,6 +23,7 @@ DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # 
 LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
 FEWEST_STEPS = 2  # sampling intervals between the best delays of two joints
 UNEVEN = 0.85  # ratio of a joint's residual at its best delay to that at the other joint's, below which they differ
+EXPLAINED = 0.3  # relative residual of each joint at its best delay, above which the torque does not fit at all
 EVALUATIONS = 30  # of the search for delay and drift
 MOST_SAMPLES = 30_000  # more would take too long
 
@@ -155,7 +156,7 @@ def suspect_uneven(recordings: Sequence[Recording]) -> Uneven | None:
         return None
     pairs = [(float(left[best[i], i]), float(left[best[j], i])) for i, j in ((late, early), (early, late))]
     own, other = min(pairs, key=lambda each: each[0] / each[1])
-    if not own < UNEVEN * other:
+    if not own < UNEVEN * other or left.min(axis=0).max() > EXPLAINED:
         return None
     return Uneven(late + 1, early + 1, unit * float(best[late] - best[early]), own, other)
 
