@@ -37,35 +37,21 @@ TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 
 
 
 @dataclass(frozen=True)
-class Fault:
-    """A change of the columns that explains a recording much better.
-
-    residual, residual_given: relative RMS of the worst joint's torque residual with the change, and as given.
+class Reversed:
+    """Reversed columns. residuals: relative RMS of the worst joint's torque residual with the change, and as given.
+    impossible: whether friction is negative as given, as if all torques are reversed.
     """
 
-    residual: float
-    residual_given: float
-
-
-@dataclass(frozen=True)
-class Reversed(Fault):
-    """Reversed columns. impossible: whether friction is negative as given, as if all torques are reversed."""
-
+    residuals: tuple[float, float]
     signs: Signs
     impossible: bool
 
 
 @dataclass(frozen=True)
-class Contradictory(Fault):
-    """Torques that contradict each other. factors: true torque over the column's (joints,), relative to joint 1."""
+class WrongTimes:
+    """Times that are `factor` times the true ones. residuals: as for reversed columns."""
 
-    factors: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class WrongTimes(Fault):
-    """Times that are `factor` times the true ones."""
-
+    residuals: tuple[float, float]
     factor: float
 
 
@@ -140,12 +126,12 @@ class ColumnCheck:
         if not (gained and least < WELL):
             return None
         worst, _, signs = min((each for each in tried if each[0] <= AS_WELL * least), key=lambda each: each[1])
-        return Reversed(worst, given.worst, signs, impossible)
+        return Reversed((worst, given.worst), signs, impossible)
 
-    def contradictory_torques(self) -> Contradictory | None:
-        """The factors of all torques but the first that explain the recordings better.
+    def contradictory_torques(self) -> tuple[float, ...] | None:
+        """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better.
 
-        Their prior is weak and friction absorbs much, so a small gain is evidence; the likelihood can then decide.
+        The links' prior is weak and friction absorbs much, so a small gain is evidence; the likelihood can then decide.
         """
         normal, given = self._given
         factors, best = np.ones(self.model.joints), given
@@ -159,7 +145,7 @@ class ColumnCheck:
                 factors = chosen if best is not given else factors
         if given.misfit - best.misfit < GAIN * factors.size:
             return None
-        return Contradictory(best.worst, given.worst, tuple(factors.tolist()))
+        return tuple(factors.tolist())
 
     def wrong_times(self) -> WrongTimes | None:
         """The factor of the times that explains the recordings much better, by gravity and the described geometry."""
@@ -172,7 +158,7 @@ class ColumnCheck:
         worst, factor = min(
             coarse, *((self._slower(coarse[1] * step), coarse[1] * step) for step in STEPS[::4].tolist())
         )
-        return WrongTimes(worst, given.worst, factor) if worst < min(CLEAR * given.worst, WELL) else None
+        return WrongTimes((worst, given.worst), factor) if worst < min(CLEAR * given.worst, WELL) else None
 
     def _slower(self, factor: float) -> float:
         """The residual if the true times are those of the recordings divided by `factor`."""

@@ -85,11 +85,6 @@ def ratios_of(names: Sequence[str], value: Values, std: Values) -> dict[str, Qua
     }
 
 
-def allowed_ratio() -> float:
-    """The logarithm of the ratio of two torque columns up to which they do not contradict each other."""
-    return COLUMNS_APART * USUAL_RATIO_STD
-
-
 def contradictions(
     joints: Sequence[str],
     extra: Mapping[str, Quantity],

@@ -16,8 +16,8 @@ from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
 from hil.estimation.chain_estimate import vague
 from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
-from hil.estimation.unsettled.chain_slips import apart, ratios_apart, refuse_chain_slips, regression_said
-from hil.estimator.chain.column_faults import ColumnCheck, Contradictory
+from hil.estimation.unsettled.chain_slips import refuse_chain_slips, torques_apart
+from hil.estimator.chain.column_faults import ColumnCheck
 from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -74,8 +74,8 @@ def estimate_chain_recordings(
     )
     check = ColumnCheck.of(recordings, ChainModel(base), prior)
     refuse_chain_slips(check, config.joint_names or (), source)
-    contradictory = None if model.torque_scale else apart(check)
-    found = _identified(recordings, model, prior, contradictory is not None)
+    contradictory = () if model.torque_scale else torques_apart(check, [joint.name for joint in arm.joints])
+    found = _identified(recordings, model, prior, bool(contradictory))
     model = found.model
     foretold = _held_out(recordings, model, prior)
     linear = len(model.linear_names)
@@ -141,7 +141,7 @@ def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior
     """
     if contradictory and all(each.between == "held" for each in recordings):
         found = identify_recordings(recordings, replace(model, torque_scale=True), prior)
-        if ratios_apart(found):
+        if contradictions([""] * model.joints, ratios_of(found.names, found.value, found.std), {}, "column"):
             return found
     return identify_recordings(recordings, model, prior)
 
@@ -185,9 +185,9 @@ def _verdict(
     arm: ArmDescription,
     foretold: Array | None,
     prior: Prior,
-    contradictory: Contradictory | None = None,
+    contradictory: Sequence[str] = (),
 ) -> Verdict:
-    """The verdict, with reasons. contradictory: torques that contradict each other according to the regression."""
+    """The verdict, with reasons. contradictory: on torques that contradict each other in the regression."""
     names = found.model.base.names
     weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
     trust: Trust = "yes"
@@ -241,9 +241,9 @@ def _verdict(
     differ = contradictions(joints, ratios, {}, "column", found.conflicts)
     trust = lowered(trust, "with care" if differ else "")
     sentences += (*differ, *ratios_said(joints, ratios, "column", differ))
-    if contradictory is not None and not found.simulated:
+    if contradictory and not found.simulated:
         trust = "no"
-        sentences.append(regression_said(contradictory, joints))
+        sentences += contradictory
     if not found.reached:
         trust = lowered(trust, "with care")
         sentences.append(

@@ -86,7 +86,7 @@ COLUMNS = (
         (CSV.replace("t,q1", "t [ms],q1"), COLUMNS + 'time_unit = "s"\n', 2, "states the unit ms"),
         (CSV.replace("q1,q2", "q1 [furlong],q2"), COLUMNS.replace('position_unit = "deg"', ""), 2, "'furlong'"),
         (CSV, COLUMNS.replace('"deg"', '"ticks"'), 2, "columns.ticks_per_turn is missing"),
-        (CSV, COLUMNS + 'pwm = ["i1", "i2"]\n', 2, "current and pwm are both given"),
+        (CSV, COLUMNS + 'pwm = ["i1", "i2"]\n', 2, "columns.current and columns.pwm are both given"),
         (CSV, COLUMNS.replace("current", "voltage"), 2, "columns.torque_per_volt is missing"),
         (re.sub(r"^(\d\.\d)\d", r"\1", CSV, flags=re.MULTILINE), COLUMNS, 2, "they are too coarse"),
         ("".join(CSV.splitlines(True)[:20]), COLUMNS, 2, "at least 32 are needed"),
