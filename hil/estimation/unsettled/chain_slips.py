@@ -8,6 +8,8 @@ from hil.estimation.unsettled.slips import reversal_said, unexplained
 from hil.estimator.chain.column_faults import ColumnCheck
 from hil.results.parts import Quantity
 
+ROUGHLY = 0.05  # assumed relative standard error of a ratio of torques that a regression gives
+
 
 def refuse_chain_slips(check: ColumnCheck | None, joints: Sequence[str], source: str) -> None:
     """Raise CsvError if signs are reversed or the times have a wrong scale. joints: their names."""
@@ -31,5 +33,5 @@ def refuse_chain_slips(check: ColumnCheck | None, joints: Sequence[str], source:
 def torques_apart(check: ColumnCheck | None, joints: Sequence[str]) -> tuple[str, ...]:
     """Sentences on torque columns whose factors differ by more than the spread of torque constants allows."""
     factors = None if check is None else check.contradictory_torques()
-    known = {f"{RATIO}_{number}": Quantity(each, 0.0, "1") for number, each in enumerate(factors or (), 1)}
+    known = {f"{RATIO}_{number}": Quantity(each, ROUGHLY * each, "1") for number, each in enumerate(factors or (), 1)}
     return contradictions(joints, known, {}, "column")
