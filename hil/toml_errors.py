@@ -115,7 +115,8 @@ def _fault(detail: Any, root: type[BaseModel], table: str) -> str:
     if kind == "value_error":
         # The message about a whole table already names its keys.
         about = key if isinstance(detail["input"], dict | BaseModel) else f"{key} = {_shown(detail['input'])}"
-        return f"{about}: {context['error']}" if key else str(context["error"])
+        said = str(context["error"])
+        return said if not key or said.startswith(f"{key}.") else f"{about}: {said}"
     message = _exact_length(detail, root) or what_is_wrong(detail)
     return f"{key} = {_shown(detail['input'])}: {message}{_unit_hint(detail, root)}{_brackets_hint(key, detail)}"
 

@@ -28,6 +28,7 @@ multiple of the residual with the signs as given, and explains most of the torqu
 """
 
 MOST_LEFT = 0.5
+QUARTERS = (0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi)  # rad: between the directions from which two angles are measured
 
 _POSITIVE = ("inertia", "viscous", "coulomb")
 _STANDARD_ERRORS = 3.0
@@ -45,6 +46,35 @@ class Signs:
         """The reversed columns, as text."""
         named = [f"the torque of joint {joint}" for joint, sign in enumerate(self.torque, start=1) if sign < 0]
         return (*named, *(f"the position of joint {joint}" for joint, sign in enumerate(self.position, 1) if sign < 0))
+
+    def said(self, joints: Sequence[str] = ()) -> str:
+        """The subject of a sentence on the reversed signs, such as "the signs of both torques".
+
+        joints: names of the joints, by default their numbers.
+        """
+        names = joints or [f"joint {number}" for number in range(1, len(self.torque) + 1)]
+        listed = [
+            _columns(kind, signs, names) for kind, signs in (("torque", self.torque), ("position", self.position))
+        ]
+        plural = "s" if self.are_several else ""
+        return f"the sign{plural} of {' and '.join(each for each in listed if each)}"
+
+    @property
+    def are_several(self) -> bool:
+        """Whether more than one column is reversed."""
+        return len(self.reversed_columns) > 1
+
+
+def _columns(kind: str, signs: Sequence[int], names: Sequence[str]) -> str:
+    """The reversed columns of one kind, as text; "" if there are none."""
+    found = [name for name, sign in zip(names, signs, strict=True) if sign < 0]
+    if len(found) < 2:
+        return f"the {kind} of {found[0]}" if found else ""
+    if len(found) == len(names):
+        return f"both {kind}s" if len(names) == 2 else f"all {kind}s"
+    common = "joints " if all(name.startswith("joint ") for name in found) else ""
+    short = [name.removeprefix("joint ") if common else name for name in found]
+    return f"the {kind}s of {common}{', '.join(short[:-1])} and {short[-1]}"
 
 
 @dataclass(frozen=True)
@@ -87,21 +117,52 @@ def suspect_signs(recordings: Sequence[Recording]) -> Suspicion | None:
     return None if best is None else Suspicion(best[1], best[0], left, impossible)
 
 
-def suspect_absolute(recordings: Sequence[Recording]) -> tuple[float, float] | None:
-    """Return evidence that joint 2's angle is measured from a fixed direction instead of from link 1.
+@dataclass(frozen=True)
+class Absolute:
+    """An angle of joint 2 that seems to be measured from a fixed direction instead of from link 1.
 
-    The result is the relative RMS of the worst joint's torque residual, first with angle 2 minus angle 1, then with the
-    angles as given; None if the angle difference does not explain the recordings much better.
+    residual, residual_given: relative RMS of the worst joint's torque residual, with the difference between the angles
+    and as given. turned: angle [rad] that must be added to this difference.
+    """
+
+    residual: float
+    residual_given: float
+    turned: float
+
+
+def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = ()) -> Absolute | None:
+    """Return evidence that joint 2's angle is absolute; None if that does not explain the recordings much better.
+
+    turned: angles [rad] that may have to be added to the difference between the angles, because they were measured from
+    other directions; quarter turns are always tried. The first that explains the recordings as well as any is chosen.
     """
     if recordings[0].joints != 2:
         return None
-    return _better_explained(
-        recordings,
-        [
-            replace(each, position=np.stack([each.position[0], each.position[1] - each.position[0]]))
-            for each in recordings
-        ],
-    )
+    found = []
+    for angle in (*turned, *QUARTERS):
+        evidence = _better_explained(recordings, [_difference(each, angle) for each in recordings])
+        if evidence is not None:
+            found.append(Absolute(*evidence, angle))
+    least = min((each.residual for each in found), default=np.inf)
+    return next((each for each in found if each.residual <= SAME_RESIDUAL * least), None)
+
+
+def suspect_absolute_unzeroed(recordings: Sequence[Recording]) -> Absolute | None:
+    """Return the same evidence for recordings whose zeros are unknown: those of the difference come from gravity."""
+    if recordings[0].joints != 2:
+        return None
+    apart = [_difference(each, 0.0) for each in recordings]
+    zeros = turned_zeros(apart)
+    if zeros is None:
+        return None
+    evidence = _better_explained(recordings, [replace(each, position=each.position + zeros[:, None]) for each in apart])
+    return None if evidence is None else Absolute(*evidence, 0.0)
+
+
+def _difference(recording: Recording, turned: float) -> Recording:
+    """Return the recording with the angle of joint 2 relative to that of joint 1, plus `turned` [rad]."""
+    first, second = recording.position
+    return replace(recording, position=np.stack([first, second - first + turned]))
 
 
 def suspect_swapped(recordings: Sequence[Recording]) -> tuple[float, float] | None:
@@ -125,7 +186,13 @@ def suspect_order(recordings: Sequence[Recording], torques: bool = True) -> tupl
         return None
     order = slice(None, None, -1 if torques else 1)
     other = [
-        replace(each, torque=each.torque[order].copy(), position=each.position[::-1].copy()) for each in recordings
+        replace(
+            each,
+            torque=each.torque[order].copy(),
+            position=each.position[::-1].copy(),
+            position_step=each.position_step[::-1].copy(),
+        )
+        for each in recordings
     ]
     zeros = turned_zeros(other)
     if zeros is not None:

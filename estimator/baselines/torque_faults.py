@@ -21,6 +21,9 @@ BEYOND = np.array([0.7, 0.55, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.04, 0.02])
 INTERVALS = np.arange(-4.0, 4.1)  # constant delays that are tried, in sampling intervals
 DRIFTS = np.array([-16.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 16.0])  # over the longest recording, likewise
 LATEST = 0.06  # s by which the torque of one joint may be earlier or later than that of the others
+FEWEST_STEPS = 2  # sampling intervals between the best delays of two joints
+UNEVEN = 0.85  # ratio of a joint's residual at its best delay to that at the other joint's, below which they differ
+EXPLAINED = 0.3  # relative residual of each joint at its best delay, above which the torque does not fit at all
 EVALUATIONS = 30  # of the search for delay and drift
 MOST_SAMPLES = 30_000  # more would take too long
 
@@ -70,6 +73,21 @@ class Late:
     residual_given: float
 
 
+@dataclass(frozen=True)
+class Uneven:
+    """Joints whose own torques fit their motion best with different delays.
+
+    late, early: the joints (from 1) with the longest and the shortest delay. by: difference of the delays [s].
+    residual, residual_given: relative RMS of the torque residual of one of them, with its own and the other's delay.
+    """
+
+    late: int
+    early: int
+    by: float
+    residual: float
+    residual_given: float
+
+
 def suspect_clipped(recordings: Sequence[Recording]) -> tuple[Clipped, ...]:
     """Return the joints whose motion is explained much better by a limited torque."""
     given = _residuals(recordings)
@@ -115,6 +133,32 @@ def suspect_late(recordings: Sequence[Recording]) -> Late | None:
     ]
     best = min(tried, key=lambda each: each.residual)
     return best if best.residual < LESS_RESIDUAL * common[0] else None
+
+
+def suspect_uneven(recordings: Sequence[Recording]) -> Uneven | None:
+    """Return the joints whose best delays differ, judging each joint by its own residual.
+
+    `suspect_late` compares the residuals of the worst joint, which friction may dominate; this evidence is weaker.
+    """
+    joints = recordings[0].joints
+    if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
+        return None
+    unit = float(np.median([each.interval for each in recordings]))
+    most = max(FEWEST_STEPS + 1, min(24, round(LATEST / unit)))
+    rows = [
+        _residuals([_delayed(each, np.full(joints, unit * steps)) for each in recordings])
+        for steps in range(-most, most + 1)
+    ]
+    left = np.stack([np.full(joints, np.inf) if row is None else row for row in rows])
+    best = np.argmin(left, axis=0)
+    late, early = int(np.argmax(best)), int(np.argmin(best))
+    if best[late] - best[early] < FEWEST_STEPS or best.min() == 0 or best.max() == 2 * most:
+        return None
+    pairs = [(float(left[best[i], i]), float(left[best[j], i])) for i, j in ((late, early), (early, late))]
+    own, other = min(pairs, key=lambda each: each[0] / each[1])
+    if not own < UNEVEN * other or left.min(axis=0).max() > EXPLAINED:
+        return None
+    return Uneven(late + 1, early + 1, unit * float(best[late] - best[early]), own, other)
 
 
 def _delayed(recording: Recording, delays: Array) -> Recording:

@@ -6,7 +6,7 @@ adds no information (docs/theory.md); in that case the regression's result is re
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -166,7 +166,9 @@ def torque_error(recordings: Sequence[Recording], found: RecordedChain) -> Array
     RMS (joints,).
     """
     value = np.array([found.parameters[name] for name in found.model.linear_names])
-    return _torque_residual(recordings, found.model, value, found.cutoff)
+    scale = [found.parameters.get(f"torque_scale_{joint}", 1.0) for joint in range(1, found.model.joints + 1)]
+    true = [replace(each, torque=each.torque * np.array(scale)[:, None]) for each in recordings]
+    return _torque_residual(true, found.model, value, found.cutoff)
 
 
 def _regression(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> tuple[Array, Array, float]:

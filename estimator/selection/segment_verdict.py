@@ -24,6 +24,7 @@ from hil.estimator.selection.verdict import (
 )
 
 NEARLY_EXPLAINED = 1.5  # ratio of residual to noise up to which undetermined friction near standstill does no harm
+UNDETERMINED = 10.0  # standard error over value above which a parameter is not determined at all
 LITTLE_TORQUE = 0.1  # fraction of the RMS torque; gravity torques below this are negligible
 IMPROVEMENT = {
     "inertia": "faster motion",
@@ -57,6 +58,8 @@ class SegmentEvidence:
     """Findings that cast no doubt on the values, as sentences."""
     gravity: bool = True
     """Whether gravity acts in the arm's plane."""
+    reason: str = ""
+    """Why the estimate is unusable, as the end of a sentence."""
 
 
 def relative_std(recordings: Sequence[Recording], estimate: ShootingEstimate, gravity: bool = True) -> dict[str, float]:
@@ -89,7 +92,7 @@ def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, 
     trust = _trust(left, held_out, relative[weakest], evidence)
     trust = lowered(trust, contradicted(evidence.conflicts, explained))
     sentences = (
-        *(("Do not use these numbers: the warnings give the reasons.",) if evidence.faulty else ()),
+        *((f"Do not use these numbers: {evidence.reason or 'see the warnings'}.",) if evidence.faulty else ()),
         _left(estimate, evidence, trust),
         _predicted(held_out, estimate.segment_length),
         *conflict_sentences(evidence.conflicts, explained),
@@ -125,7 +128,8 @@ def _left(estimate: ShootingEstimate, evidence: SegmentEvidence, trust: Trust) -
     seen = [each for each in evidence.candidates if each.evidence > 1.0 and each.explained > NOTICEABLE]
     if seen:
         part = seen[0].part.replace("_", " ")
-        said += f" A term for {part} would explain {100.0 * seen[0].explained:.0f} % of the residual."
+        article = "an" if part[0] in "aeiou" else "a"
+        said += f" Adding {article} {part} term would remove {100.0 * seen[0].explained:.0f} % of the residual."
     return said
 
 
@@ -139,9 +143,10 @@ def _predicted(held_out: Array | None, length: float) -> str:
 
 
 def _weakest(name: str, part: float, spoiled: bool) -> str:
+    if not part < UNDETERMINED:
+        remedy = "" if spoiled else f" To identify it, use {IMPROVEMENT[kind_of(name)]}."
+        return f"This motion does not determine {name}.{remedy}"
     if part <= WELL_KNOWN or spoiled:
         return f"The least certain parameter is {name}, known to within {percent(part)}."
-    if not np.isfinite(part):
-        return f"This motion provides no information on {name}. To identify it, use {IMPROVEMENT[kind_of(name)]}."
     improvement = IMPROVEMENT[kind_of(name)]
     return f"The least certain parameter is {name}, known to within {percent(part)}. To improve it, use {improvement}."

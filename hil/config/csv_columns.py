@@ -118,9 +118,9 @@ class Columns(_Table):
     def _consistent(self) -> Self:
         drives = [kind for kind in ("torque", "current", "voltage", "pwm") if getattr(self, kind) is not None]
         if len(drives) > 1:
-            raise ValueError(f"columns: {' and '.join(drives)} are both given; give only one of them")
+            raise ValueError(f"columns.{' and columns.'.join(drives)} are both given; give only one of them")
         if self.time is not None and self.rate is not None:
-            raise ValueError("columns: give either time or rate, not both")
+            raise ValueError("columns.time and columns.rate are both given; give only one of them")
         if self.current is not None and self.torque_constant is None:
             raise ValueError(
                 "columns.torque_constant is missing: columns.current requires it (in N m/A, one value per joint)"
@@ -136,7 +136,22 @@ class Columns(_Table):
         if self.position_unit == TICKS and self.ticks_per_turn is None:
             raise ValueError("columns.ticks_per_turn is missing: positions are in ticks (4096 for X-series servos)")
         self._one_each()
+        self._one_role_each()
         return self
+
+    def _one_role_each(self) -> None:
+        """Refuse a column that is named twice: its values cannot be two quantities."""
+        roles = [("columns.time", [self.time] if self.time else []), ("columns.position", self.position or [])]
+        if self.drive is not None:
+            roles.append((f"columns.{self.drive}", getattr(self, self.drive)))
+        seen: dict[str, str] = {}
+        for key, names in roles:
+            for name in names:
+                if seen.get(name) == key:
+                    raise ValueError(f'{key} names "{name}" twice; each joint needs a column of its own')
+                if name in seen:
+                    raise ValueError(f'{seen[name]} and {key} both name "{name}"; a column holds only one quantity')
+                seen[name] = key
 
     def _one_each(self) -> None:
         per_joint = ("torque", "current", "voltage", "pwm", "torque_constant", "resistance", "torque_per_volt", "zero")
@@ -144,7 +159,8 @@ class Columns(_Table):
         count = len(self.position) if self.position is not None else None
         for key, size in given.items():
             if count is not None and size != count:
-                raise ValueError(f"columns.{key} has {size} entries; position has {count}, one per joint")
+                entries = "1 entry" if size == 1 else f"{size} entries"
+                raise ValueError(f"columns.{key} has {entries}; position has {count}, one per joint")
 
 
 class JointName(BaseModel):

@@ -388,7 +388,8 @@ def _without_lengths(path: Path, values: dict[str, Any]) -> Config:
 
 def _same_length(key: str, values: list[float] | list[list[int]], count: int) -> None:
     if len(values) != count:
-        raise ValueError(f"{key} has {len(values)} entries; it needs {count}, one for each [[joints]] table")
+        entries = "1 entry" if len(values) == 1 else f"{len(values)} entries"
+        raise ValueError(f"{key} has {entries}; it needs {count}, one for each [[joints]] table")
 
 
 def _all_different(key: str, values: Sequence[int | str]) -> None:

@@ -125,10 +125,10 @@ def _filled(source: str, rows: Rows, held: bool) -> Rows:
         inside = first > 0 and last < hole.size
         if not inside or rows.time[last] - rows.time[first - 1] > LONGEST_HOLE:
             out[first:last] = True
-    for row in torque:
+    for joint, row in enumerate(torque, 1):
         known = np.isfinite(row)
         if not known.any():
-            raise CsvError(f"{source}: a torque or current column holds no numbers at all.")
+            raise CsvError(f"{source}: the torque or current column of joint {joint} holds no numbers at all.")
         before = np.maximum.accumulate(np.where(known, np.arange(row.size), 0))
         row[~known] = row[before][~known] if held else np.interp(rows.time[~known], rows.time[known], row[known])
     notes = []

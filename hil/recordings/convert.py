@@ -1,5 +1,6 @@
 """Conversion of a table, given the meaning of its columns, to recordings in SI units."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,7 @@ from numpy.typing import NDArray
 
 from hil.config.csv_columns import TICKS, Columns
 from hil.errors import CsvError
-from hil.estimator.data.recording import FEWEST_SAMPLES, LONGEST_GAP, Recording
+from hil.estimator.data.recording import FEWEST_SAMPLES, LEAST_MOTION, LONGEST_GAP, Recording
 from hil.estimator.errors import RecordingError
 from hil.recordings.clean import Rows, cleaned
 from hil.recordings.encoder import encoder_step
@@ -16,9 +17,9 @@ from hil.recordings.missing_codes import without_codes
 from hil.recordings.plausible import refuse_degrees
 from hil.recordings.table import Table
 from hil.recordings.units import UNITS, unit_of, wrapped
+from hil.recordings.velocity import contradict, rates
 from hil.recordings.velocity import doubts as velocity_doubts
 from hil.recordings.velocity import notes as velocity_notes
-from hil.recordings.velocity import rates
 
 Values = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ class Converted:
 
     names: one per recording. stepped: whether each joint's encoder resolution is known. columns: description of the
     columns, including guesses. notes: one sentence per guess or correction. doubts: one per contradiction among the
-    columns.
+    columns. unusable: whether a contradiction is so large that a model is useless.
     """
 
     recordings: tuple[Recording, ...]
@@ -40,6 +41,7 @@ class Converted:
     columns: Columns
     notes: tuple[str, ...]
     doubts: tuple[str, ...] = ()
+    unusable: bool = False
 
 
 def convert(table: Table, columns: Columns) -> Converted:
@@ -65,7 +67,7 @@ def convert(table: Table, columns: Columns) -> Converted:
     torque = np.stack([_torque(table, whole, joint, notes) for joint in range(len(whole.position))])
     zero = np.array(whole.zero or [0.0] * len(position))[:, None]
     steps = [whole.position_step or encoder_step(row) for row in position]
-    step = np.array([each or SMALLEST_STEP for each in steps])
+    step = _steps(steps, position)
     held = whole.between == "held"
     parts = cleaned(table.source, Rows(time, torque, position + zero), held)
     notes += [note for part in parts for note in part.notes]
@@ -86,8 +88,22 @@ def convert(table: Table, columns: Columns) -> Converted:
         table.source if len(long) == 1 else f"{table.source}, part {number}" for number in range(1, len(long) + 1)
     )
     return Converted(
-        recordings, names, tuple(each is not None for each in steps), whole, tuple(notes), velocity_doubts(found)
+        recordings,
+        names,
+        tuple(each is not None for each in steps),
+        whole,
+        tuple(notes),
+        velocity_doubts(found),
+        contradict(found),
     )
+
+
+def _steps(found: Sequence[float | None], position: Values) -> Values:
+    """The encoder steps (joints,); a joint that moves too little to show its own is assumed to have another's."""
+    known = max((each for each in found if each is not None), default=SMALLEST_STEP)
+    swing = np.nanmax(position, axis=1, initial=-np.inf) - np.nanmin(position, axis=1, initial=np.inf)
+    other = np.where(swing < LEAST_MOTION * known, known, SMALLEST_STEP)
+    return np.array([each or float(others) for each, others in zip(found, other, strict=True)])
 
 
 def _is_long_enough(part: Rows, segment: float) -> bool:

@@ -3,7 +3,7 @@
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from hil.config.csv_columns import PLANAR, TORQUE_UNITS, Columns
 from hil.errors import CsvError
@@ -36,7 +36,6 @@ _NOT_POSITION = re.compile(
 )
 _LENGTHS = ("mm", "cm", "m", "in", "inch")
 _EXAMPLE = 5  # columns of a recording of two joints
-_EXAMPLE_OF_ONE = 3
 _SUPPLY = re.compile(r"(?<![a-z])(supply|battery|bus|input)(?![a-z])", re.I)
 
 
@@ -155,18 +154,51 @@ def _unclear(table: Table, what: str, found: Iterable[str]) -> CsvError:
             "tip does not determine the joint angles; record the encoders, or compute the angles first."
         )
     seen = f"several are candidates ({', '.join(some[:12])})" if some else "none has a recognisable name"
-    example = '[columns]\ntime = "time"\nposition = ["q1", "q2"]\ntorque = ["tau1", "tau2"]'
-    names = list(table.columns)
-    if len(names) >= _EXAMPLE:  # with this file's own names, in the usual order
-        shown = [json.dumps(split_head(name)[0], ensure_ascii=False) for name in names[:_EXAMPLE]]
-        example = (
-            f"[columns]\ntime = {shown[0]}\nposition = [{shown[1]}, {shown[2]}]\ntorque = [{shown[3]}, {shown[4]}]"
-        )
-    elif len(names) >= _EXAMPLE_OF_ONE:
-        shown = [json.dumps(split_head(name)[0], ensure_ascii=False) for name in names[:_EXAMPLE_OF_ONE]]
-        example = f"[columns]\ntime = {shown[0]}\nposition = [{shown[1]}]\ntorque = [{shown[2]}]"
     return CsvError(
         f"{table.source}: which columns hold {what}? Of {table.listed()}, {seen}. Specify them in --config ARM.toml "
-        '(in Python: config="ARM.toml"), '
-        f"for example, if this is their order:\n{example}"
+        f'(in Python: config="ARM.toml"), for example, if these are the right ones:\n{_example(table)}'
     )
+
+
+def _example(table: Table) -> str:
+    """A `[columns]` table with this file's own names: those that are recognised, then the others in the usual order."""
+    words = {split_head(name)[0]: _spaced(split_head(name)[0]) for name in table.columns}
+    kinds = {name: _kind(name, spaced) for name, spaced in words.items()}
+    time = next((name for name, kind in kinds.items() if kind == "time"), None)
+    position = _first_group(kinds, "position")
+    drive = next((kind for kind in ("torque", "current", "voltage", "pwm") if kind in kinds.values()), "torque")
+    driven = _first_group(kinds, drive)
+    joints = len(position or driven) or (1 if len(words) < _EXAMPLE else PLANAR)
+    rest = [name for name, kind in kinds.items() if kind == "unknown"]
+    if time is None and len(rest) > joints * ((not position) + (not driven)):
+        time = rest.pop(0)
+    position = position or [rest.pop(0) for _ in range(min(joints, len(rest)))]
+    driven = driven or rest[:joints]
+    if len(position) != len(driven) or not position:
+        time, position, drive, driven = "time", ["q1", "q2"], "torque", ["tau1", "tau2"]
+    when = f"time = {_quoted(time)}" if time is not None else "rate = 200.0  # samples per second"
+    listed = [f"{key} = [{', '.join(map(_quoted, names))}]" for key, names in (("position", position), (drive, driven))]
+    return "\n".join(("[columns]", when, *listed))
+
+
+def _quoted(name: str) -> str:
+    return json.dumps(name, ensure_ascii=False)
+
+
+def _kind(name: str, words: str) -> str:
+    """The kind of a column by its name: "other" if it is known to be none that is needed, "unknown" if nobody knows."""
+    if _TIME.fullmatch(_last(name)):
+        return "time"
+    found = next((kind for kind, pattern in _KINDS.items() if pattern.search(words)), "unknown")
+    if _NOT_POSITION.search(words) or (found == "position" and _NOT_MEASURED.search(words)):
+        return "other"
+    return found
+
+
+def _first_group(kinds: Mapping[str, str], wanted: str) -> list[str]:
+    """The first columns of a kind that differ only in the joint's number; none if they are too many."""
+    groups: dict[str, list[str]] = defaultdict(list)
+    for name, kind in kinds.items():
+        if kind == wanted:
+            groups[_stem(name)].append(name)
+    return next((names for names in groups.values() if len(names) <= PLANAR), [])

@@ -27,9 +27,11 @@ def read_dataset(folder: Path) -> list[Table]:
     """Read the episodes of a LeRobot dataset, in order. Raises CsvError."""
     try:
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
-        features = dict(info.get("features", {}))
-    except (OSError, ValueError, AttributeError, TypeError) as error:
+    except (OSError, ValueError) as error:
         raise CsvError(f"{folder / INFO} cannot be read: {error}.") from error
+    features = info.get("features", {}) if isinstance(info, dict) else None
+    if not isinstance(features, dict):
+        raise CsvError(f'{folder / INFO} must hold an object with a table "features", as LeRobot writes it.')
     files = sorted((folder / "data").rglob("*.parquet"))
     if not files:
         raise CsvError(f"{folder} is a LeRobot dataset without data: it has no data/**/*.parquet.")

@@ -23,6 +23,7 @@ FEWEST_WINDOWS = 8
 LONGEST_LAG = 0.3  # s
 ALIKE = 0.99  # correlation of the two motions below which a column is not the velocity of that joint
 APART = 0.04  # relative difference that is worth a warning
+FAR_APART = 0.2  # logarithm of the factor beyond which the result is unusable: inertias are off by 50 %
 LATE = 0.02  # s likewise
 KNOWN_UNITS = (1.0, 180.0 / math.pi, 30.0 / math.pi, 30.0 / math.pi / 0.229)  # rad/s, deg/s, rpm, X-series ticks
 _VELOCITY = re.compile(r"(?<![a-z])(vel|velocity|speed|omega|dq|qd|qdot)(?![a-z])", re.I)
@@ -53,10 +54,14 @@ def rates(table: Table, time: Values, position: Values) -> tuple[Rate, ...]:
     return known if len(known) == len(position) else ()
 
 
+def contradict(found: Sequence[Rate]) -> bool:
+    """Whether velocities contradict positions so much that a model of one of them is useless."""
+    return any(abs(math.log(factor)) > FAR_APART for factor in _factors(found))
+
+
 def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
     """Sentences on velocities that contradict the positions."""
-    unit = min(KNOWN_UNITS, key=lambda each: max((abs(math.log(rate.factor / each)) for rate in found), default=0.0))
-    factors = [rate.factor / unit for rate in found]
+    factors = _factors(found)
     wrong = [joint for joint, factor in enumerate(factors, 1) if abs(math.log(factor)) > APART]
     if not wrong:
         return ()
@@ -65,7 +70,8 @@ def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
         return (
             f"The velocity columns are {factor:.3g} times the rates at which the positions change: the times, or "
             f"both velocities, have a wrong scale. If times are {factor:.3g} times too long, inertias are "
-            f"{factor**2:.3g} times too large: check the unit of time and the sample rate.",
+            f"{factor**2:.3g} times too large: check the unit of time and the sample rate. If only the unit of the "
+            "velocities is another one, leave these columns out: nothing else uses them.",
         )
     return tuple(
         f"Column {found[joint - 1].column!r} is {factors[joint - 1]:.3g} times the rate at which the position of joint "
@@ -73,6 +79,12 @@ def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
         "wrong scale. Check units, gear ratio and sample rate."
         for joint in wrong
     )
+
+
+def _factors(found: Sequence[Rate]) -> list[float]:
+    """The factors of all columns relative to the known unit that suits them best."""
+    unit = min(KNOWN_UNITS, key=lambda each: max((abs(math.log(rate.factor / each)) for rate in found), default=0.0))
+    return [rate.factor / unit for rate in found]
 
 
 def notes(found: Sequence[Rate]) -> tuple[str, ...]:

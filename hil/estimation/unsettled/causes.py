@@ -8,7 +8,7 @@ import numpy as np
 from hil.estimation.unsettled.agreement import disagreement
 from hil.estimation.unsettled.defects import defect_said, is_certain, is_other_arm, likely_defect
 from hil.estimation.unsettled.local_defects import Array, local_defects, local_residual
-from hil.estimator.baselines.torque_faults import suspect_clipped, suspect_drift, suspect_late
+from hil.estimator.baselines.torque_faults import suspect_clipped, suspect_drift, suspect_late, suspect_uneven
 from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.selection.verdict import MUCH_LEFT
@@ -45,7 +45,13 @@ def causes(fitted: Fitted) -> tuple[str, ...]:
         return said
     where = recordings, names, fitted.predicted, estimate.segment_length
     found = local_defects(*where) or _clipped(recordings) or _late(recordings) or _drifting(recordings)
-    return found or said or local_residual(*where)
+    return found or said or _uneven(recordings) or local_residual(*where)
+
+
+def are_known(fitted: Fitted, found: tuple[str, ...]) -> bool:
+    """Whether `found`, the sentences of `causes`, name a cause and not only where the residual is large."""
+    where = fitted.recordings, fitted.names, fitted.predicted, fitted.estimate.segment_length
+    return bool(found) and found != local_residual(*where)
 
 
 def _clipped(recordings: Sequence[Recording]) -> tuple[str, ...]:
@@ -79,6 +85,19 @@ def _late(recordings: Sequence[Recording]) -> tuple[str, ...]:
         f"The torque of joint {late.joint} seems to be logged about {1e3 * abs(late.delay):.2g} ms too {than}, "
         f"compared with the other joint: with this shift, inverse dynamics leaves {100 * late.residual:.2g} % of the "
         f"torque unexplained instead of {100 * late.residual_given:.2g} %. Shift its column, or log both together.",
+    )
+
+
+def _uneven(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    found = suspect_uneven(recordings)
+    if found is None:
+        return ()
+    return (
+        f"The position of joint {found.late} may be logged about {1e3 * found.by:.2g} ms later, relative to its "
+        f"torque, than that of joint {found.early}: inverse dynamics of one of these joints leaves "
+        f"{100 * found.residual:.2g} % of its torque unexplained with its own delay, "
+        f"{100 * found.residual_given:.2g} % with the other's. A single delay is estimated for both: log all columns "
+        "at the same time, or shift those of one joint.",
     )
 
 

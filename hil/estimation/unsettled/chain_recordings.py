@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,8 @@ from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
 from hil.estimation.chain_estimate import vague
 from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
+from hil.estimation.unsettled.chain_slips import refuse_chain_slips, torques_apart
+from hil.estimator.chain.column_faults import ColumnCheck
 from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -34,6 +36,7 @@ Array = NDArray[np.float64]
 FITTED_SHARE = 0.75  # of each recording, for the check on the rest
 EXPLAINED = 1.2  # ratio of residual to noise up to which the model counts as complete
 TORQUE_FORETOLD, TORQUE_WRONG = 0.1, 0.3  # relative error of the torque on the last part: trusted, rejected
+TORQUE_UNEXPLAINED = 0.1  # the same, beyond which a model is rejected that leaves part of the motion unexplained
 UNSUPPORTED = ("presliding", "asymmetry", "ripple", "cogging", "saturation", "cable", "encoder")
 
 
@@ -48,9 +51,12 @@ class ChainEstimated:
 
 
 def estimate_chain_recordings(
-    recordings: Sequence[Recording], config: RecordingConfig, shown_path: str
+    recordings: Sequence[Recording], config: RecordingConfig, shown_path: str, source: str
 ) -> ChainEstimated:
-    """Estimate a spatial arm from recordings. Raises ConfigError, ArmFileError, EstimationError."""
+    """Estimate a spatial arm from recordings. source: their files, for messages.
+
+    Raises ConfigError, CsvError, ArmFileError, EstimationError.
+    """
     refused = [option for option in UNSUPPORTED if getattr(config.model, option)]
     if refused:
         raise ConfigError(f"model.{refused[0]} = true: only planar arms support this term so far; remove it.")
@@ -66,7 +72,11 @@ def estimate_chain_recordings(
         lags=base.chain.joints > 1,
         by_voltage=tuple(range(1, base.chain.joints + 1)) if config.columns.drive in {"voltage", "pwm"} else (),
     )
-    found = identify_recordings(recordings, model, prior)
+    check = ColumnCheck.of(recordings, ChainModel(base), prior)
+    refuse_chain_slips(check, config.joint_names or (), source)
+    contradictory = () if model.torque_scale else torques_apart(check, [joint.name for joint in arm.joints])
+    found = _identified(recordings, model, prior, bool(contradictory))
+    model = found.model
     foretold = _held_out(recordings, model, prior)
     linear = len(model.linear_names)
     entries = {
@@ -90,7 +100,7 @@ def estimate_chain_recordings(
         validation=Validation(
             residual_over_floor=tuple(found.residual_over_noise.tolist()) if found.simulated else None
         ),
-        verdict=_verdict(found, arm, foretold, prior),
+        verdict=_verdict(found, arm, foretold, prior, contradictory),
         warnings=doubted_inertias(arm),
         timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),
         chain=ChainFacts(
@@ -124,6 +134,18 @@ def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescripti
         return read_arm(Path(config.arm.urdf), names)
     except ArmFileError as error:
         raise ConfigError(f"arm.urdf: {error}") from error
+
+
+def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior, contradictory: bool) -> RecordedChain:
+    """The fit. contradictory: whether the torques seem to contradict each other.
+
+    Their ratios are then fitted too, unless the likelihood finds that they agree; a regression does not fit them.
+    """
+    if contradictory and all(each.between == "held" for each in recordings):
+        found = identify_recordings(recordings, replace(model, torque_scale=True), prior)
+        if contradictions([""] * model.joints, ratios_of(found.names, found.value, found.std), {}, "column"):
+            return found
+    return identify_recordings(recordings, model, prior)
 
 
 def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> Array | None:
@@ -160,11 +182,22 @@ def _method(found: RecordedChain) -> str:
     )
 
 
-def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, prior: Prior) -> Verdict:
+def _verdict(
+    found: RecordedChain,
+    arm: ArmDescription,
+    foretold: Array | None,
+    prior: Prior,
+    contradictory: Sequence[str] = (),
+) -> Verdict:
+    """The verdict, with reasons. contradictory: on torques that contradict each other in the regression."""
     names = found.model.base.names
     weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
     trust: Trust = "yes"
     sentences = []
+    # A regression alone does not reveal missing effects.
+    explained = not found.simulated or (
+        float(found.residual_over_noise.max()) <= EXPLAINED and found.systematic <= SYSTEMATIC
+    )
     if found.simulated:
         worst = float(found.residual_over_noise.max())
         joint = arm.joints[int(np.argmax(found.residual_over_noise))].name
@@ -189,13 +222,10 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
         trust = "with care"
         sentences.append("The recordings are too short to check the prediction on a part that was not fitted.")
     else:
-        error, joint = float(foretold.max()), arm.joints[int(np.argmax(foretold))].name
-        part = f"the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
-        sentences.append(
-            f"Fitted to the rest, the model predicts the torque on {part} to within {100 * error:.1f} % of its RMS "
-            f"(worst joint: {joint})."
-        )
-        trust = "no" if error > TORQUE_WRONG else "with care" if error > TORQUE_FORETOLD else trust
+        error = float(foretold.max())
+        sentences.append(_foretold_said(error, arm.joints[int(np.argmax(foretold))].name))
+        wrong = TORQUE_WRONG if explained else TORQUE_UNEXPLAINED
+        trust = "no" if error > wrong else "with care" if error > TORQUE_FORETOLD else trust
     if found.from_prior:
         trust = lowered(trust, "with care")
         sentences.append(
@@ -207,16 +237,15 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
     if found.at_bound:
         trust = lowered(trust, "with care")
         sentences.append(bound_sentence(found.at_bound))
-    # A regression alone does not reveal missing effects.
-    explained = not found.simulated or (
-        float(found.residual_over_noise.max()) <= EXPLAINED and found.systematic <= SYSTEMATIC
-    )
     trust = lowered(trust, contradicted(found.conflicts, explained))
     sentences += conflict_sentences(found.conflicts, explained)
     joints, ratios = [joint.name for joint in arm.joints], ratios_of(found.names, found.value, found.std)
-    contradictory = contradictions(joints, ratios, {}, "column", found.conflicts)
-    trust = lowered(trust, "with care" if contradictory else "")
-    sentences += (*contradictory, *ratios_said(joints, ratios, "column", contradictory))
+    differ = contradictions(joints, ratios, {}, "column", found.conflicts)
+    trust = lowered(trust, "with care" if differ else "")
+    sentences += (*differ, *ratios_said(joints, ratios, "column", differ))
+    if contradictory and not found.simulated:
+        trust = "no"
+        sentences += contradictory
     if not found.reached:
         trust = lowered(trust, "with care")
         sentences.append(
@@ -224,6 +253,20 @@ def _verdict(found: RecordedChain, arm: ArmDescription, foretold: Array | None, 
             "the remaining distance to the minimum. Record faster motion, so that fewer joints stick."
         )
     return Verdict(trust, weakest, tuple(sentences))
+
+
+def _foretold_said(error: float, joint: str) -> str:
+    """Describe the prediction of the last part. error: of the torque, relative to its RMS; joint: the worst one."""
+    part = f"the torque on the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
+    if error > 1.0:
+        return (
+            f"Fitted to the rest, the model is useless for predicting {part}: the error is {error:.2g} times the "
+            f"torque's own RMS (worst joint: {joint})."
+        )
+    return (
+        f"Fitted to the rest, the model predicts {part} to within {100 * error:.1f} % of its RMS (worst joint: "
+        f"{joint})."
+    )
 
 
 def _predicted(recordings: Sequence[Recording], found: RecordedChain) -> tuple[Array, ...]:

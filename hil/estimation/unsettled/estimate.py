@@ -19,7 +19,7 @@ from hil.estimation.result_checks import describe_segment_choice, describe_verdi
 from hil.estimation.slips.position_jumps import jump_warnings
 from hil.estimation.torque_constants import Source, contradictions, ratios_of, ratios_said
 from hil.estimation.unsettled.angle_scale import angle_scale
-from hil.estimation.unsettled.causes import Fitted, causes
+from hil.estimation.unsettled.causes import Fitted, are_known, causes
 from hil.estimation.unsettled.plausibility import implausible, undetermined
 from hil.estimation.unsettled.warnings import Doubts, doubts_of
 from hil.estimator.baselines.idim import fit_inverse_dynamics
@@ -126,7 +126,7 @@ def estimate_any(
     plain = estimate if choice is None else choice.plain
     fitted = Fitted(recordings, given.names, predicted, plain, estimate, gravity)
     why = () if given.jumps else causes(fitted)
-    found = doubts_of(recordings, estimate, bool(why), gravity > 0.0)
+    found = doubts_of(recordings, estimate, are_known(fitted, why), gravity > 0.0)
     verdict = _judged(fitted, given, why, held_out, found)
     result = _result(estimate, recordings, shown_path, round(time.perf_counter() - began, 3), stepped)
     result = replace(
@@ -175,6 +175,7 @@ def _judged(
                 *(() if why else ratios_said(joints, ratios, given.torque_source, contradictory)),
             ),
             fitted.gravity > 0.0,
+            found.reason,
         ),
     )
 

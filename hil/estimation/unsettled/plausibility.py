@@ -1,5 +1,6 @@
 """Detection of values from imported recordings that are impossible for a servo arm, usually because of a wrong unit."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -35,7 +36,7 @@ def undetermined(estimate: ShootingEstimate) -> list[str]:
     values.
     """
     found = [
-        f"{name} ({value:.3g} +- {std:.2g})"
+        f"{name} ({value:.3g} +- {std:.2g})" if std < math.inf else f"{name} (not at all)"
         for name, value, std in zip(estimate.names, estimate.value, estimate.std, strict=True)
         if term_of(name).standstill and not (std < UNKNOWN * abs(value)) and abs(value) > SHOWN
     ]

@@ -20,7 +20,7 @@ from hil.estimation.unsettled.estimate import Estimated, Given, estimate_any
 from hil.estimation.unsettled.slips import refuse_slips
 from hil.estimator.baselines.zero import turned_zeros
 from hil.estimator.data.recording import Recording
-from hil.estimator.errors import RecordingError
+from hil.estimator.errors import ConvergenceError, RecordingError
 from hil.recordings.convert import Converted, convert
 from hil.recordings.files import read_tables
 from hil.recordings.periodic import mean_period
@@ -36,7 +36,7 @@ MOST_RECORDINGS = 200
 @dataclass(frozen=True)
 class _Read:
     """All recordings of one arm. notes: sentences on what was guessed, corrected or averaged. doubts: contradictions
-    among the columns.
+    among the columns. unusable: whether these are so large that a model is useless.
     """
 
     recordings: tuple[Recording, ...]
@@ -45,6 +45,7 @@ class _Read:
     columns: Columns
     notes: tuple[str, ...]
     doubts: tuple[str, ...]
+    unusable: bool
 
 
 def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder: Path | None) -> ShootingResult:
@@ -58,6 +59,8 @@ def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder:
         return (_estimate_planar if config.arm.urdf is None else _estimate_chain)(paths, config_path, config, folder)
     except RecordingError as error:
         raise CsvError(f"{', '.join(map(str, paths))}: {error}.") from error
+    except ConvergenceError as error:
+        raise ConvergenceError(f"{', '.join(map(str, paths))}: {error}") from error
 
 
 def _estimate_planar(
@@ -68,11 +71,11 @@ def _estimate_planar(
     columns, gravity = read.columns, config.arm.gravity
     zeros = (columns.zeros_unknown or config.model.zeros) and gravity > 0.0
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
-    refuse_slips(read.recordings, ", ".join(map(str, paths)))
+    refuse_slips(read.recordings, ", ".join(map(str, paths)), columns.zero)
     jumps = jump_sentences(whole.recordings, whole.names, whole.stepped)
     given = Given(names=read.names, jumps=jumps, origin=tuple(columns.zero or ()))
     found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped, given)
-    result = _doubted(_named(found, read, gravity), read.doubts)
+    result = _doubted(_named(found, read, gravity), read)
     if config.known is not None:
         result = replace(result, physical=physical_of(result, config.known.quantities(), gravity))
     if folder is not None:
@@ -87,7 +90,7 @@ def _estimate_chain(
     """The result for a spatial arm; its URDF is kept next to the result."""
     read = _read(paths, config.columns)
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
-    found = estimate_chain_recordings(read.recordings, config, shown)
+    found = estimate_chain_recordings(read.recordings, config, shown, ", ".join(map(str, paths)))
     arm = _arm(read, config.arm.gravity)
     names = config.joint_names
     assert names is not None and config.arm.urdf is not None  # checked by the estimate
@@ -95,7 +98,7 @@ def _estimate_chain(
     jumps = jump_sentences(read.recordings, read.names, read.stepped, names)
     warnings = (*jumps, *found.result.warnings)
     result = replace(found.result, recordings=read.names, arm=arm, notes=read.notes, warnings=warnings)
-    result = _doubted(result, read.doubts)
+    result = _doubted(result, read)
     if folder is not None:
         _keep(folder, paths, config_path, config, read, found.predicted)
         urdf = Path(config.arm.urdf)
@@ -114,7 +117,8 @@ def _read(paths: Sequence[Path], columns: Columns) -> _Read:
         raise CsvError(f"{len(recordings)} recordings, more than {MOST_RECORDINGS}: give fewer files or episodes.")
     names = tuple(name for each in found for name in each.names)
     stepped = tuple(bool(all(flags)) for flags in zip(*(each.stepped for each in found), strict=True))
-    return _Read(_stepped_alike(recordings, found), names, stepped, found[0].columns, _notes(found), _doubts(found))
+    stated, unusable = _notes(found), any(each.unusable for each in found)
+    return _Read(_stepped_alike(recordings, found), names, stepped, found[0].columns, stated, _doubts(found), unusable)
 
 
 def _stepped_alike(recordings: tuple[Recording, ...], found: Sequence[Converted]) -> tuple[Recording, ...]:
@@ -133,12 +137,13 @@ def _doubts(found: Iterable[Converted]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(doubt for each in found for doubt in each.doubts))
 
 
-def _doubted(result: ShootingResult, doubts: Sequence[str]) -> ShootingResult:
-    """The result with these doubts added to its verdict."""
-    if not doubts or result.verdict is None:
+def _doubted(result: ShootingResult, read: _Read) -> ShootingResult:
+    """The result with the doubts about the columns added to its verdict."""
+    verdict = result.verdict
+    if not read.doubts or verdict is None:
         return result
-    trust = "with care" if result.verdict.trust == "yes" else result.verdict.trust
-    return replace(result, verdict=replace(result.verdict, trust=trust, sentences=(*result.verdict.sentences, *doubts)))
+    trust = "no" if read.unusable or verdict.trust == "no" else "with care"
+    return replace(result, verdict=replace(verdict, trust=trust, sentences=(*verdict.sentences, *read.doubts)))
 
 
 def _zeroed(read: _Read, gravity: float) -> _Read:

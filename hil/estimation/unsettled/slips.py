@@ -1,34 +1,40 @@
 """Rejection of recordings with a clear mistake in their columns: an estimate would take a minute and be useless."""
 
+import math
 from collections.abc import Sequence
 
 from hil.errors import CsvError
-from hil.estimator.baselines.signs import suspect_absolute, suspect_order, suspect_signs, suspect_swapped
+from hil.estimator.baselines.signs import (
+    Signs,
+    suspect_absolute,
+    suspect_absolute_unzeroed,
+    suspect_order,
+    suspect_signs,
+    suspect_swapped,
+)
 from hil.estimator.data.recording import Recording
 
 CLEAR = 0.25
 """A mistake is clear only if its correction reduces the torque residual to less than this fraction of its value."""
 
+SAME_ANGLE = 0.01  # rad
+
 WELL = 0.3
 """A mistake is clear only if the torque residual after its correction is less than this fraction of the RMS torque."""
 
 
-def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
+def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None = None) -> None:
     """Raise CsvError if a sign is reversed, joints or torques are swapped, or an angle is measured from a fixed
     direction instead of from the previous link.
+
+    zero: columns.zero, which the recordings already contain; None if it is not known.
     """
-    absolute = suspect_absolute(recordings)
-    if absolute is not None and _is_clear(*absolute):
-        raise CsvError(
-            f"{source}: the angle of joint 2 seems to be measured from a fixed direction, such as the horizontal, "
-            f"instead of from link 1. With the difference between the two angles, {_unexplained(*absolute)}. Set in "
-            '[columns] of --config ARM.toml (in Python: config="ARM.toml"): angles = "absolute"'
-        )
+    _refuse_absolute(recordings, source, zero)
     order = suspect_order(recordings)
     if order is not None and _is_clear(*order):
         raise CsvError(
             f"{source}: the joints seem to be in the wrong order: with angles and torques of joints 1 and 2 exchanged, "
-            f"{_unexplained(*order)}. "
+            f"{unexplained(*order)}. "
             "Joint 1 is the one at the base: name its columns first in [columns] of --config ARM.toml."
         )
     for column, swapped in (
@@ -38,32 +44,57 @@ def refuse_slips(recordings: Sequence[Recording], source: str) -> None:
         if swapped is not None and _is_clear(*swapped):
             raise CsvError(
                 f"{source}: the {column} columns of joints 1 and 2 seem to be swapped: with them exchanged, "
-                f"{_unexplained(*swapped)}. Exchange them in the file, or in [columns] of --config ARM.toml."
+                f"{unexplained(*swapped)}. Exchange them in the file, or in [columns] of --config ARM.toml."
             )
     signs = suspect_signs(recordings)
     if signs is None:
         return
     if _is_clear(signs.residual, signs.residual_given):
-        columns = " and ".join(signs.signs.reversed_columns)
         raise CsvError(
-            f"{source}: the sign of {columns} is reversed: with the sign changed, "
-            f"{_unexplained(signs.residual, signs.residual_given)}. Change the sign in the file, or swap the columns."
+            f"{source}: {reversal_said(signs.signs)}, {unexplained(signs.residual, signs.residual_given)}. "
+            "Change that in the file, or swap the columns."
         )
     # All torques reversed leave the same residual, but nothing has a negative inertia.
     inertias = [name for name in signs.impossible if name.startswith("inertia")]
     if inertias and signs.residual < WELL:
-        columns, names = " and ".join(signs.signs.reversed_columns), " and ".join(inertias)
+        verb = "are" if signs.signs.are_several else "is"
         raise CsvError(
-            f"{source}: the sign of {columns} is reversed: as given, {names} would be negative. Change the sign in the "
-            "file, or reverse the positions."
+            f"{source}: {signs.signs.said()} {verb} reversed: as given, {' and '.join(inertias)} would be negative. "
+            "Change that in the file, or reverse the positions."
         )
+
+
+def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None) -> None:
+    """Raise CsvError if the angle of joint 2 is absolute, with the zero that then applies if it is another one."""
+    joints = recordings[0].joints
+    free = suspect_absolute_unzeroed(recordings) if zero is None else None
+    zero = zero or (0.0,) * joints
+    # columns.zero is added after the difference; so far, both zeros were added to the absolute angles.
+    found = free or suspect_absolute(recordings, (zero[0], zero[0] - zero[-1]))
+    if found is None or not _is_clear(found.residual, found.residual_given):
+        return
+    second = (zero[-1] + found.turned - zero[0] + math.pi) % (2.0 * math.pi) - math.pi
+    other = "" if abs(second - zero[-1]) < SAME_ANGLE else f" and zero = [{zero[0]:.4f}, {second:.4f}]"
+    raise CsvError(
+        f"{source}: the angle of joint 2 seems to be measured from a fixed direction, such as the horizontal, "
+        f"instead of from link 1. With the difference between the two angles, "
+        f"{unexplained(found.residual, found.residual_given)}. Set in [columns] of --config ARM.toml (in Python: "
+        f'config="ARM.toml"): angles = "absolute"{other}'
+    )
+
+
+def reversal_said(signs: Signs, joints: Sequence[str] = ()) -> str:
+    """Say which signs are reversed, up to what changing them gains. joints: their names, by default their numbers."""
+    if signs.are_several:
+        return f"{signs.said(joints)} are reversed: with these signs changed"
+    return f"{signs.said(joints)} is reversed: with the sign changed"
 
 
 def _is_clear(residual: float, given: float) -> bool:
     return residual < CLEAR * given and residual < WELL
 
 
-def _unexplained(residual: float, given: float) -> str:
+def unexplained(residual: float, given: float) -> str:
     """Describe the gain of a correction: the torque that inverse dynamics leaves unexplained with and without it."""
     return f"inverse dynamics leaves {_percent(residual)} of the torque unexplained instead of {_percent(given)}"
 

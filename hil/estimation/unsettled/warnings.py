@@ -29,6 +29,8 @@ class Doubts:
     faults: tuple[str, ...]
     doubts: tuple[str, ...]
     warnings: tuple[str, ...]
+    reason: str = ""
+    """What the faults have in common, as the end of a sentence."""
 
 
 def doubts_of(
@@ -40,6 +42,7 @@ def doubts_of(
     arm's plane.
     """
     faults, doubts, warnings = _signs(recordings), [], _rows(recordings)
+    reasons = ["a sign is reversed (see the warning)"] if faults else []
     for joint in range(estimate.model.joints):
         name = f"Joint {joint + 1}"
         warnings += _motion(recordings, joint, name)
@@ -49,24 +52,27 @@ def doubts_of(
         left = float(estimate.residual_rms[joint]) / motion
         if left > LEFT:
             advice = "the verdict names the cause" if cause_known else UNITS_ADVICE
+            reasons.append(f"the fit leaves {100 * left:.2g} % of the motion of joint {joint + 1} unexplained")
             faults.append(
                 f"{name}: the fit leaves {100 * left:.2g} % of the motion unexplained, so do not use these numbers: "
                 f"{advice}."
             )
     early = [] if cause_known else _early(recordings, estimate)
-    return Doubts(tuple(faults), tuple(doubts), (*warnings, *early, *_weak(estimate, gravity)))
+    shown = (*warnings, *early, *_weak(estimate, gravity))
+    return Doubts(tuple(faults), tuple(doubts), shown, " and ".join(reasons))
 
 
 def _signs(recordings: Sequence[Recording]) -> list[str]:
     suspicion = suspect_signs(recordings)
     if suspicion is None:
         return []
-    columns = " and ".join(suspicion.signs.reversed_columns)
+    subject, several = suspicion.signs.said(), suspicion.signs.are_several
+    seem, changed = ("seem", "these signs") if several else ("seems", "the sign")
     negative = f"; as given, {', '.join(suspicion.impossible)} would be negative" if suspicion.impossible else ""
     return [
-        f"The sign of {columns} seems to be reversed: with the sign changed, inverse dynamics leaves "
+        f"{subject.capitalize()} {seem} to be reversed: with {changed} changed, inverse dynamics leaves "
         f"{100 * suspicion.residual:.2g} % of the torque unexplained instead of {100 * suspicion.residual_given:.2g} %"
-        f"{negative}. Correct the sign in the file, or swap the columns."
+        f"{negative}. Correct that in the file, or swap the columns."
     ]
 
 

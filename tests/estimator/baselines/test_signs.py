@@ -12,6 +12,7 @@ from hil.errors import CsvError
 from hil.estimation.unsettled.slips import refuse_slips
 from hil.estimator.baselines import signs
 from hil.estimator.baselines.signs import Signs, suspect_signs
+from hil.estimator.baselines.torque_faults import suspect_uneven
 from hil.estimator.data.recording import Recording
 from hil.recordings.convert import convert
 from hil.recordings.csv_file import read_csv_table
@@ -59,6 +60,12 @@ def test_all_torques_reversed_shows_in_negative_inertia(recording: Recording) ->
 
 def test_the_words() -> None:
     assert Signs((1, -1), (1, -1)).reversed_columns == ("the torque of joint 2", "the position of joint 2")
+    assert Signs((1, -1), (1, 1)).said() == "the sign of the torque of joint 2"
+    assert Signs((-1, -1), (1, 1)).said() == "the signs of both torques"
+    assert Signs((1, -1), (1, -1)).said() == "the signs of the torque of joint 2 and the position of joint 2"
+    assert Signs((1, -1, -1), (1, 1, 1)).said() == "the signs of the torques of joints 2 and 3"
+    assert Signs((1, -1, -1), (1, 1, 1)).said(("a", "b", "c")) == "the signs of the torques of b and c"
+    assert Signs((-1, -1, -1), (1, 1, 1)).said() == "the signs of all torques"
 
 
 def test_too_short_a_recording_says_nothing(recording: Recording) -> None:
@@ -91,3 +98,16 @@ def test_a_reversed_sign_that_explains_hardly_anything_is_not_offered(
 
     monkeypatch.setattr(signs, "_fit", fitted)
     assert (suspect_signs([recording]) is not None) is offered
+
+
+@pytest.mark.parametrize(("joint", "late", "early"), [(1, 2, 1), (0, 1, 2)])
+def test_a_joint_that_is_logged_later_than_the_other_is_named(joint: int, late: int, early: int) -> None:
+    motion = two_joints(10.0)
+    good = Recording(motion.time, motion.torque, motion.position, np.full(2, 0.0015), "held")
+    assert suspect_uneven([good]) is None
+    shifted = good.position.copy()
+    shifted[joint, 3:] = good.position[joint, :-3]
+    found = suspect_uneven([replace(good, position=shifted)])
+    assert found is not None
+    assert (found.late, found.early) == (late, early)
+    assert found.by == pytest.approx(0.015, abs=0.0051)

@@ -148,7 +148,9 @@ def test_the_warning_refers_to_the_cause_and_not_to_units() -> None:
         residual_over_noise=np.array([1.0, 20.0]),
     )
     for known in (True, False):
-        (fault,) = doubts_of([healthy()], estimate, known).faults
+        found = doubts_of([healthy()], estimate, known)
+        (fault,) = found.faults
+        assert "of the motion of joint 2 unexplained" in found.reason
         assert ("the verdict names the cause" in fault) is known and ("check the units" in fault) is not known
 
 

@@ -296,7 +296,7 @@ def test_the_way_to_the_path_stays_between_rest_and_path() -> None:
         ("[stabiliser]", "[stabilizer]", "stabili"),
         ('urdf = "open_manipulator_x_like.urdf"\nrest', 'urdf = "none.urdf"\nrest', "cannot be read"),
         ('urdf = "open_manipulator_x_like.urdf"\nrest', "rest", "arm.urdf"),
-        ("centre = [0.0, -0.3, 0.3, 0.2]", "centre = [0.0]", "joint_path.centre has 1 entries"),
+        ("centre = [0.0, -0.3, 0.3, 0.2]", "centre = [0.0]", "joint_path.centre has 1 entry"),
     ],
 )
 def test_a_wrong_description_is_named(old: str, new: str, message: str) -> None:

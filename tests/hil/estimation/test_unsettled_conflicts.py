@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hil.estimation.unsettled.estimate import Given, conflicts_in
+from hil.estimation.unsettled.plausibility import undetermined
 from hil.estimator.selection.segment_verdict import SegmentEvidence, judge_segments
 
 NAMES = ("inertia_1", "gravity_1", "viscous_1", "coulomb_1", "offset_1")
@@ -43,3 +44,22 @@ def test_values_far_from_the_files_lower_the_verdict(estimate: Any, given: Given
     assert verdict.trust == trust
     assert said in " ".join(verdict.sentences)
     assert bool(said) == ("standard deviations from" in " ".join(verdict.sentences))
+
+
+@pytest.mark.parametrize("spoiled", [True, False])
+def test_the_verdict_gives_its_own_reason_and_no_infinite_uncertainty(spoiled: bool) -> None:
+    recordings: Any = [SimpleNamespace(torque=np.ones((2, 10)))]
+    estimate = estimated(left=9.0)
+    estimate.std[3] = np.inf
+    reason = "the fit leaves 13 % of the motion of joint 2 unexplained"
+    evidence = SegmentEvidence(np.array([0.5, 0.5]), faulty=True, spoiled=spoiled, reason=reason)
+    said = " ".join(judge_segments(recordings, estimate, evidence).sentences)
+    assert f"Do not use these numbers: {reason}." in said
+    assert "This motion does not determine coulomb_1." in said
+    assert "inf" not in said.replace("information", "")
+
+
+def test_an_undetermined_term_is_listed_without_an_infinite_error() -> None:
+    estimate: Any = SimpleNamespace(names=("coulomb_width_1",), value=np.array([37.0]), std=np.array([np.inf]))
+    (said,) = undetermined(estimate)
+    assert "coulomb_width_1 (not at all)" in said

@@ -12,7 +12,7 @@ import pytest
 
 import hil as api
 from benchmarks import chain as bench
-from hil.errors import ConfigError
+from hil.errors import ConfigError, CsvError
 from hil.estimation.unsettled.chain_recordings import _verdict
 from hil.estimator.chain.model.chain_model import ChainModel
 from tests.support.command_line import hil
@@ -96,6 +96,31 @@ def test_errors_that_repeat_with_the_motion_are_trusted_with_care(setup: bench.S
     assert "repeats with the motion" in hidden.sentences[1]
     found.systematic, found.std = 0.9, 1.1 * setup.prior.std
     assert _verdict(found, arm, np.full(4, 0.01), setup.prior).trust == "with care"  # type: ignore[arg-type]
+
+
+def test_an_incomplete_model_that_fails_its_own_prediction_is_not_trusted(setup: bench.Setup) -> None:
+    arm = SimpleNamespace(joints=tuple(SimpleNamespace(name=name) for name in setup.arm.joints))
+    found: Any = SimpleNamespace(
+        **{"model": ChainModel(setup.base), "std": 0.01 * setup.prior.std, "simulated": True, "from_prior": ()},
+        **{"residual_over_noise": np.full(4, 8.7), "reached": True, "systematic": 9.0},
+        names=setup.base.names,
+        value=setup.prior.value,
+        at_bound=(),
+        conflicts=(),
+    )
+    said = _verdict(found, arm, np.full(4, 0.19), setup.prior)  # type: ignore[arg-type]
+    assert said.trust == "no"
+    assert _verdict(found, arm, np.full(4, 0.06), setup.prior).trust == "with care"  # type: ignore[arg-type]
+    useless = _verdict(found, arm, np.full(4, 17.8), setup.prior)  # type: ignore[arg-type]
+    assert "the error is 18 times the torque's own RMS" in " ".join(useless.sentences)
+
+
+def test_a_reversed_column_is_refused_before_the_fit(setup: bench.Setup) -> None:
+    table = np.genfromtxt("arm.csv", delimiter=",", names=True)
+    table["tau3"] *= -1.0
+    np.savetxt("bad.csv", table, delimiter=",", header=",".join(table.dtype.names or ()), comments="", fmt="%.9g")
+    with pytest.raises(CsvError, match=rf"bad.csv: the sign of the torque of {setup.arm.joints[2]} is reversed"):
+        api.estimate("bad.csv", config=described(setup, "held"))
 
 
 def test_measured_torque_gives_the_regression_and_says_so(setup: bench.Setup) -> None:

@@ -299,6 +299,23 @@ def test_a_plain_slip_is_refused_before_the_fit(slip: Callable[[np.ndarray], np.
         refuse_slips([swung(slip)], "arm.csv")
 
 
+@pytest.mark.parametrize(
+    ("zero", "given", "said"),
+    [
+        ((-np.pi / 2, 0.0), True, 'angles = "absolute"$'),
+        ((-np.pi / 2, -np.pi / 2), True, r'angles = "absolute" and zero = \[-1.5708, 0.0000\]$'),
+        ((0.3, 0.0), True, 'angles = "absolute"$'),
+        ((0.0, 0.0), False, 'angles = "absolute"$'),
+    ],
+)
+def test_absolute_angles_are_recognised_with_any_zero(zero: tuple[float, float], given: bool, said: str) -> None:
+    """As recorded, angle 1 is 0 where the columns' zero says, and angle 2 is measured from the same direction."""
+    origin = zero[0] if given else -np.pi / 2
+    recording = swung(lambda q: np.stack([q[0] - origin, q[0] - origin + q[1]]) + np.array(zero)[:, None])
+    with pytest.raises(CsvError, match=said):
+        refuse_slips([recording], "arm.csv", zero if given else None)
+
+
 @pytest.mark.parametrize("offset", [0.0, np.pi / 2])
 def test_joints_in_the_wrong_order_are_refused_before_the_fit(offset: float) -> None:
     """Also where the angles are measured from the hanging pose."""

@@ -1,0 +1,222 @@
+"""Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, wrong times.
+
+As for planar arms (`hil.estimator.baselines.signs`), the torque residual of filtered inverse dynamics with a column
+changed is compared with that of the columns as given. Signs and factors of torques only change how the normal equations
+of the joints are added up, so all combinations can be tried; reversed angles and other times need a new regressor.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+
+from hil.estimator import linalg
+from hil.estimator.arrays import Array
+from hil.estimator.baselines.signs import Signs
+from hil.estimator.chain.fit.regression import filtered_torque
+from hil.estimator.chain.fit.stage1 import PASSES
+from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.prior import Prior
+from hil.estimator.chain.recordings import CUTOFFS, LAG
+from hil.estimator.data.recording import Recording
+from hil.estimator.errors import EstimationError, RecordingError
+
+SUSPICIOUS = 0.1  # relative torque residual of the worst joint, below which only contradictory torques are sought
+CLEAR = 0.5  # largest ratio of the worst joint's residuals, with a change and as given
+WELL = 0.3  # largest relative residual with a change
+GAIN = 0.03  # decrease of the residual's logarithm, mean of the joints, that makes factors of the torques credible
+AS_WELL = 1.05  # ratio of the residuals up to which fewer reversals are preferred
+SIGNIFICANT = 3.0  # standard errors
+FACTORS = np.exp(np.linspace(-np.log(6.0), np.log(6.0), 41))  # of a torque, that are tried
+STEPS = 1.0 + 0.08 * np.linspace(-1.0, 1.0, 17)  # by which the best factor is refined
+SWEEPS = 3  # over the joints
+TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 10.0])  # factors that are tried
+
+
+@dataclass(frozen=True)
+class Reversed:
+    """Reversed columns. residuals: relative RMS of the worst joint's torque residual with the change, and as given.
+    impossible: whether friction is negative as given, as if all torques are reversed.
+    """
+
+    residuals: tuple[float, float]
+    signs: Signs
+    impossible: bool
+
+
+@dataclass(frozen=True)
+class WrongTimes:
+    """Times that are `factor` times the true ones. residuals: as for reversed columns."""
+
+    residuals: tuple[float, float]
+    factor: float
+
+
+@dataclass(frozen=True)
+class _Solved:
+    value: Array
+    std: Array
+    relative: Array
+    """RMS of the torque residual relative to the torque (joints,)."""
+
+    @property
+    def worst(self) -> float:
+        return float(self.relative.max())
+
+    @property
+    def misfit(self) -> float:
+        """Logarithm of the likelihood, negative, with the torque of each joint in its own unit."""
+        return float(np.log(self.relative).sum())
+
+
+@dataclass(frozen=True)
+class ColumnCheck:
+    """Recordings of a chain whose columns are in doubt. cutoff [Hz], delay [s]: see `filtered_torque`."""
+
+    recordings: Sequence[Recording]
+    model: ChainModel
+    prior: Prior
+    cutoff: float
+    delay: float
+
+    @classmethod
+    def of(cls, recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> "ColumnCheck | None":
+        """Filter like the regression; None if the recordings are too short for that."""
+        for cutoff in CUTOFFS:
+            with suppress(RecordingError):
+                check = cls(recordings, model, prior, cutoff, LAG)
+                assert check._given
+                return check
+        return None
+
+    @cached_property
+    def _given(self) -> tuple["_Normal", _Solved]:
+        normal = self._normal(self.recordings)
+        return normal, normal.solved(np.ones(self.model.joints), self.prior)
+
+    def _normal(self, recordings: Sequence[Recording]) -> "_Normal":
+        rows = [filtered_torque(each, self.model, self.cutoff, self.delay) for each in recordings]
+        return _Normal.of(
+            np.concatenate([Y for Y, _ in rows], axis=1), np.concatenate([tau for _, tau in rows], axis=1)
+        )
+
+    @property
+    def suspicious(self) -> bool:
+        """Whether inverse dynamics leaves so much of the torque that a mistake is worth looking for."""
+        return self._given[1].worst > SUSPICIOUS or self._dissipates_too_little(self._given[1])
+
+    def reversed_columns(self) -> Reversed | None:
+        """The reversal that explains the recordings much better than the signs as given."""
+        given, impossible = self._given[1], self._dissipates_too_little(self._given[1])
+        joints = self.model.joints
+        tried: list[tuple[float, int, Signs]] = []
+        for position in _turned(joints):
+            turned = [replace(each, position=each.position * np.array(position)[:, None]) for each in self.recordings]
+            normal = self._given[0] if min(position) > 0 else self._normal(turned)
+            for torque in product((1, -1), repeat=joints):
+                signs = Signs(torque, position)
+                found = normal.solved(np.array(torque, dtype=float), self.prior)
+                if signs.reversed_columns and not self._dissipates_too_little(found):
+                    tried.append((found.worst, len(signs.reversed_columns), signs))
+        least = min((worst for worst, _, _ in tried), default=np.inf)
+        gained = least < CLEAR * given.worst or (impossible and least < AS_WELL * given.worst)
+        if not (gained and least < WELL):
+            return None
+        worst, _, signs = min((each for each in tried if each[0] <= AS_WELL * least), key=lambda each: each[1])
+        return Reversed((worst, given.worst), signs, impossible)
+
+    def contradictory_torques(self) -> tuple[float, ...] | None:
+        """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better.
+
+        The links' prior is weak and friction absorbs much, so a small gain is evidence; the likelihood can then decide.
+        """
+        normal, given = self._given
+        factors, best = np.ones(self.model.joints), given
+        for grid in (FACTORS, *(STEPS,) * SWEEPS):
+            for joint in range(1, factors.size):
+                for factor in grid:
+                    tried = factors * np.where(np.arange(factors.size) == joint, factor, 1.0)
+                    found = normal.solved(tried, self.prior)
+                    if found.misfit < best.misfit:
+                        chosen, best = tried, found
+                factors = chosen if best is not given else factors
+        if given.misfit - best.misfit < GAIN * factors.size:
+            return None
+        return tuple(factors.tolist())
+
+    def wrong_times(self) -> WrongTimes | None:
+        """The factor of the times that explains the recordings much better, by gravity and the described geometry."""
+        given = self._given[1]
+        if not np.any(self.model.base.chain.gravity):
+            return None
+        coarse = min((self._slower(factor), factor) for factor in TIMES.tolist())
+        if not coarse[0] < given.worst:
+            return None
+        worst, factor = min(
+            coarse, *((self._slower(coarse[1] * step), coarse[1] * step) for step in STEPS[::4].tolist())
+        )
+        return WrongTimes((worst, given.worst), factor) if worst < min(CLEAR * given.worst, WELL) else None
+
+    def _slower(self, factor: float) -> float:
+        """The residual if the true times are those of the recordings divided by `factor`."""
+        try:
+            changed = [replace(each, time=each.time / factor) for each in self.recordings]
+            return replace(self, recordings=changed, cutoff=self.cutoff * factor)._given[1].worst
+        except EstimationError:
+            return np.inf
+
+    def _dissipates_too_little(self, found: _Solved) -> bool:
+        """Whether more friction terms are significantly negative than positive."""
+        start, joints = self.model.base.count, self.model.joints
+        over = (found.value / found.std)[start : start + 2 * joints]
+        return int(np.sum(over < -SIGNIFICANT)) > int(np.sum(over > SIGNIFICANT))
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Normal equations of each joint's torques.
+
+    squares: (joints, names, names). products: (joints, names), with the torque. torque: (joints,) its mean square.
+    """
+
+    squares: Array
+    products: Array
+    torque: Array
+    rows: int
+
+    @classmethod
+    def of(cls, columns: Array, torque: Array) -> "_Normal":
+        """Form the equations of a regressor (joints, rows, names) and torques (joints, rows)."""
+        rows = torque.shape[1]
+        squares = np.stack([Y.T @ Y for Y in columns]) / rows
+        products = np.stack([Y.T @ tau for Y, tau in zip(columns, torque, strict=True)]) / rows
+        return cls(squares, products, np.maximum(np.mean(torque**2, axis=1), 1e-18), rows)
+
+    def solved(self, factors: Array, prior: Prior) -> _Solved:
+        """Solve with each joint's torque multiplied by its factor (joints,)."""
+        level = self.torque * factors**2
+        left, products = level, self.products * factors[:, None]
+        count = prior.value.size
+        for _ in range(PASSES):
+            weight = self.rows / left
+            square, product_ = np.tensordot(weight, self.squares, 1), weight @ products
+            square[range(count), range(count)] += prior.std**-2
+            product_[:count] += prior.value / prior.std**2
+            norm = np.sqrt(np.maximum(np.diag(square), 1e-300))
+            inverse = linalg.pinv(square / np.outer(norm, norm), hermitian=True)
+            value = inverse @ (product_ / norm) / norm
+            explained = 2.0 * products @ value - np.einsum("i,jik,k->j", value, self.squares, value)
+            left = np.maximum(level - explained, 1e-8 * level)
+        return _Solved(value, np.sqrt(np.maximum(np.diag(inverse), 1e-300)) / norm, np.sqrt(left / level))
+
+
+def _turned(joints: int) -> Iterator[tuple[int, ...]]:
+    """Yield the signs of the angles that are tried: as given, one joint's reversed, all reversed."""
+    yield (1,) * joints
+    for joint in range(joints):
+        yield tuple(-1 if each == joint else 1 for each in range(joints))
+    if joints > 1:
+        yield (-1,) * joints

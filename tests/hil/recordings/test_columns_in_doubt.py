@@ -1,0 +1,121 @@
+"""Columns that cannot be what the configuration says are refused, and suggestions use each column once."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.config.csv_columns import Columns, parse_recording_config
+from hil.errors import ConfigError, CsvError
+from hil.estimation.unsettled import recordings as estimates
+from hil.estimator.errors import ConvergenceError
+from hil.recordings.convert import convert
+from hil.recordings.guess import guessed
+from hil.recordings.parquet_file import read_dataset
+from hil.recordings.table import Table
+from hil.recordings.velocity import Rate, contradict, doubts
+from hil.results.parts import Verdict
+
+TIME = np.arange(0.0, 10.0, 0.005)
+STEP = 2.0 * np.pi / 4096
+
+
+def table(**columns: Any) -> Table:
+    return Table("arm.csv", {"t": TIME, **columns}, {})
+
+
+def rounded(size: float) -> Any:
+    return STEP * np.round(size * np.sin(2.0 * TIME + 0.5 * np.sin(7.0 * TIME)) / STEP)
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ('position = ["q1", "q1"]\ntorque = ["a", "b"]', 'arm.toml: columns.position names "q1" twice'),
+        (
+            'position = ["q1", "q2"]\ncurrent = ["q1", "q2"]\ntorque_constant = [1.0, 1.0]',
+            "and columns.current both name",
+        ),
+        ('time = "q1"\nposition = ["q1"]\ntorque = ["a"]', 'columns.time and columns.position both name "q1"'),
+        ('time = "t"\nrate = 100.0\nposition = ["q1"]', "arm.toml: columns.time and columns.rate are both given"),
+        ('position = ["q1", "q2"]\ntorque = ["a"]', "arm.toml: columns.torque has 1 entry; position has 2"),
+    ],
+)
+def test_a_column_with_two_roles_is_refused(keys: str, said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        parse_recording_config(f"[columns]\n{keys}\n", Path("arm.toml"))
+    assert said in str(error.value)
+    assert "columns: columns" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("names", "lines"),
+    [
+        ("q1 q2 pos1 pos2 tau1 tau2", ("rate = 200.0", 'position = ["q1", "q2"]', 'torque = ["tau1", "tau2"]')),
+        ("t q1 q2 pos1 pos2 i1 i2", ('time = "t"', 'position = ["q1", "q2"]', 'current = ["i1", "i2"]')),
+        ("Zeit Winkel1 Winkel2 Moment1 Moment2", ('time = "Zeit"', 'position = ["Winkel1", "Winkel2"]')),
+    ],
+)
+def test_a_suggestion_gives_each_column_its_own_role(names: str, lines: tuple[str, ...]) -> None:
+    with pytest.raises(CsvError) as error:
+        guessed(Table("arm.csv", dict.fromkeys(names.split(), TIME), {}), Columns())
+    for line in lines:
+        assert line in str(error.value)
+
+
+def test_a_joint_that_hardly_moves_is_named() -> None:
+    """Too few steps to recognise the encoder's, so that of the other joint is assumed."""
+    with pytest.raises(CsvError, match=r"joint 2 moved by 0\.0031 rad"):
+        convert(
+            table(q1=rounded(1.2), q2=rounded(1.5 * STEP), tau1=rounded(0.5), tau2=rounded(0.1)),
+            Columns(time="t", position=["q1", "q2"], torque=["tau1", "tau2"]),
+        )
+
+
+def test_a_torque_column_without_numbers_is_named() -> None:
+    with pytest.raises(CsvError, match="torque or current column of joint 2 holds no numbers"):
+        convert(
+            table(q1=rounded(1.2), q2=rounded(1.0), tau1=rounded(0.5), tau2=np.full(TIME.size, np.nan)),
+            Columns(time="t", position=["q1", "q2"], torque=["tau1", "tau2"]),
+        )
+
+
+def test_velocities_that_contradict_positions_make_a_model_useless() -> None:
+    twice = [Rate("vel1", 2.0, 0.0), Rate("vel2", 2.0, 0.0)]
+    assert contradict(twice) and len(doubts(twice)) == 1
+    assert not contradict([Rate("vel1", 1.05, 0.0), Rate("vel2", 1.0, 0.0)])
+    read: Any = SimpleNamespace(doubts=("The times are wrong.",), unusable=True)
+    assert _trust(read) == "no"
+    read.unusable = False
+    assert _trust(read) == "with care"
+
+
+@dataclass(frozen=True)
+class Judged:
+    verdict: Verdict
+
+
+def _trust(read: Any) -> str:
+    judged: Any = Judged(Verdict("yes", "inertia_1", ()))
+    doubted: Any = estimates._doubted(judged, read)
+    return str(doubted.verdict.trust)
+
+
+def test_a_fit_that_fails_names_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ConvergenceError("no friction model could be fitted")
+
+    monkeypatch.setattr(estimates, "_estimate_planar", fail)
+    with pytest.raises(ConvergenceError, match=r"arm\.csv: no friction model"):
+        estimates.estimate_recordings([Path("arm.csv")], None, None)
+
+
+@pytest.mark.parametrize("text", ["[]", '{"features": 3}'])
+def test_a_dataset_whose_description_is_no_table_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text(text, encoding="utf-8")
+    with pytest.raises(CsvError, match=r"info\.json must hold an object"):
+        read_dataset(tmp_path)
