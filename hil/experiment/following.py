@@ -41,7 +41,7 @@ import numpy as np
 from hil.config.joint import JointConfig
 from hil.drivers.state import State
 
-__all__ = ["GOALS", "MEMORY", "CurrentNoise", "allow_noise", "begin", "is_frozen", "look", "seen_above"]
+__all__ = ["GOALS", "MEMORY", "CurrentNoise", "allow_noise", "begin", "is_frozen", "look", "seen_above", "usual_sigma"]
 
 GAIN_ERROR = 0.2
 """Largest scale error of a current sensor."""
@@ -64,6 +64,9 @@ _FULL_WEIGHT = 5.0
 LEAST_RATIO = 10.0
 """Log likelihood ratio at which a current counts as zero, however low the rate."""
 
+NOISY_RATIO = 16.0
+"""The same for a sensor as noisy as assumed, of which chance makes more: most sensors have less noise than that."""
+
 _FEWEST = 2
 """Minimum number of samples that differ from the goal, however low the rate."""
 
@@ -73,8 +76,8 @@ ALLOWED_SIGMAS = 4.0
 FEWEST_READINGS, MOST_READINGS = 8, 256
 """Number of readings from which noise is first measured, and number of the latest ones that are kept."""
 
-_UNCERTAIN = 3.0
-"""Upper bound of the relative error of noise measured from n readings, times the square root of n."""
+_UNCERTAIN = 1.9
+"""How much too small the noise measured from n readings may be, relative to the real one, times the square root of n."""
 
 _MAD_TO_SIGMA = 1.4826
 """Ratio of standard deviation to median absolute deviation of a normal distribution."""
@@ -104,13 +107,13 @@ one of these readings may answer to.
 
 MEMORY = np.dtype(
     [
-        *((name, "f8") for name in ("per_square", "allowed", "share", "follow_time")),
+        *((name, "f8") for name in ("per_square", "least_ratio", "allowed", "share", "follow_time")),
         *((name, "f8") for name in ("former_goal", "evidence", "ratio", "count", "differs_for", "differs")),
     ]
 )
 """Constants and state of the check of one joint.
 
-per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V]; share: the same, relative to the goal; follow_time:
+per_square: 1 / (2 sigma^2). least_ratio: log likelihood ratio at which a current counts as zero. allowed: accepted deviation [A or V]; share: the same, relative to the goal; follow_time:
 how long a larger deviation may last [s].
 evidence, ratio, count: sum of the log likelihood ratios times seconds, without seconds, and its number of samples.
 differs_for, differs: duration [s] and number of samples of a deviation.
@@ -128,15 +131,22 @@ def begin(memory: Any, goals: Any, joint: JointConfig, planned: float, follow_sh
     allow_noise(memory, goals, joint, planned, follow_share, 0.0)
 
 
+def usual_sigma(joint: JointConfig, planned: float) -> float:
+    """Return the standard deviation of current errors that is assumed of any sensor [A or V]."""
+    return max(SIGMA_SHARE * planned, SIGMA_TICKS * abs(joint.joint.drive_unit(12.0)))
+
+
 def allow_noise(memory: Any, goals: Any, joint: JointConfig, planned: float, follow_share: float, noise: float) -> None:
     """Set the thresholds for readings with this standard deviation [A or V]. Other arguments: as for `begin`."""
     tick = abs(joint.joint.drive_unit(12.0))
-    sigma = max(SIGMA_SHARE * planned, SIGMA_TICKS * tick, noise)
-    memory["per_square"] = 0.5 / sigma**2
-    memory["allowed"] = max(follow_share * planned, ALLOWED_TICKS * tick) + ALLOWED_SIGMAS * noise
+    usual = usual_sigma(joint, planned)
+    memory["per_square"] = 0.5 / max(usual, noise) ** 2
+    memory["least_ratio"] = LEAST_RATIO if noise <= usual else NOISY_RATIO
+    noisy = ALLOWED_SIGMAS * noise
+    scaled = min(GAIN_ERROR, follow_share) * planned
+    memory["allowed"] = max(follow_share * planned, ALLOWED_TICKS * tick, scaled + noisy)
     # An error in proportion to the goal makes the current change less; rounding hides up to one tick.
-    changes = max(SIGMA_SHARE * planned, ALLOWED_TICKS * tick, ALLOWED_SIGMAS * noise)
-    goals["most"] = (changes + tick) / (1.0 - GAIN_ERROR)
+    goals["most"] = (max(SIGMA_SHARE * planned, ALLOWED_TICKS * tick, noisy) + tick) / (1.0 - GAIN_ERROR)
 
 
 def seen_above(memory: Any, interval: float) -> float:
@@ -144,7 +154,7 @@ def seen_above(memory: Any, interval: float) -> float:
 
     interval: time between two exchanges [s].
     """
-    needed = max(LEAST_RATIO * interval, _FULL_WEIGHT * LOST_AFTER_S) / _SOON_S
+    needed = max(memory["least_ratio"] * interval, _FULL_WEIGHT * LOST_AFTER_S) / _SOON_S
     return float(np.sqrt(needed / memory["per_square"]) / (1.0 - GAIN_ERROR))
 
 
@@ -172,15 +182,16 @@ class CurrentNoise:
         return FEWEST_READINGS <= count < MOST_READINGS and count & (count - 1) == 0
 
     def measured(self) -> tuple[list[float], list[float]]:
-        """Return each joint's noise and its upper bound [A or V]; 0 if nothing shows any."""
+        """Return each joint's noise and its upper bound [A or V]; 0 after too few readings."""
         if len(self._errors) < FEWEST_READINGS:
             return [0.0] * len(self._ticks), [0.0] * len(self._ticks)
         errors = np.array(self._errors)
         spread = np.median(np.abs(errors - np.median(errors, axis=0)), axis=0)
         noise = _MAD_TO_SIGMA * spread
-        # Rounding may have reduced the spread by half a tick; if there is none, SIGMA_TICKS covers what it hides.
-        most = _MAD_TO_SIGMA * (spread + 0.5 * self._ticks) * (1.0 + _UNCERTAIN / len(errors) ** 0.5)
-        return noise.tolist(), np.where(spread > 0.25 * self._ticks, most, 0.0).tolist()
+        # Rounding may have reduced the spread by half a tick; what it hides entirely is less than two.
+        most = _MAD_TO_SIGMA * (spread + 0.5 * self._ticks) / (1.0 - _UNCERTAIN / len(errors) ** 0.5)
+        hidden = np.minimum(most, SIGMA_TICKS * self._ticks)
+        return noise.tolist(), np.where(spread > 0.25 * self._ticks, most, hidden).tolist()
 
 
 def look(memory: Any, goal: float, carried: float, seconds: float) -> float:
@@ -200,7 +211,7 @@ def look(memory: Any, goal: float, carried: float, seconds: float) -> float:
         memory.evidence = evidence
         memory.ratio += gain
         memory.count += 1.0
-        if evidence >= _FULL_WEIGHT * LOST_AFTER_S and memory.ratio >= LEAST_RATIO:
+        if evidence >= _FULL_WEIGHT * LOST_AFTER_S and memory.ratio >= memory.least_ratio:
             return float(memory.count * seconds)
     else:
         memory.evidence = memory.ratio = memory.count = 0.0

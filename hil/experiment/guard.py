@@ -277,7 +277,8 @@ class Guard:
         self._allow(most)
         noisy = []
         for index, joint in enumerate(self._config.joints):
-            if not self._joints[index]["is_followed"] or not self._is_noisy(index, most[index]):
+            usual = following.usual_sigma(joint, self._planned[index])
+            if not self._joints[index]["is_followed"] or most[index] <= usual:
                 continue
             said = self._how_noisy(index, noise[index])
             if noise[index] > following.MOST_NOISE * joint.goal_limit:
@@ -285,10 +286,6 @@ class Guard:
                 self._stop(index, Cause.NOT_FOLLOWING, f"cannot be monitored: {said}. {remedy}")
             noisy.append(f"{self._names[index]}: {said}")
         return noisy
-
-    def _is_noisy(self, index: int, noise: float) -> bool:
-        """Whether this noise [A or V] is more than the checks assume anyway."""
-        return bool(2.0 * noise**2 * self._joints[index]["following"]["per_square"] >= 1.0 - 1e-9)
 
     def _allow(self, noise: Sequence[float]) -> None:
         share = self._safety.follow_share
