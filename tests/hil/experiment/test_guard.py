@@ -393,7 +393,7 @@ def test_a_noisy_current_reading_is_named_and_refused_only_if_it_hides_lost_torq
     for each in (guard, later):
         for number in range(40):
             each.look(at(500 + number, STILL._replace(goal_current=(0.0, -0.02), current=(0.0, 0.06))))
-    assert look(Guard(arm(), (0.05, 0.05)), *[at(n, STILL._replace(current=(0.0, 0.06))) for n in range(21)])
+    assert look(Guard(arm(), (0.05, 0.05)), *[at(n, STILL._replace(current=(0.0, 0.06))) for n in range(20)])
     with pytest.raises(SafetyStop, match=r"cannot be monitored: its current reading is noisy: .* A RMS"):
         at_rest(Guard(arm()), 2.0)
 
