@@ -65,7 +65,7 @@ LEAST_RATIO = 10.0
 """Log likelihood ratio at which a current counts as zero, however low the rate."""
 
 NOISY_RATIO = 16.0
-"""The same for a sensor as noisy as assumed, of which chance makes more: most sensors have less noise than that."""
+"""The same for a sensor whose noise is known to be as large as assumed; most sensors have far less noise than that."""
 
 _FEWEST = 2
 """Minimum number of samples that differ from the goal, however low the rate."""
@@ -77,7 +77,7 @@ FEWEST_READINGS, MOST_READINGS = 8, 256
 """Number of readings from which noise is first measured, and number of the latest ones that are kept."""
 
 _UNCERTAIN = 1.9
-"""How much too small the noise measured from n readings may be, relative to the real one, times the square root of n."""
+"""How much too small noise measured from n readings may be, relative to the real noise, times the square root of n."""
 
 _MAD_TO_SIGMA = 1.4826
 """Ratio of standard deviation to median absolute deviation of a normal distribution."""
@@ -113,8 +113,8 @@ MEMORY = np.dtype(
 )
 """Constants and state of the check of one joint.
 
-per_square: 1 / (2 sigma^2). least_ratio: log likelihood ratio at which a current counts as zero. allowed: accepted deviation [A or V]; share: the same, relative to the goal; follow_time:
-how long a larger deviation may last [s].
+per_square: 1 / (2 sigma^2). least_ratio: log likelihood ratio at which a current counts as zero. allowed: accepted
+deviation [A or V]; share: the same, relative to the goal; follow_time: how long a larger deviation may last [s].
 evidence, ratio, count: sum of the log likelihood ratios times seconds, without seconds, and its number of samples.
 differs_for, differs: duration [s] and number of samples of a deviation.
 """

@@ -296,8 +296,8 @@ class Guard:
     def _how_noisy(self, index: int, noise: float) -> str:
         seen, unit = following.seen_above(self._joints[index]["following"], self._interval), self._units[index]
         return (
-            f"its current reading is noisy: {noise:.2g} {unit} RMS at a constant goal; lost torque cannot be seen within "
-            f"0.1 s at goals below {seen:.2g} {unit}"
+            f"its current reading is noisy: {noise:.2g} {unit} RMS at a constant goal; lost torque cannot be seen "
+            f"within 0.1 s at goals below {seen:.2g} {unit}"
         )
 
     def look_at_rest(self, state: State) -> None:
