@@ -143,7 +143,8 @@ def main() -> None:
         key: max((loops["ours"][key] for loops in rates.values()), key=abs)
         for key in ("lateness_p50_us", "lateness_p99_us", "drift_us", "missed")
     }
-    stall = {"periods": STALL_PERIODS, "expected": STALL_MISSES, "counted": stalled(500.0)}
+    with real_time():  # on a busy machine, an ordinary process misses deadlines of its own
+        stall = {"periods": STALL_PERIODS, "expected": STALL_MISSES, "counted": stalled(500.0)}
     result = {
         **worst,
         "rates": rates,

@@ -59,11 +59,13 @@ _COUNT = len(NAMES)
 _STANDING = 0.05  # rad/s below which dry friction may hold a joint
 _STATIC = 1.5  # ratio of static to Coulomb friction
 _CERTAIN = 2.0  # standard deviations within which a torque that friction has held is known
+_INERTIAS = 4  # number of inertial parameters, the first ones
+_SHOWN = 3.0  # acceleration from which inertias are learnt, in standard deviations of its rounding
 _VISIBLE = 2.0  # velocity that shows in the register, in standard deviations of its rounding
 _VELOCITY_STD = 0.0135  # rad/s: rounding of the register, with steps of 0.024, and some noise
 _FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned torque
 _NOISE_S = 1.0  # time constant of the noise estimate
-_USUAL_S = 1.0  # time constant of the mean square velocity
+_USUAL_S = 1.0  # time constant of the mean square velocity and of the memory of accelerations
 _CLIPPED = 9.0  # maximum influence of one sample on the noise estimate, in variances of the noise
 _STANDING_NOISE = 0.3  # fraction of the noise, and of the smallest threshold, that remains while a joint stands still
 _LESSONS = 2.0  # number of successive updates that share an error of the model
@@ -85,8 +87,9 @@ _OF_REST, _ROW, _GAIN = _OF_MOMENTUM + 2, _OF_MOMENTUM + 4, _OF_MOMENTUM + 5
 # Scalars: per joint filtered torque, noise variance, fraction of time at standstill, duration and sample count of a
 # possible alarm, residual torque; then the time since the last parameter update and since the start.
 _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
-# Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration; mean square velocity.
-_TAUGHT, _TEACHES, _SQUARED = 0, 2, 4
+# Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration; mean square velocity;
+# square of the largest recent acceleration.
+_TAUGHT, _TEACHES, _SQUARED, _SHARPEST = 0, 2, 4, 6
 # The constants: joints, interval, floors; from 4 drifts; then two minimum noises, the highest floors and their
 # friction; whether the arm is hardly known.
 _HIGHEST = 4 + _COUNT + 2
@@ -231,13 +234,16 @@ def _gain(m: Any, i: int, row: Any) -> float:
     return gain
 
 
-def _learn(m: Any, row: Any, gain: Any, lacking: float, spread: float) -> None:
+def _learn(m: Any, row: Any, gain: Any, lacking: float, spread: float, first: int) -> None:
+    """Update the parameters from `first` on; the uncertainty of those before it is taken into account (Schmidt)."""
     for i in range(_COUNT):
         gain[i] = _gain(m, i, row)
     for i in range(_COUNT):
-        m[_THETA, i] += gain[i] * lacking / spread
+        if i >= first:
+            m[_THETA, i] += gain[i] * lacking / spread
         for n in range(_COUNT):
-            m[_COVARIANCE + i, n] -= gain[i] * gain[n] / spread
+            if i >= first or n >= first:
+                m[_COVARIANCE + i, n] -= gain[i] * gain[n] / spread
 
 
 def _keep_dissipative(m: Any) -> None:
@@ -342,6 +348,23 @@ def _remember_speed(m: Any, j: int, velocity: float, dt: float) -> None:
     m[_PENDING, _SQUARED + j] += min(dt / _USUAL_S, 1.0) * (velocity * velocity - m[_PENDING, _SQUARED + j])
 
 
+def _remember_acceleration(m: Any, j: int, row: Any, dt: float) -> None:
+    """Update the square of the joint's largest recent acceleration."""
+    largest = max(abs(row[0]), abs(row[2]), abs(row[3]))
+    former = m[_PENDING, _SHARPEST + j]
+    m[_PENDING, _SHARPEST + j] = max(largest * largest, former * (1.0 - min(dt / _USUAL_S, 1.0)))
+
+
+def _accelerates(m: Any, j: int, slope: float) -> bool:
+    """Return whether recent accelerations stand out from the rounding of velocities.
+
+    If they do not, inertias are not learnt: errors of that size in the regressors would draw them towards zero, and
+    leave the estimate of everything else wrong and too certain.
+    """
+    rounding = slope * _VELOCITY_STD
+    return bool(m[_PENDING, _SHARPEST + j] >= (_SHOWN * rounding) ** 2)
+
+
 def _floor(m: Any, k: Any, j: int) -> float:
     """Return the smallest torque that may raise an alarm, lower for a joint whose friction turns out to be small."""
     dry = m[_THETA, 8 + j] + math.sqrt(max(m[_COVARIANCE + 8 + j, 8 + j], 0.0))
@@ -408,6 +431,7 @@ def _observe_loop(
         if not is_warm:
             continue
         _remember_speed(m, j, v1 if j == 0 else v2, dt)
+        _remember_acceleration(m, j, row, dt)
         lacking, left_open = _lacks(m, j, row)
         single[_LACKING + j] = lacking
         stands = min(max(single[_STANDS + j], 0.0), 1.0)
@@ -432,7 +456,8 @@ def _observe_loop(
         _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), dt * (1.0 - stands), single[_SAMPLES + j] > 0.0)
         if lesson and not is_beyond and not _is_suspect(rests[j]):
             taught_by = _LESSONS * (spread - left_open) + _STANDING_LESSONS * (1.0 - quiet) * rounding
-            _learn(m, row, m[_GAIN], lacking, left_open + taught_by + holds * holds)
+            first = 0 if _accelerates(m, j, slope) else _INERTIAS
+            _learn(m, row, m[_GAIN], lacking, left_open + taught_by + holds * holds, first)
             _keep_dissipative(m)
     return alarm
 
@@ -449,5 +474,5 @@ _keep, _unexplained = earlier_model.keep, earlier_model.unexplained
 _static_friction, _is_blocked = map(_inner, (_static_friction, _is_blocked))
 _second_moment, _of_rounding = map(_inner, (_second_moment, _of_rounding))
 _alarms, _teach_noise, _floor, _remember_speed = map(_inner, (_alarms, _teach_noise, _floor, _remember_speed))
-_look_back = _inner(_look_back)
+_remember_acceleration, _accelerates, _look_back = map(_inner, (_remember_acceleration, _accelerates, _look_back))
 observe: Callable[..., int] = compiled(_observe_loop)

@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 import numba
 import numpy as np
 
+from hil.config.experiment import ExperimentConfig
 from hil.config.schema import Config
 from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
@@ -48,10 +49,15 @@ _INERTIA = 0.3
 """Standard deviations for an arm without a description, as multiples of the planned torque in SI units.
 
 Gravity may be ten times as large as a small first torque, which then moves the arm by a tenth of a radian. But viscous
-friction and inertia cannot be several times as large as the planned torque, because the arm would then hardly move.
+friction and inertia cannot be several times as large as the planned torque, because the arm would then hardly move. If
+the excitation is slower than `_USUAL_HZ`, they can, in proportion: long, heavy arms are excited slowly.
 """
+_USUAL_HZ = 0.7
+"""Geometric mean of the lowest and the highest frequency from which the excitation is not called slow."""
 _FLAT = 0.3
 """Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the units of `_INERTIA`."""
+_NEAR_LIMIT = 0.05
+"""Distance from a position limit, as a fraction of the range, within which a hard stop is named as a possible cause."""
 _STILL_RAD_S = 0.06
 _STEP_S = 0.02
 """If a torque is held over several exchanges, a joint must appear stationary for this time before it is judged [s]."""
@@ -241,6 +247,7 @@ class ModelWatch:
         self._observer = MomentumObserver(mean, covariance, largest, interval, frictions, hardly_known=not is_described)
         self._names = [joint.joint.title for joint in config.joints]
         self._blocked_by = [causes_of_standstill(joint.joint) for joint in config.joints]
+        self._limits = [joint.position_limit for joint in config.joints]
         # Goals held over several exchanges are steps, which the current and the velocity follow with a delay.
         self._is_held = interval < 0.99 / config.experiment.rate
         self._recent: deque[State] = deque(maxlen=math.ceil(_WINDOW_S / interval) + 1)
@@ -334,7 +341,15 @@ class ModelWatch:
                 f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "
                 "encoder has failed, something is pushing or holding it, or the arm is not the one described."
             )
-        raise SafetyStop(said, Cause.UNEXPECTED)
+        raise SafetyStop(said + self._near_limit(joint, state.position[joint]), Cause.UNEXPECTED)
+
+    def _near_limit(self, joint: int, angle: float) -> str:
+        """Return the sentence for a joint that may have met a hard stop; empty far from its position limits."""
+        low, high = self._limits[joint]
+        limit = low if angle - low < high - angle else high
+        if abs(angle - limit) > _NEAR_LIMIT * (high - low):
+            return ""
+        return f" It is at {angle:.2f} rad, close to its limit of {limit:g} rad: it may have met a hard stop there."
 
 
 def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:
@@ -375,7 +390,7 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
     guesses = [servo_prior(joint.joint.servo).coulomb for joint in config.joints]
     mean = {f"coulomb_{number}": guess.median for number, guess in enumerate(guesses, 1)}
     spread = np.zeros(len(NAMES))
-    is_flat = config.arm.gravity == 0.0
+    is_flat, slowness = config.arm.gravity == 0.0, _slowness(config.experiment)
     for index, name in enumerate(NAMES):
         if len(largest) == 1 and name in _OF_TWO:
             continue
@@ -385,5 +400,18 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
             spread[index] = _FRICTION_SPREAD * guesses[joint].spread * guesses[joint].median
         else:
             share = _FLAT if is_flat and term in ("gravity", "tilt") else _UNDESCRIBED.get(term, _INERTIA)
+            share *= slowness if term not in ("gravity", "tilt", "offset") else 1.0
             spread[index] = share * largest[joint]
     return mean, np.diag(spread**2)
+
+
+def _slowness(experiment: ExperimentConfig) -> float:
+    """Return how many times slower than usual the excitation is; at least 1."""
+    if experiment.lines is not None:
+        harmonics = [line for lines in experiment.lines for line in lines]
+        low, high = min(harmonics) / experiment.period, max(harmonics) / experiment.period
+    elif experiment.band is not None:
+        low, high = experiment.band
+    else:
+        return 1.0
+    return max(1.0, _USUAL_HZ / math.sqrt(low * high))

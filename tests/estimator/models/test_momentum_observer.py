@@ -85,3 +85,32 @@ def test_a_push_on_a_hardly_known_joint_is_found_by_the_model_from_before(push: 
 @pytest.mark.parametrize("friction", [0.0, 0.02, 0.05, 0.1])
 def test_a_healthy_hardly_known_joint_is_never_stopped(friction: float) -> None:
     assert alarm_of_hardly_known(0.0, friction, begins=6.0) == math.inf
+
+
+def slow_heavy_joint_is_stopped(seed: int) -> bool:
+    """Whether a healthy hanging link is stopped, whose accelerations are below the rounding of velocities."""
+    rng = np.random.default_rng(seed)
+    peak, interval, substeps = 9.0, 0.01, 4
+    inertia, gravity, viscous = peak * rng.uniform([0.3, 2.0, 0.5], [2.0, 7.0, 1.5])
+    omega, phase = math.tau * np.geomspace(0.03, 0.4, 8), rng.uniform(0.0, math.tau, 8)
+    times = np.arange(0.0, 40.0, interval / substeps)
+    wave = np.sin(np.multiply.outer(times, omega) + phase).sum(axis=1)
+    torques = peak / abs(wave).max() * wave
+    std = {"inertia_1": 1.8, "viscous_1": 6.0, "offset_1": 0.3, "gravity_1": 10.0, "tilt_1": 1.0, "coulomb_1": 0.01}
+    covariance = np.diag([(peak * std.get(name, 0.0)) ** 2 for name in NAMES])
+    observer = MomentumObserver({}, covariance, np.array([peak]), interval, 3.0, hardly_known=True)
+    angle, speed, tick = -math.pi / 2, 0.0, math.tau / 4096
+    held = 0.0
+    for index, torque in enumerate(torques.tolist()):
+        if index % substeps == 0:
+            seen = 0.024 * round(speed / 0.024)
+            if observer.observe((tick * round(angle / tick),), (seen,), (held,), interval) >= 0:
+                return True
+            held = torque
+        speed += interval / substeps / inertia * (held - viscous * speed - gravity * math.cos(angle))
+        angle += interval / substeps * speed
+    return False
+
+
+def test_a_healthy_joint_that_moves_slowly_and_weighs_much_is_never_stopped() -> None:
+    assert not any(slow_heavy_joint_is_stopped(seed) for seed in range(12))

@@ -11,9 +11,10 @@ from hil.config.schema import Config, load_config
 from hil.drivers.state import State
 from hil.dry_run.ensemble import prior_ensemble
 from hil.errors import Cause, SafetyStop
+from hil.estimator.models.momentum_observer import NAMES
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.closed_loop import Feedback, respond, resting
-from hil.experiment.model_watch import JOLT_BACK_S, JOLT_RAD_S, JOLT_TIMES, ModelWatch
+from hil.experiment.model_watch import JOLT_BACK_S, JOLT_RAD_S, JOLT_TIMES, ModelWatch, known_arm
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.plant import Plant, make_plant
 from tests.support.jolts import Jolts
@@ -278,3 +279,13 @@ def test_teeth_that_change_sides_within_the_play_of_a_gear_are_no_horn_that_slip
         turned = 0.009 * ((index + 20) // 40)
         now, nothing = interval * index, (0.0, 0.0)
         watch.look(State(now, now + 1e-3, nothing, nothing, (0.0, speed), (-1.57, turned), (0, 0), (False, False)))
+
+
+def test_an_undescribed_arm_that_is_excited_slowly_may_be_heavy() -> None:
+    """The paper's arm: 11.5 kg m^2 on joint 1, moved by 9 N m at 0.03 to 0.43 Hz."""
+    heavy = load_config(CONFIGS / "paper_two_link.toml")
+    usual = heavy.model_copy(update={"experiment": heavy.experiment.model_copy(update={"period": 1.2})})
+    inertia, viscous = NAMES.index("inertia_1"), NAMES.index("viscous_1")
+    slow, fast = (np.sqrt(np.diag(known_arm(each, np.array([9.0, 9.0]), None)[1])) for each in (heavy, usual))
+    assert slow[inertia] > 11.5 > 3.0 * fast[inertia]
+    assert slow[viscous] > 12.0 > fast[viscous]
