@@ -8,7 +8,6 @@ At a low sample rate, the delay of such a spring would drive the joint (`hil.pla
 stronger, as far as the rate allows, and the spring softer, as far as gravity allows.
 """
 
-from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
@@ -74,34 +73,24 @@ def proposed(config: Config, belief: Belief, springs: NDArray[np.bool_]) -> Stab
     damping = np.maximum(2 * _DAMPING_RATIO * np.sqrt(stiffness * inertia) - viscous, 0.0)
     usual = np.array([len(joint.ids) * servo_prior(joint.joint.servo).viscous.median for joint in config.joints])
     lightest = np.min([_free_inertia(config, each) for each in parameters], axis=0)
-    wanted = _Gains(np.where(springs, stiffness, 0.0), np.where(springs, damping, 0.0))
+    stiffness, damping = np.where(springs, stiffness, 0.0), np.where(springs, damping, 0.0)
     least = np.where(springs, _OUTWEIGHS * away, 0.0)
-    found = _at_rate(config.experiment.rate, wanted, least, usual, lightest)
-    if (weak := found.stiffness < least).any():
-        rate = float(_sufficient_rates(wanted.damping, least, usual, lightest).max())
+    spring, damper = _at_rate(config.experiment.rate, stiffness, damping, usual, lightest)
+    if (weak := spring < least).any():
+        rate = float(_sufficient_rates(damping, least, usual, lightest).max())
         _refuse_rate(config, int(np.argmax(weak)), away, np.ceil(rate))
-    return StabiliserConfig(stiffness=_rounded(found.stiffness), damping=_rounded(found.damping))
+    return StabiliserConfig(stiffness=_rounded(spring), damping=_rounded(damper))
 
 
-@dataclass(frozen=True)
-class _Gains:
-    """Stiffness (joints,) [N m/rad] and damping (joints,) [N m s/rad]."""
+def _at_rate(rate: float, stiffness: Array, damping: Array, usual: Array, lightest: Array) -> tuple[Array, Array]:
+    """Return stiffness and damping for a rate [Hz]: as given, or else a stronger damper and then a softer spring.
 
-    stiffness: Array
-    damping: Array
-
-
-def _at_rate(rate: float, wanted: _Gains, least: Array, usual: Array, lightest: Array) -> _Gains:
-    """Return the gains for a rate [Hz]: those wanted, or else a stronger damper and then a softer spring.
-
-    least: stiffness that gravity requires (joints,) [N m/rad]; the result is softer if the rate does not allow it.
     usual: typical viscous friction (joints,) [N m s/rad]. lightest: smallest inertia (joints,) [kg m^2].
     """
     delay = DELAY_SAMPLES / rate
-    needed = delay * wanted.stiffness / _DRIVEN - usual
-    damping = np.maximum(wanted.damping, np.minimum(needed, most_damping(rate, lightest)))
-    at_most = _DRIVEN * (damping + usual) / delay
-    return _Gains(np.minimum(wanted.stiffness, at_most), damping)
+    needed = delay * stiffness / _DRIVEN - usual
+    damping = np.maximum(damping, np.minimum(needed, most_damping(rate, lightest)))
+    return np.minimum(stiffness, _DRIVEN * (damping + usual) / delay), damping
 
 
 def _sufficient_rates(damping: Array, least: Array, usual: Array, lightest: Array) -> Array:
