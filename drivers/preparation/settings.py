@@ -13,8 +13,13 @@ from hil.drivers.control_table import Register
 from hil.drivers.errors import DriverError, WrongReply, WrongSetting
 from hil.drivers.servo import Servo
 
-EEPROM = ("Current Limit", "Operating Mode")
-"""EEPROM registers that an experiment sets and restores, in this order, since the limit bounds the goal."""
+PROTECTIVE = ("Shutdown", "Temperature Limit", "Max Voltage Limit", "Min Voltage Limit")
+"""EEPROM registers that decide when a servo protects itself. An experiment does not set them, but restores them if
+another program has changed them meanwhile.
+"""
+
+EEPROM = ("Current Limit", "Operating Mode", *PROTECTIVE)
+"""EEPROM registers that are restored, in this order, since the limit bounds the goal."""
 
 RAM = (
     "Velocity I Gain",

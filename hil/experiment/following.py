@@ -23,18 +23,25 @@ far from it. But a motor's current follows its goal: if all three readings stay 
 that they may answer to (those of the last `ANSWERS_S`) have become others, they are frozen. A constant error of the
 sensor cancels in this comparison.
 
+A current sensor may be noisier than assumed. Its noise is measured at constant goals, while the arm rests before the
+start (`CurrentNoise`), and is a lower bound of sigma: a noisy reading then means that lost torque is found later, not
+that a healthy motor is stopped. So that this does not blind the check, a joint with far too much noise is refused.
+
 The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
 that it keeps for a joint is a record of the type `MEMORY`.
 """
 
+from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numba
 import numpy as np
 
 from hil.config.joint import JointConfig
+from hil.drivers.state import State
 
-__all__ = ["GOALS", "MEMORY", "begin", "is_frozen", "look"]
+__all__ = ["GOALS", "MEMORY", "CurrentNoise", "allow_noise", "begin", "is_frozen", "look", "seen_above", "usual_sigma"]
 
 GAIN_ERROR = 0.2
 """Largest scale error of a current sensor."""
@@ -57,8 +64,29 @@ _FULL_WEIGHT = 5.0
 LEAST_RATIO = 10.0
 """Log likelihood ratio at which a current counts as zero, however low the rate."""
 
+NOISY_RATIO = 16.0
+"""The same for a sensor whose noise is known to be as large as assumed; most sensors have far less noise than that."""
+
 _FEWEST = 2
 """Minimum number of samples that differ from the goal, however low the rate."""
+
+ALLOWED_SIGMAS = 4.0
+"""A deviation within this multiple of the measured noise is accepted."""
+
+FEWEST_READINGS, MOST_READINGS = 8, 256
+"""Number of readings from which noise is first measured, and number of the latest ones that are kept."""
+
+_UNCERTAIN = 1.9
+"""How much too small noise measured from n readings may be, relative to the real noise, times the square root of n."""
+
+_MAD_TO_SIGMA = 1.4826
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
+
+MOST_NOISE = 0.25
+"""Largest accepted noise, relative to the joint's goal limit."""
+
+_SOON_S = 0.1
+"""Time within which lost torque should be found [s]."""
 
 ANSWERS_S, _BLOCKS = 0.03, 3
 """A reading may answer to any goal of this time [s], which is divided into so many blocks."""
@@ -79,14 +107,14 @@ one of these readings may answer to.
 
 MEMORY = np.dtype(
     [
-        *((name, "f8") for name in ("per_square", "allowed", "share", "follow_time")),
+        *((name, "f8") for name in ("per_square", "least_ratio", "allowed", "share", "follow_time")),
         *((name, "f8") for name in ("former_goal", "evidence", "ratio", "count", "differs_for", "differs")),
     ]
 )
 """Constants and state of the check of one joint.
 
-per_square: 1 / (2 sigma^2). allowed: accepted deviation [A or V]; share: the same, relative to the goal; follow_time:
-how long a larger deviation may last [s].
+per_square: 1 / (2 sigma^2). least_ratio: log likelihood ratio at which a current counts as zero. allowed: accepted
+deviation [A or V]; share: the same, relative to the goal; follow_time: how long a larger deviation may last [s].
 evidence, ratio, count: sum of the log likelihood ratios times seconds, without seconds, and its number of samples.
 differs_for, differs: duration [s] and number of samples of a deviation.
 """
@@ -98,14 +126,72 @@ def begin(memory: Any, goals: Any, joint: JointConfig, planned: float, follow_sh
     planned: the joint's largest goal [A, or V under PWM]. follow_share, follow_time: the [safety] settings of the same
     names.
     """
-    tick = abs(joint.joint.drive_unit(12.0))
-    sigma = max(SIGMA_SHARE * planned, SIGMA_TICKS * tick)
-    memory["per_square"] = 0.5 / sigma**2
-    memory["allowed"] = max(follow_share * planned, ALLOWED_TICKS * tick)
     memory["share"] = follow_share
     memory["follow_time"] = follow_time
+    allow_noise(memory, goals, joint, planned, follow_share, 0.0)
+
+
+def usual_sigma(joint: JointConfig, planned: float) -> float:
+    """Return the standard deviation of current errors that is assumed of any sensor [A or V]."""
+    return max(SIGMA_SHARE * planned, SIGMA_TICKS * abs(joint.joint.drive_unit(12.0)))
+
+
+def allow_noise(memory: Any, goals: Any, joint: JointConfig, planned: float, follow_share: float, noise: float) -> None:
+    """Set the thresholds for readings with this standard deviation [A or V]. Other arguments: as for `begin`."""
+    tick = abs(joint.joint.drive_unit(12.0))
+    usual = usual_sigma(joint, planned)
+    memory["per_square"] = 0.5 / max(usual, noise) ** 2
+    memory["least_ratio"] = LEAST_RATIO if noise <= usual else NOISY_RATIO
+    noisy = ALLOWED_SIGMAS * noise
+    scaled = min(GAIN_ERROR, follow_share) * planned
+    memory["allowed"] = max(follow_share * planned, ALLOWED_TICKS * tick, scaled + noisy)
     # An error in proportion to the goal makes the current change less; rounding hides up to one tick.
-    goals["most"] = (max(SIGMA_SHARE * planned, ALLOWED_TICKS * tick) + tick) / (1.0 - GAIN_ERROR)
+    goals["most"] = (max(SIGMA_SHARE * planned, ALLOWED_TICKS * tick, noisy) + tick) / (1.0 - GAIN_ERROR)
+
+
+def seen_above(memory: Any, interval: float) -> float:
+    """Return the smallest goal [A or V] at which lost torque is found in a tenth of a second.
+
+    interval: time between two exchanges [s].
+    """
+    needed = max(memory["least_ratio"] * interval, _FULL_WEIGHT * LOST_AFTER_S) / _SOON_S
+    return float(np.sqrt(needed / memory["per_square"]) / (1.0 - GAIN_ERROR))
+
+
+class CurrentNoise:
+    """Standard deviation of the joints' current readings, measured at goals that hardly change.
+
+    Every reading is compared with its goal. The median absolute deviation ignores single wrong replies, and a current
+    that stays at another value than its goal is no noise.
+    """
+
+    def __init__(self, joints: Sequence[JointConfig]) -> None:
+        self._ticks = np.abs([joint.joint.drive_unit(12.0) for joint in joints])
+        self._errors = deque[Any](maxlen=MOST_READINGS)
+        self._former: Any = None
+
+    def add(self, state: State) -> bool:
+        """Process an exchange; return whether enough readings have been added since the last measurement."""
+        goal, former = np.array(state.goal_current), self._former
+        self._former = goal
+        if former is None or True in state.missing or (np.abs(goal - former) > SIGMA_TICKS * self._ticks).any():
+            return False
+        self._errors.append(state.current - goal)
+        count = len(self._errors)
+        # Each measurement needs twice as many readings as the one before: this takes time between two samples.
+        return FEWEST_READINGS <= count < MOST_READINGS and count & (count - 1) == 0
+
+    def measured(self) -> tuple[list[float], list[float]]:
+        """Return each joint's noise and its upper bound [A or V]; 0 after too few readings."""
+        if len(self._errors) < FEWEST_READINGS:
+            return [0.0] * len(self._ticks), [0.0] * len(self._ticks)
+        errors = np.array(self._errors)
+        spread = np.median(np.abs(errors - np.median(errors, axis=0)), axis=0)
+        noise = _MAD_TO_SIGMA * spread
+        # Rounding may have reduced the spread by half a tick; what it hides entirely is less than two.
+        most = _MAD_TO_SIGMA * (spread + 0.5 * self._ticks) / (1.0 - _UNCERTAIN / len(errors) ** 0.5)
+        hidden = np.minimum(most, SIGMA_TICKS * self._ticks)
+        return noise.tolist(), np.where(spread > 0.25 * self._ticks, most, hidden).tolist()
 
 
 def look(memory: Any, goal: float, carried: float, seconds: float) -> float:
@@ -125,7 +211,7 @@ def look(memory: Any, goal: float, carried: float, seconds: float) -> float:
         memory.evidence = evidence
         memory.ratio += gain
         memory.count += 1.0
-        if evidence >= _FULL_WEIGHT * LOST_AFTER_S and memory.ratio >= LEAST_RATIO:
+        if evidence >= _FULL_WEIGHT * LOST_AFTER_S and memory.ratio >= memory.least_ratio:
             return float(memory.count * seconds)
     else:
         memory.evidence = memory.ratio = memory.count = 0.0

@@ -8,7 +8,7 @@ commands or replies (`deadlines` and `silence`); `command_limits` clamps what is
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from math import copysign, isnan
+from math import copysign, inf, isnan
 from typing import NoReturn
 
 import numpy as np
@@ -25,6 +25,7 @@ from hil.experiment import following, joint_checks, work
 from hil.experiment.apart import Apart
 from hil.experiment.command_limits import CommandLimits
 from hil.experiment.deadlines import Deadlines
+from hil.experiment.following import CurrentNoise
 from hil.experiment.joint_checks import JOINT, MOST_OUTSIDE_RAD, JointChecks
 from hil.experiment.silence import LATE_WAKE_UP_S, Silence
 from hil.experiment.status_check import StatusCheck
@@ -75,6 +76,8 @@ class Guard:
     lowers_since: for an arm that is being lowered, the time of the last exchange that all servos answered [s]. Replies
     may then be missing for longer; temperatures, voltages and alerts are accepted as long as the servos have their
     torque, and no advice about the experiment's torque is given.
+
+    noise: noise of each joint's current readings [A or V], if another guard has measured it.
     """
 
     def __init__(
@@ -88,6 +91,7 @@ class Guard:
         left_by_a_run: bool = False,
         recent: RecentMotion | None = None,
         lowers_since: float | None = None,
+        noise: Sequence[float] | None = None,
     ) -> None:
         rate = config.experiment.rate
         safety = config.safety
@@ -114,8 +118,8 @@ class Guard:
         """Clamp goals to each joint's limit and slew rate [A or V]. Raises SafetyStop for a goal that is not finite."""
         self.holding = commands.holding
         """Set the goals now in effect [A or V], from which `clamp` continues."""
-        planned = planned or _planned(config)
-        interval = 1.0 / rate if interval is None else interval
+        self._config, self._planned = config, planned or _planned(config)
+        self._interval = interval = 1.0 / rate if interval is None else interval
         self.recent = RecentMotion(config, interval) if recent is None else recent
         """The latest exchanges, including those during a stop."""
         self._silence = Silence(config, interval, patience, lowers_since)
@@ -125,7 +129,11 @@ class Guard:
         self._heard_instead = heard_instead
         self._deadlines = Deadlines(config, heard_instead, any_share=is_lowering)
         self._longest_gap = safety.watchdog
-        self._joints = _joint_records(config, planned, left_by_a_run)
+        self._joints = _joint_records(config, self._planned, left_by_a_run)
+        self._noise = CurrentNoise(config.joints)
+        self.current_noise = [0.0] * len(config.joints) if noise is None else noise
+        """Noise of each joint's current readings, or its upper bound [A or V]; 0 if not known."""
+        self._allow(self.current_noise)
         self._checks = JointChecks(self._joints, interval)
         self._apart = Apart()
         self._status = StatusCheck(config, heard_instead, bears_errors=is_lowering)
@@ -249,9 +257,48 @@ class Guard:
 
     def rests_at(self, positions: Sequence[float]) -> None:
         """Set the joints' angles before torque was switched on [rad]; by default, those of the first sample are
-        used.
+        used. From now on, `measure_noise` is called with each exchange until `noise_is_known`.
         """
         self._resting = positions
+        self._joints["following"]["allowed"] = inf  # until some readings have shown their noise
+
+    def measure_noise(self, state: State) -> None:
+        """Process an exchange of an arm at rest: until its noise is known, a current reading may deviate."""
+        if self._noise.add(state):
+            self._allow(self._noise.measured()[1])
+
+    def noise_is_known(self) -> list[str]:
+        """End the measurement of noise; return what it means for each joint whose current reading is noisy.
+
+        Raises SafetyStop if a reading is too noisy for a check of the current.
+        """
+        noise, most = self._noise.measured()
+        self.current_noise = most
+        self._allow(most)
+        noisy = []
+        for index, joint in enumerate(self._config.joints):
+            usual = following.usual_sigma(joint, self._planned[index])
+            if not self._joints[index]["is_followed"] or most[index] <= usual:
+                continue
+            said = self._how_noisy(index, noise[index])
+            if noise[index] > following.MOST_NOISE * joint.goal_limit:
+                remedy = "Check its supply and its cable; replace the servo if this happens again."
+                self._stop(index, Cause.NOT_FOLLOWING, f"cannot be monitored: {said}. {remedy}")
+            noisy.append(f"{self._names[index]}: {said}")
+        return noisy
+
+    def _allow(self, noise: Sequence[float]) -> None:
+        share = self._safety.follow_share
+        each = zip(self._joints, self._config.joints, self._planned, noise, strict=True)
+        for record, joint, planned, sigma in each:
+            following.allow_noise(record["following"], record["goals"], joint, planned, share, sigma)
+
+    def _how_noisy(self, index: int, noise: float) -> str:
+        seen, unit = following.seen_above(self._joints[index]["following"], self._interval), self._units[index]
+        return (
+            f"its current reading is noisy: {noise:.2g} {unit} RMS at a constant goal; lost torque cannot be seen "
+            f"within 0.1 s at goals below {seen:.2g} {unit}"
+        )
 
     def look_at_rest(self, state: State) -> None:
         """Raise SafetyStop when a joint moves before anything has been commanded."""

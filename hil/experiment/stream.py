@@ -195,6 +195,8 @@ class Stream:
                 f"The arm is moving before the start: {moving}. Wait until it is at rest, then start again. If it "
                 "moved by itself, another program is commanding it, or something is pushing or holding it."
             )
+        for noisy in self._guard.noise_is_known():
+            self._note(noisy)
 
     def _check_velocity(self, state: State, window: int) -> None:
         """Raise SafetyStop, which no brake may follow, for a joint that reports a velocity although its position has
@@ -370,6 +372,8 @@ class Stream:
         if state.status is not None and self._guard.wants_status:
             self._bus.read_status_next()
         self._model.look(state)
+        if phase is Phase.REST:
+            self._guard.measure_noise(state)
         if self._is_undriven and phase is Phase.REST:
             self._guard.look_at_rest(state)
             self._is_undriven = self._stabiliser is None or any(state.missing)

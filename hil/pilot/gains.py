@@ -3,13 +3,22 @@ so much friction that gravity cannot move a joint. Such a joint drifts, even fro
 
 The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction within a radian,
 and soft enough to leave most of the torque to the excitation.
+
+At a low sample rate, the delay of such a spring would drive the joint (`hil.plan.stabiliser`). Then the damper is made
+stronger, as far as the rate allows, and the spring softer, as far as gravity allows.
 """
+
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config, StabiliserConfig
+from hil.drivers.servo_prior import servo_prior
+from hil.errors import ConfigError
 from hil.pilot.belief import Belief
+from hil.plan.gains import MOST_DAMPING, most_damping
+from hil.plan.stabiliser import DELAY_SAMPLES
 
 Array = NDArray[np.float64]
 
@@ -18,6 +27,7 @@ _DAMPING_RATIO = 0.35
 _OUTWEIGHS = 1.3  # relative to the largest destabilising gravity stiffness of all arms
 _FRICTIONS_PER_RADIAN = 1.5
 _HELD = 1.5  # friction over gravity's torque at one radian from rest: at 1 it holds the joint at any angle
+_DRIVEN = 0.8  # largest share of a joint's damping that the delay of its spring may cancel
 _TORQUE_SHARE = 0.35  # largest share of the torque limit at a deflection of 1 rad, beyond what gravity needs
 
 
@@ -61,8 +71,43 @@ def proposed(config: Config, belief: Belief, springs: NDArray[np.bool_]) -> Stab
     spring = np.maximum(inertia * (2 * np.pi * _FREQUENCY) ** 2, _FRICTIONS_PER_RADIAN * friction)
     stiffness = _OUTWEIGHS * away + np.minimum(spring, _TORQUE_SHARE * limit)
     damping = np.maximum(2 * _DAMPING_RATIO * np.sqrt(stiffness * inertia) - viscous, 0.0)
+    usual = np.array([len(joint.ids) * servo_prior(joint.joint.servo).viscous.median for joint in config.joints])
+    lightest = np.min([_free_inertia(config, each) for each in parameters], axis=0)
     stiffness, damping = np.where(springs, stiffness, 0.0), np.where(springs, damping, 0.0)
-    return StabiliserConfig(stiffness=_rounded(stiffness), damping=_rounded(damping))
+    least = np.where(springs, _OUTWEIGHS * away, 0.0)
+    spring, damper = _at_rate(config.experiment.rate, stiffness, damping, usual, lightest)
+    if (weak := spring < least).any():
+        rate = float(_sufficient_rates(damping, least, usual, lightest).max())
+        _refuse_rate(config, int(np.argmax(weak)), away, np.ceil(rate))
+    return StabiliserConfig(stiffness=_rounded(spring), damping=_rounded(damper))
+
+
+def _at_rate(rate: float, stiffness: Array, damping: Array, usual: Array, lightest: Array) -> tuple[Array, Array]:
+    """Return stiffness and damping for a rate [Hz]: as given, or else a stronger damper and then a softer spring.
+
+    usual: typical viscous friction (joints,) [N m s/rad]. lightest: smallest inertia (joints,) [kg m^2].
+    """
+    delay = DELAY_SAMPLES / rate
+    needed = delay * stiffness / _DRIVEN - usual
+    damping = np.maximum(damping, np.minimum(needed, most_damping(rate, lightest)))
+    return np.minimum(stiffness, _DRIVEN * (damping + usual) / delay), damping
+
+
+def _sufficient_rates(damping: Array, least: Array, usual: Array, lightest: Array) -> Array:
+    """Return each joint's lowest rate (joints,) [Hz] at which `_at_rate` finds the stiffness that gravity requires."""
+    product = DELAY_SAMPLES * least / _DRIVEN  # of rate and damping
+    grown = MOST_DAMPING * lightest  # damping per rate
+    root = np.sqrt(usual**2 + 4.0 * grown * product)
+    return np.asarray(np.minimum((root - usual) / (2.0 * grown), product / (damping + usual)))
+
+
+def _refuse_rate(config: Config, index: int, away: Array, rate: float) -> NoReturn:
+    raise ConfigError(
+        f"{config.path}: experiment.rate = {config.experiment.rate:g} is too low to hold joint "
+        f"{config.joints[index].name!r}: in some of the possible arms, gravity drives it away from its rest pose with "
+        f"{away[index]:.2g} N m/rad, and a spring that outweighs this would make the joint oscillate, because it acts "
+        f"{1e3 * DELAY_SAMPLES / config.experiment.rate:.0f} ms late. Set experiment.rate to at least {rate:.0f}."
+    )
 
 
 def gravity_stiffness(config: Config, parameters: dict[str, float]) -> Array:
@@ -88,6 +133,15 @@ def _inertia(config: Config, parameters: dict[str, float]) -> Array:
     coupling = parameters["coupling"] * np.cos(config.arm.rest_pose[1])
     first = parameters["inertia_1"] + parameters["inertia_2"] + 2 * coupling
     return np.array([first, parameters["inertia_2"] + parameters["armature_2"]])
+
+
+def _free_inertia(config: Config, parameters: dict[str, float]) -> Array:
+    """Inertia of each joint (joints,) [kg m^2] in the rest pose, with the other joint free to move."""
+    held = _inertia(config, parameters)
+    if len(held) == 1:
+        return held
+    shared = parameters["inertia_2"] + parameters["coupling"] * np.cos(config.arm.rest_pose[1])
+    return np.asarray(held - shared**2 / held[::-1])
 
 
 def _per_joint(config: Config, parameters: list[dict[str, float]], name: str) -> Array:

@@ -7,6 +7,7 @@ from itertools import permutations
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
+from hil.drivers.preparation.settings import PROTECTIVE
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, Mode
 from hil.errors import Cause
 
@@ -16,7 +17,7 @@ _MODE, _DELAY = "Operating Mode", "Return Delay Time"
 _GOAL_PWM = "Goal PWM"
 """In current mode, a limit of the voltage; a tripped watchdog leaves 0."""
 
-_REGISTERS = (_MODE, "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _GOAL_PWM, _DELAY)
+_REGISTERS = (_MODE, "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _GOAL_PWM, _DELAY, *PROTECTIVE)
 
 WRITTEN = frozenset({"Operating Mode", "Current Limit", _GOAL_PWM})
 """Settings that this program writes itself."""
@@ -56,7 +57,7 @@ Settings = Mapping[tuple[Joint, str], int]
 
 
 def settings_now(bus: ServoBus) -> Settings:
-    """Read the settings that determine how servos move and what they report.
+    """Read the settings that determine how servos move, what they report and when they protect themselves.
 
     Servos that do not answer are omitted. Each register is read twice, in opposite orders, because a reply may belong
     to an earlier request. If the two readings differ, the value is unknown and omitted. So are all values of a servo
@@ -78,15 +79,16 @@ def settings_now(bus: ServoBus) -> Settings:
 def changed_settings(before: Settings, after: Settings, cause: Cause | None = None) -> str:
     """Return a message that names the settings that differ; "" if none do.
 
-    cause: the cause of a stop; settings that cannot explain it are omitted.
+    cause: the cause of a stop. Settings that cannot explain it are omitted, except for those that protect a servo.
     """
+    differing = {each: value for each, value in before.items() if after.get(each, value) != value}
+    if not any(_may_explain(register, cause) for _, register in differing):
+        return ""
     changed = [
         f"{joint}: {register} is {_told(register, after[joint, register])} and was {_told(register, value)}"
-        for (joint, register), value in before.items()
-        if after.get((joint, register), value) != value and _may_explain(register, cause)
+        for (joint, register), value in differing.items()
+        if register in PROTECTIVE or _may_explain(register, cause)
     ]
-    if not changed:
-        return ""
     said = f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."
     if (swapped := _swapped(before, after)) is not None:
         first, second = swapped
@@ -125,7 +127,9 @@ def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago
 
 
 def _may_explain(register: str, cause: Cause | None) -> bool:
-    return cause is None or cause in (_LATE if register == _DELAY else _MOVED)
+    if cause is None or register in PROTECTIVE:
+        return cause is None
+    return cause in (_LATE if register == _DELAY else _MOVED)
 
 
 def _told(register: str, value: int) -> str:

@@ -1,5 +1,7 @@
 """One joint in the guard's compiled checks, all of which but one are given nothing to find."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hil.config.joint import JointConfig
@@ -71,3 +73,25 @@ class Following:
     def most_under_same(self) -> float:
         """Largest change of the goal under which all readings may stay the same [A or V]."""
         return float(self._joint["goals"]["most"][0])
+
+    def rest(self, config: JointConfig, carried: Sequence[float], seconds: float, planned: float) -> bool:
+        """Process replies at goal 0 with these currents and learn their noise; return whether all were accepted."""
+        noise, (record,) = following.CurrentNoise([config]), self._joint
+        record["following"]["allowed"] = ANY
+        for current in carried:
+            if self.look(0.0, current, seconds) is not None:
+                return False
+            if noise.add(_state(0.0, current=current)):
+                self._allow(config, planned, noise.measured()[1][0])
+        self._allow(config, planned, noise.measured()[1][0])
+        return True
+
+    def seen_above(self, interval: float) -> float:
+        """Smallest goal at which lost torque is found in 0.1 s [A or V]. interval: time between two replies [s]."""
+        return following.seen_above(self._joint[0]["following"], interval)
+
+    def _allow(self, config: JointConfig, planned: float, noise: float) -> None:
+        record = self._joint[0]
+        following.allow_noise(
+            record["following"], record["goals"], config, planned, float(record["following"]["share"]), noise
+        )

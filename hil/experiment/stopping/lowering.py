@@ -10,6 +10,7 @@ Replies may be missing for a moment, even at the beginning: joints that are not 
 """
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,14 +121,22 @@ class Lowering:
         away: NDArray[np.float64] = np.array(state.position) - self._rest
         return away
 
-    def begin(self, state: State, goal: list[float], recent: RecentMotion, watch: ChainWatch | None = None) -> int:
+    def begin(
+        self,
+        state: State,
+        goal: list[float],
+        recent: RecentMotion,
+        watch: ChainWatch | None = None,
+        noise: Sequence[float] | None = None,
+    ) -> int:
         """Start lowering from this sample, the latest that all servos answered; return the number of samples that
         lowering takes.
 
         goal: latest goals [A or V]. recent: the latest exchanges. watch: the check against the model, which has seen
         the motion so far. Without it, a motor that turns against its goal is detected only when its joint runs away.
+        noise: noise of each joint's current readings [A or V], if known.
         """
-        self._recent, self._watch = recent, watch
+        self._recent, self._watch, self._noise = recent, watch, noise
         self._obedience = Obedience(len(state.position))
         self._paths = 0
         self.slow_down(1)
@@ -161,6 +170,7 @@ class Lowering:
             patience=LONGEST_S,
             recent=self._recent,
             lowers_since=state.time_before_write,
+            noise=self._noise,
         )
         self._guard.holding(goal)
         self._excess = deque[tuple[float, NDArray[np.float64]]]()

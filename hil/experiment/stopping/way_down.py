@@ -136,7 +136,7 @@ class WayDown:
         old = self._clock.now() - state.time_before_write if stopped.is_blind else 0.0
         index = first = round(old / self._interval)
         self._steps = PositionSteps(state)
-        count = lowering.begin(state, self._goal, self._guard.recent, self._watch)
+        count = lowering.begin(state, self._goal, self._guard.recent, self._watch, self._guard.current_noise)
         # The first goals are sent at once: until then those that led to the stop drive the arm.
         begun = start = self._clock.now() - first * self._interval
         while index < count:

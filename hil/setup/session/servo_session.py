@@ -18,7 +18,7 @@ from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import BusShared, DriverError, PortLost, ServoRefused
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import read_settings
+from hil.drivers.preparation.settings import PROTECTIVE, read_settings
 from hil.drivers.servo_model import Mode
 from hil.drivers.torque.off import and_list, signals_held_back
 from hil.setup.changed_settings import Settings, settings_now
@@ -105,7 +105,9 @@ class ServoSession:
         for joint, servo in bus.drives.items():
             settings = read_settings(servo)
             self._delays[joint] = servo.read("Return Delay Time")
-            changed = {"Operating Mode": int(joint.mode)}
+            # If this program is killed, the next one can tell that another has changed what protects the servo.
+            changed = {name: settings[name] for name in PROTECTIVE if name in settings}
+            changed["Operating Mode"] = int(joint.mode)
             if joint.mode is Mode.CURRENT:
                 share = described[joint].goal_limit / len(described[joint].ids)
                 changed["Current Limit"] = joint.current_limit_ticks(share)

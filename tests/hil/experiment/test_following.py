@@ -1,7 +1,7 @@
 """Checks of the motor current: how fast lost torque is detected, and what healthy motors may do."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from random import Random
 
 import numpy as np
@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config, load_config
-from hil.experiment.following import GOALS, MEMORY, begin, is_frozen
+from hil.drivers.state import State
+from hil.experiment.following import GOALS, MEMORY, CurrentNoise, begin, is_frozen
 from tests.support.one_joint import Following
 from tests.support.paths import CONFIGS
 
@@ -106,6 +107,65 @@ def test_one_wrong_reply_in_between_is_forgiven() -> None:
     config, planned = joints("xm430_two_link")[0]
     follow = Following(config, planned, 0.3, 0.05)
     assert seen_after(follow, 400, lambda _: planned, lambda goal, now: 0.0 if now % 0.02 < 0.007 else goal) == math.inf
+
+
+def noisy(goals: Sequence[float], noise: float, tick: float, random: Random) -> list[float]:
+    return [tick * round((goal + random.gauss(0.0, noise)) / tick) for goal in goals]
+
+
+@pytest.mark.parametrize("name", ["xm430_two_link", "xl330_two_link", "xm540_two_link"])
+@pytest.mark.parametrize("rate", RATES)
+def test_a_healthy_motor_with_a_noisy_sensor_is_not_stopped(name: str, rate: int) -> None:
+    """Peaks from a fiftieth of the limit on, as in a pilot: below the noise."""
+    random, config = Random(rate), joints(name)[0][0]
+    for noise in (0.0, 0.005, 0.02, 0.05):
+        for planned in (0.02 * config.goal_limit, 0.1 * config.goal_limit):
+            follow = Following(config, planned, 0.3, 0.05)
+            tick = abs(config.joint.drive_unit(12.0))
+            goals = [planned * math.sin(5.0 * index / rate) for index in range(min(3 * rate, 900))]
+            assert follow.rest(config, noisy([0.0] * (rate // 2), noise, tick, random), 1 / rate, planned)
+            for goal, carried in zip(goals, noisy(goals, noise, tick, random), strict=True):
+                assert follow.look(goal, carried, 1 / rate) is None
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_lost_torque_is_found_as_fast_after_a_rest_without_noise(rate: int) -> None:
+    config, planned = joints("xm430_two_link")[0]
+    times = []
+    for rest in ([], [0.0] * rate, [0.0, 0.00269] * rate):
+        follow = Following(config, planned, 0.3, 0.05)
+        assert not rest or follow.rest(config, rest, 1 / rate, planned)
+        times.append(seen_after(follow, rate, lambda _: 0.3 * planned, lambda goal, now: 0.0))
+    assert times[0] == times[1] == times[2] < 0.15
+
+
+def test_lost_torque_is_found_by_a_noisy_sensor_as_soon_as_said() -> None:
+    config, planned = joints("xm430_two_link")[0]
+    random, tick, found = Random(7), 2.69e-3, []
+    for _ in range(10):
+        follow = Following(config, planned, 0.3, 0.05)
+        assert follow.rest(config, noisy([0.0] * 200, 0.05, tick, random), 0.0025, planned)
+        goal = follow.seen_above(0.0025)
+        found.append(seen_after(follow, 400, lambda _: goal, lambda goal, now: random.gauss(0.0, 0.05)))  # noqa: B023
+    assert 0.1 < goal < 0.2 and 0.03 < sorted(found)[5] < 0.12
+
+
+def test_noise_is_measured_in_spite_of_single_wrong_readings_and_of_moving_goals() -> None:
+    config, random = joints("xm430_two_link")[0][0], Random(3)
+    measure = CurrentNoise([config])
+    due = []
+    for index in range(200):
+        carried = 0.5 if index % 5 == 0 else random.gauss(0.1, 0.02)
+        due.append(measure.add(State(0.0, 0.0, (0.0,), (carried,), (0.0,), (0.0,), (0,), (False,))))
+        measure.add(State(0.0, 0.0, (0.3,), (0.0,), (0.0,), (0.0,), (0,), (False,)))
+        measure.add(State(0.0, 0.0, (0.3,), (math.nan,), (0.0,), (0.0,), (0,), (True,)))
+    assert not any(due) and measure.measured() == ([0.0], [0.0]), "no goal was sent twice"
+    for index in range(200):
+        carried = 0.5 if index % 5 == 0 else random.gauss(0.1, 0.02)
+        due.append(measure.add(State(0.0, 0.0, (0.0,), (carried,), (0.0,), (0.0,), (0,), (False,))))
+    assert sum(due) == 5, "with 8, 16, 32, 64 and 128 readings"
+    (noise,), (most,) = measure.measured()
+    assert 0.017 < noise < 0.028 and noise < most < 1.3 * noise
 
 
 STEP = 2.0**-9

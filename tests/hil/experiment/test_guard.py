@@ -1,7 +1,9 @@
 """The guard alone: each cause of a stop, and the computing time of a check."""
 
+import re
 from collections.abc import Callable
 from math import inf, nan, sin, tau
+from random import Random
 from timeit import timeit
 from typing import Any
 
@@ -369,6 +371,31 @@ def test_a_joint_that_is_elsewhere_before_the_start_has_jumped_unless_it_moves(
     with pytest.raises(SafetyStop) as stop:
         guard.look_at_rest(STILL._replace(position=(-1.57, 1.57), velocity=(0.0, velocity)))
     assert said in str(stop.value) and f"{velocity:+.2f} rad/s" in str(stop.value)
+
+
+def at_rest(guard: Guard, noise: float) -> list[str]:
+    """Let the second joint's current be this noisy before the start; return what the guard says about it."""
+    random = Random(2)
+    guard.rests_at(STILL.position)
+    for number in range(200):
+        state = at(number, STILL._replace(current=(0.0, random.gauss(0.0, noise))))
+        guard.look(state)
+        guard.measure_noise(state)
+    return guard.noise_is_known()
+
+
+def test_a_noisy_current_reading_is_named_and_refused_only_if_it_hides_lost_torque(arm: Arm) -> None:
+    assert at_rest(Guard(arm()), 0.001) == []
+    guard = Guard(arm(), (0.05, 0.05))
+    (said,) = at_rest(guard, 0.05)
+    assert re.search(r"ID 2.*is noisy: 0\.0[45]\d* A RMS .* cannot be seen within 0\.1 s at goals below 0\.1\d A", said)
+    later = Guard(arm(), (0.05, 0.05), noise=guard.current_noise)
+    for each in (guard, later):
+        for number in range(40):
+            each.look(at(500 + number, STILL._replace(goal_current=(0.0, -0.02), current=(0.0, 0.06))))
+    assert look(Guard(arm(), (0.05, 0.05)), *[at(n, STILL._replace(current=(0.0, 0.06))) for n in range(20)])
+    with pytest.raises(SafetyStop, match=r"cannot be monitored: its current reading is noisy: .* A RMS"):
+        at_rest(Guard(arm()), 2.0)
 
 
 def test_motion_that_does_not_repeat_may_need_less_torque(arm: Arm) -> None:

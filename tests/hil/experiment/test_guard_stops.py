@@ -206,6 +206,29 @@ def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
     assert f"{register} is {value} and was " in (run.path / "events.jsonl").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_protection_that_another_program_switched_off_is_named_and_restored(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, stopped: bool
+) -> None:
+    def cycle() -> None:
+        ports[0].bus.servos[2].memory.set("Shutdown", 0)
+        ports[0].bus.servos[1].memory.set("Temperature Limit", 100)
+        if stopped:
+            swing_elbow(ports, 25.0)
+
+    config, folder = arm(), tmp_path / "run"
+    if stopped:
+        stop, _ = run_until_stopped(config, folder, once(cycle), plan)
+        said = " ".join(stop.__notes__)
+        assert stop.cause is Cause.VELOCITY and "Shutdown" not in str(stop)
+    else:
+        said = run_experiment(config, RunFolder.create(folder, config), config.path, once(cycle), plan)
+    assert "Another program changed" in said and "Shutdown is 0 and was 52" in said
+    assert "Temperature Limit is 100 and was 80" in said
+    assert ports[0].bus.servos[2].value("Shutdown") == 52
+    assert ports[0].bus.servos[1].value("Temperature Limit") == 80
+
+
 @pytest.mark.parametrize("ago", [0.02, 0.2])
 def test_a_mode_that_may_have_changed_after_a_stop_at_a_limit_is_not_said_to_be_its_cause(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch, ago: float

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from hil.config.schema import Config, load_config
-from hil.errors import ExperimentError
+from hil.errors import ConfigError, ExperimentError
 from hil.estimator.models.parameters import Physics
 from hil.estimator.simulation.closed_loop import respond, resting
 from hil.pilot import identify_in_steps
 from hil.pilot.belief import Belief, prior_belief
-from hil.pilot.gains import wandering, with_stabiliser
+from hil.pilot.gains import gravity_stiffness, wandering, with_stabiliser
 from hil.pilot.search import pilot_config, with_torque
 from hil.pilot.seen import Seen
 from hil.plan.plan import make_plan
-from hil.plan.stabiliser import feedback_of
+from hil.plan.stabiliser import feedback_of, too_slow
 from hil.runs.run_folder import RunFolder
 from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
@@ -86,6 +86,49 @@ def test_arms_that_do_not_come_back_are_given_gains_that_hold_them(
         position = respond(Physics.of(parameters), start, push, 400.0, feedback).position
         away.append(float(np.abs(position[:, -1] - [rest, 0.0]).max()))
     assert np.mean(np.array(away) < 0.5) > 0.95
+
+
+def upright(config: Config, rate: float) -> Config:
+    arm = config.arm.model_copy(update={"rest_pose": [np.pi / 2, 0.0]})
+    experiment = config.experiment.model_copy(update={"rate": rate})
+    return config.model_copy(update={"arm": arm, "experiment": experiment})
+
+
+@pytest.fixture(scope="module")
+def standing(config: Config) -> Belief:
+    return prior_belief(upright(config, 400.0), 48)
+
+
+@pytest.mark.parametrize("model", ["XM430-W350", "XL430-W250"])
+def test_the_proposed_gains_are_admissible_at_the_smallest_rate_named_and_hold_every_arm(
+    config: Config, standing: Belief, model: str
+) -> None:
+    """The second joint's servo has less friction than the spring's delay takes away, at most rates."""
+    first, second = config.joints
+    if model != second.model:
+        by_voltage = {"current_limit": None, "voltage_limit": 3.3, "torque_constant": None, "torque_per_volt": 0.125}
+        second = second.model_copy(update={"model": model, **by_voltage})
+    given = config.model_copy(update={"joints": [first, second]})
+    with pytest.raises(
+        ConfigError, match=r"experiment\.rate = 10 is too low to hold joint .* to at least \d+\.$"
+    ) as no:
+        with_stabiliser(upright(given, 10.0), standing)
+    rate = float(str(no.value).rpartition(" ")[2][:-1])
+    with pytest.raises(ConfigError, match=f"to at least {rate:.0f}"):
+        with_stabiliser(upright(given, rate - 1.0), standing)
+    push = np.zeros((2, round(4.0 * rate)))
+    for each in (rate, 2.0 * rate, 1000.0):
+        held = with_stabiliser(upright(given, each), standing)
+        assert too_slow(held) == "" and held.stabiliser is not None
+        for arm in standing.parameters:
+            pull = gravity_stiffness(held, arm) + np.diag(held.stabiliser.stiffness)
+            assert np.linalg.eigvalsh(pull).min() > 0.0
+    held = with_stabiliser(upright(given, rate), standing)
+    away = [
+        respond(Physics.of(arm), resting(np.array([np.pi / 2 + 0.1, 0.1])), push, rate, feedback_of(held)).position
+        for arm in standing.parameters
+    ]
+    assert np.mean([np.abs(each[:, -1] - [np.pi / 2, 0.0]).max() < 0.3 for each in away]) > 0.95
 
 
 def test_a_joint_that_friction_holds_against_its_weight_gets_a_spring_alone(config: Config) -> None:

@@ -7,6 +7,7 @@ import pytest
 
 from hil.drivers.joint import Joint
 from hil.drivers.servo_model import servo_model
+from hil.errors import Cause
 from hil.setup.changed_settings import changed_settings, settings_now
 
 SHOULDER, ELBOW = (Joint(name, number, servo_model("XM430-W350")) for number, name in ((1, "shoulder"), (2, "elbow")))
@@ -25,6 +26,15 @@ def test_one_that_differs_from_all_before_has_not(before: tuple[int, int], after
     settings = [dict(zip(((SHOULDER, LIMIT), (ELBOW, LIMIT)), each, strict=True)) for each in (before, after)]
     said = changed_settings(settings[0], settings[1])
     assert LIMIT in said and ("swapped" in said) == (before == (0, 1))
+
+
+def test_a_protection_is_named_beside_the_cause_of_a_stop_but_is_none() -> None:
+    before = {(SHOULDER, LIMIT): 447, (ELBOW, "Shutdown"): 52}
+    alone = {**before, (ELBOW, "Shutdown"): 0}
+    assert changed_settings(before, alone, Cause.POSITION) == ""
+    assert "Shutdown is 0 and was 52" in changed_settings(before, alone)
+    both = {**alone, (SHOULDER, LIMIT): 100}
+    assert all(each in changed_settings(before, both, Cause.POSITION) for each in ("Shutdown is 0", "Limit is 100"))
 
 
 class Late:

@@ -86,7 +86,7 @@ class Bus:
 class Checks:
     """In place of the guard and the model: notes what they are given."""
 
-    recent = None
+    recent = current_noise = None
 
     def __init__(self, *_: Any, **__: Any) -> None:
         self.calls: list[Call] = []
@@ -112,6 +112,13 @@ class Checks:
 
     def look_at_rest(self, _state: State) -> None:
         self.calls.append(("at rest",))
+
+    def measure_noise(self, _state: State) -> None:
+        self.calls.append(("noise",))
+
+    def noise_is_known(self) -> list[str]:
+        self.calls.append(("known",))
+        return ["noisy"]
 
     def of(self, kind: str) -> list[Call]:
         return [call[1:] for call in self.calls if call[0] == kind]

@@ -37,7 +37,7 @@ class Lowers(Checks):
     def lies(self, _state: State) -> bool:
         return self.lies_already
 
-    def begin(self, _state: State, _goal: list[float], _recent: object, _watch: object) -> int:
+    def begin(self, _state: State, _goal: list[float], _recent: object, _watch: object, _noise: object) -> int:
         return self.samples
 
     def goals(self, index: int, _state: State) -> list[float]:

@@ -178,8 +178,11 @@ def test_a_status_in_doubt_is_read_again_next(make: Make, status: Any, wants: bo
 def test_rest_is_checked_only_before_the_start(make: Make) -> None:
     stream, bus, guard = make()
     play(stream, [0.1])
-    assert not guard.of("at rest")
+    notes: list[str] = []
+    stream._note = notes.append  # type: ignore[method-assign, assignment]
+    assert not guard.of("at rest") and not guard.of("noise")
     stream._rest()
+    assert len(guard.of("noise")) == 4 and guard.calls[-1] == ("known",) and notes == ["rest", "noisy"]
     assert len(guard.of("at rest")) == 4 and not any(call[2] for call in bus.calls[1:])
 
 
