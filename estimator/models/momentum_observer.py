@@ -60,7 +60,7 @@ _STANDING = 0.05  # rad/s below which dry friction may hold a joint
 _STATIC = 1.5  # ratio of static to Coulomb friction
 _CERTAIN = 2.0  # standard deviations within which a torque that friction has held is known
 _INERTIAS = 4  # number of inertial parameters, the first ones
-_SHOWN = 3.0  # acceleration from which inertias are learnt, in standard deviations of its rounding
+_SHOWN = 2.5  # acceleration from which inertias are learnt, in standard deviations of its rounding
 _VISIBLE = 2.0  # velocity that shows in the register, in standard deviations of its rounding
 _VELOCITY_STD = 0.0135  # rad/s: rounding of the register, with steps of 0.024, and some noise
 _FIRST_NOISE_SHARE = 0.1  # initial noise as a fraction of the largest planned torque
@@ -350,7 +350,7 @@ def _remember_speed(m: Any, j: int, velocity: float, dt: float) -> None:
 
 def _remember_acceleration(m: Any, j: int, row: Any, dt: float) -> None:
     """Update the square of the joint's largest recent acceleration."""
-    largest = max(abs(row[0]), abs(row[2]), abs(row[3]))
+    largest = max(abs(row[0]), abs(row[3]))
     former = m[_PENDING, _SHARPEST + j]
     m[_PENDING, _SHARPEST + j] = max(largest * largest, former * (1.0 - min(dt / _USUAL_S, 1.0)))
 

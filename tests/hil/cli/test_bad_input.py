@@ -140,7 +140,7 @@ CASES: list[tuple[str, int, str]] = [
     ("estimate good.csv --config binary.toml", 2, "binary.toml"),
     ("estimate good.csv --config broken.toml", 2, "not valid TOML"),
     ("estimate good.csv --config joints.toml", 2, "position"),
-    ("estimate good.csv --config both.toml", 2, "torque and current are both given"),
+    ("estimate good.csv --config both.toml", 2, "columns.torque and columns.current are both given"),
     (
         "estimate good.csv --config unit.toml",
         2,
