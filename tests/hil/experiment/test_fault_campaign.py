@@ -38,8 +38,8 @@ UNSAFE = frozenset({("first_time", 400, "pushed and slow_replies"), ("paper_two_
 """Draws known to be unsafe, by configuration, rate [Hz] and faults; the aim is none.
 
 Both are forces on arms whose masses are unknown. One acts from the moment at which torque is switched on, grows with
-the largest goal so far, and is learnt as part of the arm. The other is found after 0.12 s instead of 0.1 s: the arm is so
-heavy that its inertia cannot be told from rounding, and believing otherwise stops healthy arms (docs/safety.md).
+the largest goal so far, and is learnt as part of the arm. The other is found after 0.12 s instead of 0.1 s: the arm is
+so heavy that its inertia cannot be told from rounding, and believing otherwise stops healthy arms (docs/safety.md).
 """
 
 RATES_IN_TURN = ((100, 1000), (100, 400), (20, 400))
