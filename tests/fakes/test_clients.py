@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -67,8 +68,11 @@ class Sdk:
         raise AssertionError(f"{call}{args}: {self.handler.getTxRxResult(results[at])}")
 
     def group(self, group: Any, call: str) -> Any:
+        result = sdk.COMM_RX_TIMEOUT
         for _ in range(5):
-            result = getattr(group, call)()
+            # After a missed reply, dynamixel-sdk 4.1 takes that one for the fast reply, and looks for data in it.
+            with suppress(IndexError):
+                result = getattr(group, call)()
             if result == sdk.COMM_SUCCESS:
                 return group
         raise AssertionError(f"{call}: {self.handler.getTxRxResult(result)}")
