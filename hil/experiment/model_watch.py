@@ -407,11 +407,9 @@ def _hardly_known(config: Config, largest: Array) -> tuple[dict[str, float], Arr
 
 def _slowness(experiment: ExperimentConfig) -> float:
     """Return how many times slower than usual the excitation is; at least 1."""
-    if experiment.lines is not None:
-        harmonics = [line for lines in experiment.lines for line in lines]
-        low, high = min(harmonics) / experiment.period, max(harmonics) / experiment.period
-    elif experiment.band is not None:
+    if experiment.band is not None:
         low, high = experiment.band
     else:
-        return 1.0
+        harmonics = [line for lines in experiment.lines or [] for line in lines]
+        low, high = min(harmonics) / experiment.period, max(harmonics) / experiment.period
     return max(1.0, _USUAL_HZ / math.sqrt(low * high))

@@ -72,46 +72,44 @@ def test_commanded_torque_gives_the_likelihood(setup: bench.Setup, capsys: pytes
     assert again["parameters"]["viscous_1"]["value"] == pytest.approx(found.parameters["viscous_1"].value)
 
 
-def test_errors_that_repeat_with_the_motion_are_trusted_with_care(setup: bench.Setup) -> None:
+def fitted(setup: bench.Setup, residual_over_noise: np.ndarray, systematic: float) -> tuple[Any, Any]:
+    """An arm's description and the result of a fit that found the prior's values, as far as the verdict needs them."""
     arm = SimpleNamespace(joints=tuple(SimpleNamespace(name=name) for name in setup.arm.joints))
-    found: Any = SimpleNamespace(
+    found = SimpleNamespace(
         **{"model": ChainModel(setup.base), "std": 0.01 * setup.prior.std, "simulated": True, "from_prior": ()},
-        **{"residual_over_noise": np.ones(4), "reached": True, "systematic": 0.9},
+        **{"residual_over_noise": residual_over_noise, "reached": True, "systematic": systematic},
         names=setup.base.names,
         value=setup.prior.value,
         at_bound=(),
         conflicts=(),
     )
-    well = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
+    return arm, found
+
+
+def test_errors_that_repeat_with_the_motion_are_trusted_with_care(setup: bench.Setup) -> None:
+    arm, found = fitted(setup, residual_over_noise=np.ones(4), systematic=0.9)
+    well = _verdict(found, arm, np.full(4, 0.01), setup.prior)
     assert well.trust == "yes"
     assert well.sentences[0] == f"The largest residual, {setup.arm.joints[0]}'s, is 1.00 times the noise of its angle."
     found.names, found.value = (*found.names, "torque_scale_2"), np.append(found.value, 0.7)
     found.std = np.append(found.std, 1e-3)
-    scaled = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
+    scaled = _verdict(found, arm, np.full(4, 0.01), setup.prior)
     assert scaled.trust == "with care" and "disagree by a factor of 1.43" in " ".join(scaled.sentences)
     found.names, found.value, found.std = found.names[:-1], found.value[:-1], found.std[:-1]
     found.systematic = 3.0
-    hidden = _verdict(found, arm, np.full(4, 0.01), setup.prior)  # type: ignore[arg-type]
+    hidden = _verdict(found, arm, np.full(4, 0.01), setup.prior)
     assert hidden.trust == "with care"
     assert "repeats with the motion" in hidden.sentences[1]
     found.systematic, found.std = 0.9, 1.1 * setup.prior.std
-    assert _verdict(found, arm, np.full(4, 0.01), setup.prior).trust == "with care"  # type: ignore[arg-type]
+    assert _verdict(found, arm, np.full(4, 0.01), setup.prior).trust == "with care"
 
 
 def test_an_incomplete_model_that_fails_its_own_prediction_is_not_trusted(setup: bench.Setup) -> None:
-    arm = SimpleNamespace(joints=tuple(SimpleNamespace(name=name) for name in setup.arm.joints))
-    found: Any = SimpleNamespace(
-        **{"model": ChainModel(setup.base), "std": 0.01 * setup.prior.std, "simulated": True, "from_prior": ()},
-        **{"residual_over_noise": np.full(4, 8.7), "reached": True, "systematic": 9.0},
-        names=setup.base.names,
-        value=setup.prior.value,
-        at_bound=(),
-        conflicts=(),
-    )
-    said = _verdict(found, arm, np.full(4, 0.19), setup.prior)  # type: ignore[arg-type]
+    arm, found = fitted(setup, residual_over_noise=np.full(4, 8.7), systematic=9.0)
+    said = _verdict(found, arm, np.full(4, 0.19), setup.prior)
     assert said.trust == "no"
-    assert _verdict(found, arm, np.full(4, 0.06), setup.prior).trust == "with care"  # type: ignore[arg-type]
-    useless = _verdict(found, arm, np.full(4, 17.8), setup.prior)  # type: ignore[arg-type]
+    assert _verdict(found, arm, np.full(4, 0.06), setup.prior).trust == "with care"
+    useless = _verdict(found, arm, np.full(4, 17.8), setup.prior)
     assert "the error is 18 times the torque's own RMS" in " ".join(useless.sentences)
 
 
