@@ -1,5 +1,7 @@
 """Section on the spectra of excitation and response, compared with the noise level."""
 
+from itertools import cycle
+
 import numpy as np
 
 from hil.estimator.data.fourier import lines_of, noise_power
@@ -59,7 +61,7 @@ def _excitation(data: RunData, period: PlayedPeriod, excited: list[list[int]]) -
     amplitude = 2 * np.abs(lines_of(period.torque))
     series = [
         _points(f"torque of {name}", amplitude[joint], np.array(excited[joint]), period, colour)
-        for joint, (name, colour) in enumerate(zip(data.names, OF_JOINTS, strict=False))
+        for joint, (name, colour) in enumerate(zip(data.names, cycle(OF_JOINTS), strict=False))
     ]
     chart = Chart("excitation", "Excitation", "frequency [Hz]", "torque amplitude [N m]", tuple(series))
     peaks = ", ".join(f"{name} {np.abs(period.torque[joint]).max():.3g} N m" for joint, name in enumerate(data.names))
