@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
-from hil.experiment.consistency import LAG_S
+from hil.experiment.checks.consistency import LAG_S
 from hil.fakes.plants import motor
 from hil.fakes.plants.arm import Arm
 from hil.fakes.plants.plant import make_plant

@@ -21,8 +21,8 @@ from hil.dry_run.chain_prior import prior_arms
 from hil.errors import Cause, SafetyStop
 from hil.estimator.chain.simulation.motion_observer import ChainObserver
 from hil.estimator.chain.simulation.rollout import ChainArms
-from hil.experiment.apart import causes_of_standstill
-from hil.experiment.consistency import check_standstill
+from hil.experiment.checks.apart import causes_of_standstill
+from hil.experiment.checks.consistency import check_standstill
 from hil.experiment.model_watch import Explain
 from hil.plan.chain_model import known_chain
 from hil.plan.obedience import Residual

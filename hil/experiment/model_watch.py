@@ -24,8 +24,8 @@ from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled, only_version
 from hil.estimator.models.momentum_observer import NAMES, MomentumObserver, observe
 from hil.estimator.models.parameters import CONSTANTS
-from hil.experiment.apart import causes_of_standstill
-from hil.experiment.consistency import check_standstill
+from hil.experiment.checks.apart import causes_of_standstill
+from hil.experiment.checks.consistency import check_standstill
 
 ARMS = 64
 WIDENED = 1.5

@@ -25,8 +25,8 @@ from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.estimator.data.periodicity import correlation_of_changes, decay_of
-from hil.experiment.apart import opposed
 from hil.experiment.chain_watch import ChainWatch
+from hil.experiment.checks.apart import opposed
 from hil.experiment.guard import Guard
 from hil.experiment.model_watch import ModelWatch
 from hil.experiment.pace import Pace

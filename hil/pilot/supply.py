@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
-from hil.experiment.guard import BELOW_VOLTAGE
+from hil.experiment.checks.joint_faults import BELOW_VOLTAGE
 from hil.runs.recording import Phase
 
 Array = NDArray[np.float64]

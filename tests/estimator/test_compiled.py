@@ -13,7 +13,7 @@ from hil.estimator import compiled
 from hil.estimator.chain.model import dynamics
 from hil.estimator.compiled import code_digest
 from hil.estimator.simulation import sensitivity
-from hil.experiment import joint_checks
+from hil.experiment.checks import joint_checks
 from hil.fakes.plants import chain_kernel, two_link
 
 LOOP = """

@@ -6,8 +6,9 @@ import numpy as np
 
 from hil.config.joint import JointConfig
 from hil.drivers.state import State
-from hil.experiment import following
-from hil.experiment.joint_checks import CONSISTENCY, FINE, FOLLOWING, FROZEN, JOINT, JointChecks
+from hil.experiment.checks import following
+from hil.experiment.checks.current_noise import CurrentNoise
+from hil.experiment.checks.joint_checks import CONSISTENCY, FINE, FOLLOWING, FROZEN, JOINT, JointChecks
 
 ANY = 1e9
 """A limit that is never reached."""
@@ -76,7 +77,7 @@ class Following:
 
     def rest(self, config: JointConfig, carried: Sequence[float], seconds: float, planned: float) -> bool:
         """Process replies at goal 0 with these currents and learn their noise; return whether all were accepted."""
-        noise, (record,) = following.CurrentNoise([config]), self._joint
+        noise, (record,) = CurrentNoise([config]), self._joint
         record["following"]["allowed"] = ANY
         for current in carried:
             if self.look(0.0, current, seconds) is not None:

@@ -17,7 +17,8 @@ from hil.config.schema import Config, parse_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import BusShared, TorqueNotOff, WrongModel, WrongSetting
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
-from hil.experiment import run, work
+from hil.experiment import run
+from hil.experiment.checks import work
 from hil.experiment.model_watch import ModelWatch
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress

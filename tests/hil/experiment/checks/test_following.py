@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from hil.config.joint import JointConfig
 from hil.config.schema import Config, load_config
 from hil.drivers.state import State
-from hil.experiment.following import GOALS, MEMORY, CurrentNoise, begin, is_frozen
+from hil.experiment.checks.current_noise import CurrentNoise
+from hil.experiment.checks.following import GOALS, MEMORY, begin, is_frozen
 from tests.support.one_joint import Following
 from tests.support.paths import CONFIGS
 

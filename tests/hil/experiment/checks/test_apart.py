@@ -8,7 +8,7 @@ import hil
 from hil.drivers.joint import Joint, SecondServo
 from hil.drivers.servo_model import servo_model
 from hil.errors import Cause, SafetyStop
-from hil.experiment.apart import ALLOWED_RAD, Apart, causes_of_standstill
+from hil.experiment.checks.apart import ALLOWED_RAD, Apart, causes_of_standstill
 from tests.support.edits import QUICK, replaced
 from tests.support.paths import CONFIGS
 

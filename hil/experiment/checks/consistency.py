@@ -32,8 +32,8 @@ Lag and scale error are properties of a servo and do not change. A lag that chan
 (`hil.experiment.velocity.lag`). Once the motion has shown them, up to twice the estimated values are accepted, plus
 `MORE_LAG_S` and `MORE_SCALE` and twice their standard deviations.
 
-The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
-that it keeps for a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). The state that it keeps for
+a joint is a record of the type `MEMORY`.
 """
 
 from collections.abc import Iterable

@@ -15,7 +15,7 @@ import numpy as np
 
 from hil.drivers.state import State
 from hil.estimator.compiled import compiled, only_version
-from hil.experiment import consistency, following, work
+from hil.experiment.checks import consistency, following, work
 
 FINE = -1
 CHECKS = 7

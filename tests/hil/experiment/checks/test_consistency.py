@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hil.drivers.state import State
-from hil.experiment.consistency import (
+from hil.experiment.checks.consistency import (
     CURVED,
     CURVED_AT_FIRST,
     LAG_S,

@@ -24,24 +24,21 @@ that they may answer to (those of the last `ANSWERS_S`) have become others, they
 sensor cancels in this comparison.
 
 A current sensor may be noisier than assumed. Its noise is measured at constant goals, while the arm rests before the
-start (`CurrentNoise`), and is a lower bound of sigma: a noisy reading then means that lost torque is found later, not
+start (`current_noise`), and is a lower bound of sigma: a noisy reading then means that lost torque is found later, not
 that a healthy motor is stopped. So that this does not blind the check, a joint with far too much noise is refused.
 
-The check runs for each joint in each exchange, as part of a compiled loop (`hil.experiment.joint_checks`). The state
-that it keeps for a joint is a record of the type `MEMORY`.
+The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). The state that it keeps for
+a joint is a record of the type `MEMORY`.
 """
 
-from collections import deque
-from collections.abc import Sequence
 from typing import Any
 
 import numba
 import numpy as np
 
 from hil.config.joint import JointConfig
-from hil.drivers.state import State
 
-__all__ = ["GOALS", "MEMORY", "CurrentNoise", "allow_noise", "begin", "is_frozen", "look", "seen_above", "usual_sigma"]
+__all__ = ["GOALS", "MEMORY", "allow_noise", "begin", "is_frozen", "look", "seen_above", "usual_sigma"]
 
 GAIN_ERROR = 0.2
 """Largest scale error of a current sensor."""
@@ -72,18 +69,6 @@ _FEWEST = 2
 
 ALLOWED_SIGMAS = 4.0
 """A deviation within this multiple of the measured noise is accepted."""
-
-FEWEST_READINGS, MOST_READINGS = 8, 256
-"""Number of readings from which noise is first measured, and number of the latest ones that are kept."""
-
-_UNCERTAIN = 1.9
-"""How much too small noise measured from n readings may be, relative to the real noise, times the square root of n."""
-
-_MAD_TO_SIGMA = 1.4826
-"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
-
-MOST_NOISE = 0.25
-"""Largest accepted noise, relative to the joint's goal limit."""
 
 _SOON_S = 0.1
 """Time within which lost torque should be found [s]."""
@@ -156,42 +141,6 @@ def seen_above(memory: Any, interval: float) -> float:
     """
     needed = max(memory["least_ratio"] * interval, _FULL_WEIGHT * LOST_AFTER_S) / _SOON_S
     return float(np.sqrt(needed / memory["per_square"]) / (1.0 - GAIN_ERROR))
-
-
-class CurrentNoise:
-    """Standard deviation of the joints' current readings, measured at goals that hardly change.
-
-    Every reading is compared with its goal. The median absolute deviation ignores single wrong replies, and a current
-    that stays at another value than its goal is no noise.
-    """
-
-    def __init__(self, joints: Sequence[JointConfig]) -> None:
-        self._ticks = np.abs([joint.joint.drive_unit(12.0) for joint in joints])
-        self._errors = deque[Any](maxlen=MOST_READINGS)
-        self._former: Any = None
-
-    def add(self, state: State) -> bool:
-        """Process an exchange; return whether enough readings have been added since the last measurement."""
-        goal, former = np.array(state.goal_current), self._former
-        self._former = goal
-        if former is None or True in state.missing or (np.abs(goal - former) > SIGMA_TICKS * self._ticks).any():
-            return False
-        self._errors.append(state.current - goal)
-        count = len(self._errors)
-        # Each measurement needs twice as many readings as the one before: this takes time between two samples.
-        return FEWEST_READINGS <= count < MOST_READINGS and count & (count - 1) == 0
-
-    def measured(self) -> tuple[list[float], list[float]]:
-        """Return each joint's noise and its upper bound [A or V]; 0 after too few readings."""
-        if len(self._errors) < FEWEST_READINGS:
-            return [0.0] * len(self._ticks), [0.0] * len(self._ticks)
-        errors = np.array(self._errors)
-        spread = np.median(np.abs(errors - np.median(errors, axis=0)), axis=0)
-        noise = _MAD_TO_SIGMA * spread
-        # Rounding may have reduced the spread by half a tick; what it hides entirely is less than two.
-        most = _MAD_TO_SIGMA * (spread + 0.5 * self._ticks) / (1.0 - _UNCERTAIN / len(errors) ** 0.5)
-        hidden = np.minimum(most, SIGMA_TICKS * self._ticks)
-        return noise.tolist(), np.where(spread > 0.25 * self._ticks, most, hidden).tolist()
 
 
 def look(memory: Any, goal: float, carried: float, seconds: float) -> float:

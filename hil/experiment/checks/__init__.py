@@ -1,0 +1,1 @@
+"""Checks of every sample, joint by joint, and the explanation of what they find."""

@@ -1,0 +1,137 @@
+"""Noise of the current readings, measured while the arm rests, and what it means for the check of the current.
+
+The thresholds of `following` assume no more noise than usual. A noisier sensor gets wider ones, so that a healthy motor
+is not stopped; the user is told which lost torque can then no longer be found quickly.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from hil.config.joint import JointConfig
+from hil.config.schema import Config
+from hil.drivers.state import State
+from hil.experiment.checks import following
+
+__all__ = ["CurrentNoise", "NoiseAllowance", "Noisy"]
+
+FEWEST_READINGS, MOST_READINGS = 8, 256
+"""Number of readings from which noise is first measured, and number of the latest ones that are kept."""
+
+_UNCERTAIN = 1.9
+"""How much too small noise measured from n readings may be, relative to the real noise, times the square root of n."""
+
+_MAD_TO_SIGMA = 1.4826
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
+
+MOST_NOISE = 0.25
+"""Largest accepted noise, relative to the joint's goal limit."""
+
+
+class CurrentNoise:
+    """Standard deviation of the joints' current readings, measured at goals that hardly change.
+
+    Every reading is compared with its goal. The median absolute deviation ignores single wrong replies, and a current
+    that stays at another value than its goal is no noise.
+    """
+
+    def __init__(self, joints: Sequence[JointConfig]) -> None:
+        self._ticks = np.abs([joint.joint.drive_unit(12.0) for joint in joints])
+        self._errors = deque[Any](maxlen=MOST_READINGS)
+        self._former: Any = None
+
+    def add(self, state: State) -> bool:
+        """Process an exchange; return whether enough readings have been added since the last measurement."""
+        goal, former = np.array(state.goal_current), self._former
+        self._former = goal
+        if (
+            former is None
+            or True in state.missing
+            or (np.abs(goal - former) > following.SIGMA_TICKS * self._ticks).any()
+        ):
+            return False
+        self._errors.append(state.current - goal)
+        count = len(self._errors)
+        # Each measurement needs twice as many readings as the one before: this takes time between two samples.
+        return FEWEST_READINGS <= count < MOST_READINGS and count & (count - 1) == 0
+
+    def measured(self) -> tuple[list[float], list[float]]:
+        """Return each joint's noise and its upper bound [A or V]; 0 after too few readings."""
+        if len(self._errors) < FEWEST_READINGS:
+            return [0.0] * len(self._ticks), [0.0] * len(self._ticks)
+        errors = np.array(self._errors)
+        spread = np.median(np.abs(errors - np.median(errors, axis=0)), axis=0)
+        noise = _MAD_TO_SIGMA * spread
+        # Rounding may have reduced the spread by half a tick; what it hides entirely is less than two.
+        most = _MAD_TO_SIGMA * (spread + 0.5 * self._ticks) / (1.0 - _UNCERTAIN / len(errors) ** 0.5)
+        hidden = np.minimum(most, following.SIGMA_TICKS * self._ticks)
+        return noise.tolist(), np.where(spread > 0.25 * self._ticks, most, hidden).tolist()
+
+
+@dataclass(frozen=True)
+class Noisy:
+    """A joint whose current reading is noisier than usual; `said` says so, and what it means."""
+
+    index: int
+    said: str
+    is_too_noisy: bool
+
+
+class NoiseAllowance:
+    """Adapts the joints' thresholds to the noise of their current readings.
+
+    records: the joints' records (`joint_checks.JOINT`), whose thresholds are set here and whenever the noise becomes
+    better known. planned: largest goal of each joint [A, or V under PWM]. interval: time between two exchanges [s].
+    noise: noise of each joint's readings [A or V]; None if not known.
+    """
+
+    def __init__(
+        self,
+        records: Any,
+        config: Config,
+        planned: Sequence[float],
+        interval: float,
+        noise: Sequence[float] | None,
+    ) -> None:
+        self._records, self._joints, self._planned, self._interval = records, config.joints, planned, interval
+        self._share = config.safety.follow_share
+        self._measured = CurrentNoise(config.joints)
+        self.noise = [0.0] * len(config.joints) if noise is None else noise
+        """Noise of each joint's current readings, or its upper bound [A or V]; 0 if not known."""
+        self._allow(self.noise)
+
+    def begin(self) -> None:
+        """Accept any reading until some have shown their noise."""
+        self._records["following"]["allowed"] = inf
+
+    def add(self, state: State) -> None:
+        """Process an exchange of an arm at rest."""
+        if self._measured.add(state):
+            self._allow(self._measured.measured()[1])
+
+    def end(self) -> list[Noisy]:
+        """End the measurement; return the joints that are noisier than usual."""
+        noise, self.noise = self._measured.measured()
+        self._allow(self.noise)
+        return [
+            Noisy(index, self._how_noisy(index, noise[index]), noise[index] > MOST_NOISE * joint.goal_limit)
+            for index, joint in enumerate(self._joints)
+            if self._records[index]["is_followed"]
+            and self.noise[index] > following.usual_sigma(joint, self._planned[index])
+        ]
+
+    def _allow(self, noise: Sequence[float]) -> None:
+        for record, joint, planned, sigma in zip(self._records, self._joints, self._planned, noise, strict=True):
+            following.allow_noise(record["following"], record["goals"], joint, planned, self._share, sigma)
+
+    def _how_noisy(self, index: int, noise: float) -> str:
+        seen = following.seen_above(self._records[index]["following"], self._interval)
+        unit = self._joints[index].drive_mode.goal_unit
+        return (
+            f"its current reading is noisy: {noise:.2g} {unit} RMS at a constant goal; lost torque cannot be seen "
+            f"within 0.1 s at goals below {seen:.2g} {unit}"
+        )
