@@ -336,6 +336,15 @@ class ServoBus(TorqueSwitch):
             raise overruled(self._drives[found.place], found)
 
     @property
+    def watchdog_changed(self) -> tuple[int, int] | None:
+        """Index of a joint whose Bus Watchdog, read back last, is not as armed, and its value [20 ms]; else None."""
+        armed = self.armed_ticks
+        for place, ticks in self.prepared.watchdogs:
+            if ticks != armed and self._drives[place] in self._armed:
+                return self._of[place], ticks
+        return None
+
+    @property
     def goals_lost(self) -> tuple[int, str] | None:
         """Index of a joint that has missed many of the latest goals, and text with the value read back; else None."""
         if (lost := self.prepared.lost) is None:

@@ -24,7 +24,7 @@ from fastcrc import crc16
 
 from hil.drivers.control_table import Register
 from hil.drivers.others.heard import Heard
-from hil.drivers.others.read_back import REMEMBERED, TRY_AGAIN_S, Overruled, ReadBack
+from hil.drivers.others.read_back import OVERTIME_SHARE, REMEMBERED, TRY_AGAIN_S, Overruled, ReadBack
 from hil.drivers.packet import BROADCAST_ID, HEADER, Instruction
 from hil.drivers.port import Port, ReplyTime
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
@@ -202,7 +202,7 @@ class Exchange:
     ) -> None:
         """Prepare the read-backs made by `overruled` (see `ReadBack`).
 
-        goal: spans that end with the goal. mode: spans that end with the settings, whose values are `modes`.
+        goal: spans of Bus Watchdog and goal. mode: spans that end with the settings, whose values are `modes`.
         """
         back = self._read_back = ReadBack(self.ids, goal, mode, modes, interval=self._interval, fast=self.fast)
         self._wire_s |= {read: self._port.wire_time(self._bytes(read)) for read in back.reads}
@@ -223,6 +223,11 @@ class Exchange:
     def modes_seen_ago(self) -> float:
         """Time since all servos were last confirmed to be in their modes [s]; infinite if they never were."""
         return math.inf if self._read_back is None else self._now() - self._read_back.modes_seen_at
+
+    @property
+    def watchdogs(self) -> Sequence[tuple[int, int]]:
+        """Index of each servo in the latest read-back of goals, and its Bus Watchdog."""
+        return () if self._read_back is None else self._read_back.watchdogs
 
     @property
     def lost(self) -> Overruled | None:
@@ -257,21 +262,27 @@ class Exchange:
         return self._wire_s[read] + max(off_wire, back.longest)
 
     def _held(self, back: ReadBack, due: float) -> Overruled | None:
-        """Read back once if this is possible before `due` [s]."""
+        """Read back once if this is possible before `due` [s], or a little later if it is overdue."""
         port, now, read = self._port, self._now(), back.read
         takes = self._takes(read, back)
-        if now + takes > due or self._late_possible:
+        latest = due
+        if now + takes > due and now >= back.overdue_at:
+            latest += OVERTIME_SHARE * self._interval
+        if now + takes > latest or self._late_possible:
+            back.postponed(now)
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
             left_less_time = self._latest_plan is not self._usual
             self.read_back_at = now if self._late_possible or left_less_time else now + TRY_AGAIN_S
             return None
         port.clock.wait_until(due - takes - HOST_S)
         before = self._now()
-        if before + takes > due:  # woken up late
+        if before + takes > latest:  # woken up late
             self.read_back_at = before + TRY_AGAIN_S
             return None
-        servos = self._ask_back(read, before, due - before)
+        servos = self._ask_back(read, before, latest - before)
         now = self._now()
+        if latest > due:
+            self.awaited_until = now
         # Where nothing at all arrived, the reply may be late, and another one would be mistaken for it.
         if None in servos and self.heard.latest and back.may_repeat(now, takes):
             # The packet of another master may have destroyed the reply, and the next cycle overwrites what it wrote.

@@ -49,6 +49,11 @@ _SHORT_CYCLE_S = 0.005
 share `_AGAIN_SHARE` of one. In longer ones, read-backs are rarely destroyed, and a delay leaves joints unobserved.
 """
 
+OVERDUE_S, OVERTIME_SHARE = 0.05, 0.8
+"""If nothing was read back for `OVERDUE_S` [s] because cycles leave no time for it, a read-back may delay the next
+cycle by up to this fraction of a cycle: without one, a disarmed watchdog or another mode would never be seen.
+"""
+
 LOST_GOALS, LOST_OF = 3, 6
 """A servo that misses `LOST_GOALS` of `LOST_OF` goals counts as not accepting them, even if the next one arrives.
 
@@ -77,9 +82,9 @@ class Overruled(NamedTuple):
 class ReadBack:
     """Reads back the goals that the servos hold right before a cycle, and occasionally their settings instead.
 
-    mode: a span that ends with the settings; `modes` are their values, equally many for each servo. A change to one of
-    these settings reverses the motor, shifts every angle, or changes the meaning of goals. interval: time between two
-    cycles [s], 0 if unknown.
+    goal: a span of Bus Watchdog and goal. mode: a span that ends with the settings; `modes` are their values, equally
+    many for each servo. A change to one of these settings reverses the motor, shifts every angle, or changes the
+    meaning of goals. interval: time between two cycles [s], 0 if unknown.
 
     Every cycle overwrites the goals of another master. A master that writes less often than this program is therefore
     detected only if the goals are read before every cycle.
@@ -124,6 +129,10 @@ class ReadBack:
         self._looks = 0  # read-backs of goals so far
         self._missed: list[deque[int]] = [deque(maxlen=LOST_GOALS) for _ in ids]
         """Indices of the latest read-backs that found an older goal of this program, by servo."""
+        self.watchdogs: list[tuple[int, int]] = []
+        """Index among the IDs and Bus Watchdog of each servo that answered the latest read-back, if it was of goals."""
+        self.overdue_at = math.inf
+        """When a read-back may delay a cycle, if nothing has been read back until then [s]."""
         self.doubts_until = -math.inf
         self.sighted: Overruled | None = None
         """The latest value read back that this program did not write; it is treated as recent until `doubts_until`."""
@@ -135,6 +144,10 @@ class ReadBack:
 
     def took(self, seconds: float) -> None:
         self.longest = max(_FADES * self.longest, seconds)
+
+    def postponed(self, now: float) -> None:
+        """Process that a cycle leaves no time for a read-back."""
+        self.overdue_at = min(self.overdue_at, now + OVERDUE_S)
 
     def may_repeat(self, now: float, takes: float) -> bool:
         """Whether a lost read-back that takes `takes` [s] is repeated at once."""
@@ -157,6 +170,9 @@ class ReadBack:
         of_modes = self.is_of_modes
         is_nearly_sure = False
         intact = [_intact(answer) for answer in servos]
+        # Answers about goals begin with ERR and Bus Watchdog.
+        self.watchdogs = [] if of_modes else [(at, each[1]) for at, each in enumerate(intact) if each is not None]
+        self.overdue_at = now + OVERDUE_S
         foreign = self._foreign(intact, sent, collided=collided)
         if of_modes and not foreign and None not in intact:
             self.modes_seen_at = now

@@ -83,6 +83,11 @@ class TorqueSwitch:
         """Whether the watchdog of any servo is armed."""
         return bool(self._armed)
 
+    @property
+    def armed_ticks(self) -> int:
+        """Value to which the Bus Watchdogs are armed [20 ms]."""
+        return round(self._watchdog / WATCHDOG_UNIT)
+
     @contextmanager
     def torque(self, watchdog: float) -> Iterator[None]:
         """Switch torque on for the block and off afterwards, however the block exits.
@@ -157,6 +162,10 @@ class TorqueSwitch:
         """
         if seconds < self._watchdog:
             tell_watchdogs(self.port, {drive: self._servos[drive] for drive in self._armed}, seconds)
+
+    def rearm_watchdogs(self) -> None:
+        """Set the armed Bus Watchdogs again, after another program has changed them. Nothing is read back."""
+        tell_watchdogs(self.port, {drive: self._servos[drive] for drive in self._armed}, self._watchdog)
 
     def repeat_torque_off(self) -> None:
         """Send torque off to all servos once more without waiting for an answer, in case a silent servo receives it."""

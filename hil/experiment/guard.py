@@ -358,6 +358,11 @@ class Guard:
             if wrong is not None:
                 self._stop(index, *wrong)
 
+    def watchdog_reads(self, index: int, ticks: int) -> None:
+        """Raise SafetyStop for a joint whose Bus Watchdog reads `ticks` [20 ms] if it is required and not as armed."""
+        if (wrong := self._status.look_at_watchdog(ticks)) is not None:
+            self._stop(index, *wrong)
+
     def _look_slow(self, slow: Slow) -> None:
         safety = self._safety
         if self._is_lowering:

@@ -96,15 +96,19 @@ class StatusCheck:
                 "supply failed for a moment, or another program is using this bus."
             )
         return (
-            self._watchdog(status)
+            self.look_at_watchdog(status.watchdog)
             or self._goal(joint, status, sent, now)
             or self.look_at_clock(joint, status.tick, now)
         )
 
-    def _watchdog(self, status: Status) -> tuple[Cause, str] | None:
-        if status.watchdog == self._armed:
+    def look_at_watchdog(self, ticks: int) -> tuple[Cause, str] | None:
+        """Check a servo's Bus Watchdog [20 ms]; return the fault's cause and text, or None.
+
+        While the arm is lowered, an unprotected servo is accepted: cutting torque would drop the arm.
+        """
+        if ticks == self._armed or (self._bears_errors and ticks != _TRIPPED):
             return None
-        if status.watchdog == _TRIPPED:
+        if ticks == _TRIPPED:
             return Cause.WATCHDOG, (
                 "has lost its torque: its watchdog tripped (Bus Watchdog reads 255), so it received nothing for "
                 f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms. Check its plug and cable, unless the computer kept this "
@@ -113,7 +117,7 @@ class StatusCheck:
         if self._may_be_unwatched:
             return None
         return Cause.WATCHDOG, (
-            f"is no longer protected: its Bus Watchdog reads {status.watchdog} but was set to {self._armed}. Another "
+            f"is no longer protected: its Bus Watchdog reads {ticks} but was set to {self._armed}. Another "
             "program is using this bus, or the servo was rebooted."
         )
 

@@ -166,6 +166,32 @@ def test_what_was_not_read_back_for_lack_of_time_is_tried_again_soon(fake_config
         assert now < bus.prepared.read_back_at <= now + 0.005
 
 
+@pytest.mark.parametrize("interval", [0.001, 0.00125, 0.002, 0.0025, 0.01])
+@pytest.mark.parametrize("ticks", [0, 100])
+def test_a_watchdog_changed_by_another_program_is_seen_at_any_rate(
+    fake_config: Make, interval: float, ticks: int
+) -> None:
+    """Where cycles leave no time for a read-back, one delays the next cycle now and then, by less than an interval."""
+    latest = 0.0
+    with driven(fake_config(interval=interval)) as bus:
+        clock, servo = bus.port.clock, bus.port._serial.bus.servos[2]
+        start = clock.now()
+        for cycle in range(round(0.5 / interval)):
+            clock.wait_until(start + cycle * interval)
+            latest = max(latest, clock.now() - start - cycle * interval)
+            bus.exchange([0.01 * (cycle % 30), 0.1])
+            if is_changed := cycle * interval >= 0.2:
+                servo.write(98, bytes((ticks,)))
+            due = start + (cycle + 1) * interval
+            if bus.prepared.read_back_at <= due:
+                bus.check_not_overruled(due)
+            if bus.watchdog_changed is not None:
+                break
+            assert not is_changed or clock.now() < start + 0.2 + 0.15
+        assert bus.watchdog_changed == (1, ticks) and clock.now() > start + 0.2
+    assert latest < interval, "no sample is missed"
+
+
 def test_a_servo_that_does_not_answer_is_asked_once_more_and_left_to_the_next_cycle(fake_config: Make) -> None:
     interval = 0.0025
     with driven(fake_config(interval=interval)) as bus:

@@ -105,6 +105,8 @@ class WayDown:
             self._told(error, "The arm could not be lowered: the servos' watchdogs had already acted, so it fell.")
             return
         self._note(f"lowering the arm after: {error}")
+        if isinstance(error, SafetyStop) and error.cause is Cause.WATCHDOG:
+            self._bus.rearm_watchdogs()
         try:
             state = self._follow(state, stopped)
         except (SafetyStop, StopRequested, DriverError) as ended:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from hil.config.schema import Config
+from hil.drivers.servo_model import WATCHDOG_UNIT
 from hil.drivers.state import Slow, State, Status
 from hil.errors import Cause, SafetyStop
 from hil.experiment.guard import Guard
@@ -371,6 +372,19 @@ def test_a_joint_that_is_elsewhere_before_the_start_has_jumped_unless_it_moves(
     with pytest.raises(SafetyStop) as stop:
         guard.look_at_rest(STILL._replace(position=(-1.57, 1.57), velocity=(0.0, velocity)))
     assert said in str(stop.value) and f"{velocity:+.2f} rad/s" in str(stop.value)
+
+
+def test_an_unprotected_servo_stops_the_arm_but_not_its_lowering(arm: Arm) -> None:
+    armed = round(arm().safety.watchdog / WATCHDOG_UNIT)
+    guard, lowering = Guard(arm()), Guard(arm(), lowers_since=0.0)
+    for each in (guard, lowering):
+        each.watchdog_reads(1, armed)
+    lowering.watchdog_reads(1, 0)
+    with pytest.raises(SafetyStop, match=r"ID 2.* Bus Watchdog reads 0 but was set to 4"):
+        guard.watchdog_reads(1, 0)
+    for each in (guard, lowering):
+        with pytest.raises(SafetyStop, match="its watchdog tripped"):
+            each.watchdog_reads(1, 255)
 
 
 def at_rest(guard: Guard, noise: float) -> list[str]:

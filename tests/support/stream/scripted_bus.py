@@ -31,6 +31,7 @@ class Bus:
         self.is_watched = True
         self.modes_seen_ago = math.inf
         self.goals_lost: tuple[int, str] | None = None
+        self.watchdog_changed: tuple[int, int] | None = None
         self.takes = takes
         self.calls: list[Call] = []
         self.velocity = NOTHING
@@ -76,6 +77,9 @@ class Bus:
     def read_status_next(self) -> None:
         self.calls.append(("status",))
 
+    def rearm_watchdogs(self) -> None:
+        self.calls.append(("rearmed",))
+
     def shorten_watchdogs(self, seconds: float) -> None:
         self.calls.append(("watchdogs", seconds))
 
@@ -109,6 +113,9 @@ class Checks:
 
     def goals_are_lost(self, joint: int, held: str) -> None:
         self.calls.append(("lost", joint, held))
+
+    def watchdog_reads(self, joint: int, ticks: int) -> None:
+        self.calls.append(("watchdog", joint, ticks))
 
     def look_at_rest(self, _state: State) -> None:
         self.calls.append(("at rest",))

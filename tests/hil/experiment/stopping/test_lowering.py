@@ -236,7 +236,7 @@ def test_a_lost_torque_is_cut_at_once(tmp_path: Path) -> None:
 
 
 def test_a_servo_that_only_lost_its_watchdog_is_lowered(tmp_path: Path) -> None:
-    """Its Bus Watchdog is cleared by another program; it still receives and obeys."""
+    """Its Bus Watchdog is cleared by another program and set again; it still receives and obeys."""
     from benchmarks.fault_campaign.attack import Attack, Kind
     from benchmarks.fault_campaign.campaign import play as play_attacked
     from benchmarks.fault_campaign.campaign import prepare

@@ -115,6 +115,14 @@ def test_an_arm_is_lowered_at_the_usual_rate(make: Make, turns: int) -> None:
     assert made.lower(sent_at=None) == ["The arm was lowered, but not to its rest pose: elsewhere."]
 
 
+@pytest.mark.parametrize("cause", [Cause.WATCHDOG, Cause.LATE])
+def test_watchdogs_that_another_program_has_changed_are_set_again_first(make: Make, cause: Cause) -> None:
+    made = make()
+    made.way.lower(SafetyStop("stopped", cause), made.stopped)
+    assert [call[0] for call in made.bus.calls].count("rearmed") == (cause is Cause.WATCHDOG)
+    assert (made.bus.calls[0] == ("rearmed",)) == (cause is Cause.WATCHDOG)
+
+
 def test_ticks_missed_while_it_is_lowered_are_told_and_recorded(make: Make) -> None:
     made = make(takes=[0.13, TAKES_S])
     made.lower()

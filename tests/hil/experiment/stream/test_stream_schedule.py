@@ -125,6 +125,16 @@ def test_goals_that_read_backs_find_lost_are_told_to_the_guard(make: Make) -> No
     assert guard.of("lost") == [(1, "its Goal Current reads 3 but 5 was written")]
 
 
+def test_a_changed_watchdog_is_told_to_the_guard(make: Make) -> None:
+    stream, bus, guard = make()
+    bus.read_back_at = -math.inf
+    play(stream, [0.1])
+    assert guard.of("watchdog") == []
+    bus.watchdog_changed = (1, 0)
+    play(stream, [0.2])
+    assert guard.of("watchdog") == [(1, 0)]
+
+
 def test_missed_ticks_are_told_and_the_goal_stays(make: Make) -> None:
     stream, bus, guard = make()
     play(stream, [0.1])
