@@ -90,11 +90,10 @@ def blocks(title: str) -> list[tuple[str, str]]:
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """A copy of the code that may be modified, with the compiled loops, so that only what changes is recompiled."""
-    unwanted = shutil.ignore_patterns("*.pyc", "configs", *FOLDERS)
-    shutil.copytree(ROOT / "hil", tmp_path / "hil", ignore=unwanted)
+    """A copy of the code that may be modified, with bytecode and compiled loops: only what changes is recompiled."""
+    shutil.copytree(ROOT / "hil", tmp_path / "hil", ignore=shutil.ignore_patterns("configs", *FOLDERS))
     for folder in FOLDERS:
-        shutil.copytree(ROOT / folder, tmp_path / "hil" / folder, ignore=shutil.ignore_patterns("*.pyc"))
+        shutil.copytree(ROOT / folder, tmp_path / "hil" / folder)
     return tmp_path
 
 
