@@ -53,7 +53,8 @@ def test_a_model_error_does_not_overrule_what_is_known_of_encoders(cogging_perio
     model = Model(1, "coulomb", "delay", {"encoder", "cable"})
     found = identify(cogging_period, model)
     # As if the residual's errors were independent.
-    overruled = identify(cogging_period, model, options=LikelihoodOptions(least_inflation=np.inf))
+    near = Near(found.parameters, found.start)
+    overruled = identify(cogging_period, model, near=near, options=LikelihoodOptions(least_inflation=np.inf))
     assert size(found) < 0.8 * size(overruled)
 
 
