@@ -67,7 +67,7 @@ def test_its_cells_run_and_give_what_it_shows(tmp_path: Path, monkeypatch: pytes
 
 
 def assert_cells_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Callable[[str, str], None]) -> None:
-    """Every cell runs in `tmp_path` and gives a value of the kinds that are stored. compare: checks the values' text."""
+    """Every cell runs in `tmp_path` and gives a value of the kinds that are stored. compare: checks values as text."""
     pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'hil[png]'")
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
