@@ -83,7 +83,7 @@ def test_too_few_readings_tell_nothing(by_voltage: Config) -> None:
 def test_an_arm_on_a_weak_supply_is_identified_and_the_supply_is_named(
     resistances: tuple[float, ...], arm_file: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # How much of the error the correction removes differs from recording to recording: 43 to 57 % of it is left here.
+    # How much of the error the correction removes differs from recording to recording.
     for ohm in resistances:
         left, left_without = left_with_and_without(ohm, arm_file, tmp_path, monkeypatch)
         assert left < 0.7 * left_without
