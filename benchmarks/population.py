@@ -101,6 +101,11 @@ def run(seed: int, folder: Path, *, quick: bool = False, others: bool = False) -
     arm = draw_other(seed) if others else draw(seed)
     if quick:
         arm = replace(arm, toml=_quicker(arm.toml))
+    return outcome_of(seed, arm, folder)
+
+
+def outcome_of(seed: int, arm: DrawnArm, folder: Path) -> Outcome:
+    """Identify this arm in a separate process, and judge the outcome."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "arm.toml"
     path.write_text(arm.toml, encoding="utf-8")

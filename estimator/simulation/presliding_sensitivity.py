@@ -252,4 +252,4 @@ def _loop(
 
 
 _bend, _clear, _press, _accelerate = map(fused, (_bend, _clear, _press, _accelerate))
-_advance: Callable[..., None] = compiled(_loop, fastmath={"contract"})
+_advance: Callable[..., None] = compiled(_loop, fastmath={"contract"}, _nrt=False)

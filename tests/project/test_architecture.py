@@ -90,11 +90,10 @@ def blocks(title: str) -> list[tuple[str, str]]:
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    """A copy of the code that may be modified, with the compiled loops, so that only what changes is recompiled."""
-    unwanted = shutil.ignore_patterns("*.pyc", "configs", *FOLDERS)
-    shutil.copytree(ROOT / "hil", tmp_path / "hil", ignore=unwanted)
+    """A copy of the code that may be modified, with bytecode and compiled loops: only what changes is recompiled."""
+    shutil.copytree(ROOT / "hil", tmp_path / "hil", ignore=shutil.ignore_patterns("configs", *FOLDERS))
     for folder in FOLDERS:
-        shutil.copytree(ROOT / folder, tmp_path / "hil" / folder, ignore=shutil.ignore_patterns("*.pyc"))
+        shutil.copytree(ROOT / folder, tmp_path / "hil" / folder)
     return tmp_path
 
 
@@ -116,9 +115,9 @@ def follow(copy: Path, title: str) -> set[str]:
     return touched
 
 
-def run(copy: Path, code: str) -> None:
-    """Run `code` in a fresh interpreter that imports the copy."""
-    environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+def run(copy: Path, code: str, **options: str) -> None:
+    """Run `code` in a fresh interpreter that imports the copy. options: further environment variables."""
+    environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1", **options}
     code = f"import hil; assert hil.__file__.startswith({str(copy)!r}), hil.__file__\n{code}"
     done = subprocess.run(
         [sys.executable, "-c", code],
@@ -146,21 +145,24 @@ assert load_model("XD430-T210").operating_modes
 
 
 def test_a_friction_term_as_described(copy: Path) -> None:
-    """The new term has correct derivatives, is identified from a simulated arm, and is known everywhere."""
+    """The new term has correct derivatives and is known everywhere; not compiled, which takes most of the time."""
     touched = follow(copy, "A friction term")
     equations = {"estimator/simulation/arm.py", "estimator/simulation/sensitivity.py", "estimator/models/friction.py"}
     assert touched == {"estimator/models/terms.py", *equations, "hil/config/experiment.py"}
-    run(copy, FRICTION)
+    run(copy, FRICTION.replace("SAMPLES", "100"), NUMBA_DISABLE_JIT="1")
+
+
+@pytest.mark.slow
+def test_a_friction_term_as_described_is_identified(copy: Path) -> None:
+    follow(copy, "A friction term")
+    run(copy, FRICTION.replace("SAMPLES", "1000") + IDENTIFIED)
 
 
 FRICTION = """
-from dataclasses import replace
 import numpy as np
 from hil.config.experiment import ModelConfig
 from hil.estimation.model_from_config import wanted_model
-from hil.estimator.data.settled_period import SettledPeriod
 from hil.estimator.excitation.multisine import design_multisine
-from hil.estimator.identify import identify
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
 from hil.estimator.simulation.arm import simulate, steps_per_sample
@@ -173,6 +175,7 @@ rate = 200.0
 wave = design_multisine(rate, 5.0, ((1, 2, 4, 6, 9, 13, 17, 20),), (0.6,), 1)
 steps = steps_per_sample(rate)
 motor, slopes = torque_and_slopes(wave.torque, rate, 3e-4, steps, delay=0.0, lag=1e-3)
+motor, slopes = motor[:, :SAMPLES], slopes[:, :, :SAMPLES]
 
 state = np.array([[-1.5], [0.3]])
 def moved(drag):
@@ -188,21 +191,26 @@ up, down = (simulate(Physics.of(truth), state + sign * faster, motor, 1.0 / (rat
 by_velocity = (up - down) / 2e-6
 assert np.allclose(derivative[:, :, 1], by_velocity, atol=1e-4 * np.abs(by_velocity).max())
 
+model = wanted_model(ModelConfig(friction="coulomb", drive="lag", drag=True), 1)
+assert dict(zip(model.names, model.units))["drag_1"] == term_of("drag_1").unit
+
+from hil.arm_model import ArmModel, JointFacts
+facts = JointFacts("joint", "XM430-W350", "current", 1.8, 0.1, 2.3, (-3.1, 3.1), 6.0)
+with_drag, without = (ArmModel(truth | {"drag_1": drag}, {}, 9.81, (-1.57,), (facts,)) for drag in (0.004, 0.0))
+assert np.allclose(with_drag.friction_torque([-2.0]) - without.friction_torque([-2.0]), -0.004 * 4.0)
+"""
+
+IDENTIFIED = """
+from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.identify import identify
 rest = np.array([[-1.5], [0.0], [0.0]])
 for _ in range(8):
     position, rest = simulate(Physics.of(truth), rest, motor, 1.0 / (rate * steps))
 tick = 2 * np.pi / 4096
 period = SettledPeriod(rate=rate, torque=wave.torque, position=np.round(position / tick) * tick,
                        command_to_sample=3e-4, position_step=np.array([tick]), periods=1)
-model = wanted_model(ModelConfig(friction="coulomb", drive="lag", drag=True), 1)
 found = identify(period, model)
 assert abs(found.parameters["drag_1"] - 0.004) < 5 * found.std[found.names.index("drag_1")] < 0.002, found.parameters
-assert dict(zip(found.names, found.units))["drag_1"] == term_of("drag_1").unit
-
-from hil.arm_model import ArmModel, JointFacts
-facts = JointFacts("joint", "XM430-W350", "current", 1.8, 0.1, 2.3, (-3.1, 3.1), 6.0)
-with_drag, without = (ArmModel(truth | {"drag_1": drag}, {}, 9.81, (-1.57,), (facts,)) for drag in (0.004, 0.0))
-assert np.allclose(with_drag.friction_torque([-2.0]) - without.friction_torque([-2.0]), -0.004 * 4.0)
 """
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from hil.cli.app import COMMANDS, main
+from tests.support.edits import replaced
 from tests.support.paths import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -23,10 +24,16 @@ RUN_BY_OTHERS = {
 }
 """Commands of a quarter of a minute that other tests run on the same file."""
 SHORT = (
-    ("period = 10.0 ", "period = 4.0 "),
-    ("band = [0.1, 5.0]", "band = [0.25, 5.0]"),
+    ("rate = 400.0 ", "rate = 200.0 "),
+    ("period = 10.0 ", "period = 2.0 "),
+    ("band = [0.1, 5.0]", "band = [0.5, 6.0]"),
     ("[experiment]\n", "[experiment]\nheld_out = false\n"),
 )
+
+FEWER_SAMPLES = """[vary]
+"experiment.rate" = [200.0]
+"experiment.held_out" = [false]
+"""
 
 RUN_ELSEWHERE = {
     "sudo": "changes the machine",
@@ -68,7 +75,8 @@ def place(identified: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         (here / "configs" / urdf.name).symlink_to(urdf)
     shutil.copytree(ROOT / "examples", here / "examples")
     study = here / "examples" / "studies" / "friction.toml"
-    study.write_text(study.read_text(encoding="utf-8").replace("runs = 6", "runs = 2"), encoding="utf-8")
+    fewer = replaced(study.read_text(encoding="utf-8"), ("runs = 6", "runs = 2"), ("[vary]", FEWER_SAMPLES))
+    study.write_text(fewer, encoding="utf-8")
     (here / "runs").mkdir()
     identified.rename(here / "runs" / "finished")
     monkeypatch.chdir(here)

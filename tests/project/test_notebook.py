@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from hil.config.bundled import bundled_configs
 from hil.config.schema import load_config
 from hil.fakes.plants.arm import base_parameters
+from tests.support.edits import replaced
 from tests.support.paths import ROOT
 
 NOTEBOOK = ROOT / "examples" / "identify_an_arm.ipynb"
@@ -43,7 +45,29 @@ def assert_as_shown(shown: str, now: str) -> None:
         assert stored == pytest.approx(found, rel=0.3, abs=1e-9), f"execute the notebook again: {now}"
 
 
+SHORTER = (
+    ("rate = 400.0 ", "rate = 200.0 "),
+    ("period = 10.0 ", "period = 2.0 "),
+    ("band = [0.1, 5.0]", "band = [0.5, 6.0]"),
+)
+
+
+@pytest.mark.usefixtures("few_stops")
+def test_its_cells_run_on_shorter_experiments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of the bundled names in the working folder take precedence."""
+    for name in ("fake_two_link", "first_time"):
+        text = replaced(bundled_configs()[name].read_text(encoding="utf-8"), *SHORTER)
+        (tmp_path / name).write_text(text.replace('friction = "auto"', 'friction = "stribeck"'), encoding="utf-8")
+    assert_cells_run(tmp_path, monkeypatch, lambda shown, now: None)
+
+
+@pytest.mark.slow
 def test_its_cells_run_and_give_what_it_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert_cells_run(tmp_path, monkeypatch, assert_as_shown)
+
+
+def assert_cells_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compare: Callable[[str, str], None]) -> None:
+    """Every cell runs in `tmp_path` and gives a value of the kinds that are stored. compare: checks values as text."""
     pytest.importorskip("matplotlib", reason="matplotlib is not installed: pip install 'hil[png]'")
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
@@ -53,7 +77,7 @@ def test_its_cells_run_and_give_what_it_shows(tmp_path: Path, monkeypatch: pytes
         assert len(shown) == (value is not None), cell["source"]
         if value is None:
             continue
-        assert_as_shown("".join(shown[0]["text/plain"]), repr(value))
+        compare("".join(shown[0]["text/plain"]), repr(value))
         for kind, method in (("text/html", "_repr_html_"), ("image/png", "_repr_png_")):
             assert (kind in shown[0]) == (getattr(value, method, nothing)() is not None)
     assert (tmp_path / "run" / "report.html").is_file()

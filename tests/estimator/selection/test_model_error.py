@@ -51,9 +51,11 @@ def test_cogging_is_found_and_named(pendulum: Arm, cogging_period: SettledPeriod
 
 def test_a_model_error_does_not_overrule_what_is_known_of_encoders(cogging_period: SettledPeriod) -> None:
     model = Model(1, "coulomb", "delay", {"encoder", "cable"})
-    found = identify(cogging_period, model)
+    started = LikelihoodOptions(initial_widths=(0.05,), initial_bends=(5e-3,))  # the width is that of the arm
+    found = identify(cogging_period, model, options=started)
     # As if the residual's errors were independent.
-    overruled = identify(cogging_period, model, options=LikelihoodOptions(least_inflation=np.inf))
+    near = Near(found.parameters, found.start)
+    overruled = identify(cogging_period, model, near=near, options=LikelihoodOptions(least_inflation=np.inf))
     assert size(found) < 0.8 * size(overruled)
 
 

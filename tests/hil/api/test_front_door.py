@@ -20,7 +20,7 @@ from hil.results.result import SettledResult
 from hil.runs.collection import find_runs
 from hil.setup.preflight import Level, check_arm
 from tests.support.command_line import hil as command
-from tests.support.edits import FEWER_SAMPLES, QUICK
+from tests.support.edits import QUICK
 
 ArmFile = Callable[..., Path]
 
@@ -32,7 +32,7 @@ def in_tmp(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_identify_gives_what_the_command_writes(arm_file: ArmFile, capsys: pytest.CaptureFixture[str]) -> None:
-    path = arm_file(*FEWER_SAMPLES)
+    path = arm_file(*QUICK)
     heard: list[hil.Progress] = []
     result = hil.identify(path, out="by_function", on_progress=heard.append)
     assert capsys.readouterr() == ("", "")

@@ -102,7 +102,7 @@ def test_a_horizontal_arm_is_foreseen_to_wander_and_a_stabiliser_to_hold_it(arm_
 
 
 def test_seen_peaks_stay_within_the_predicted_ones() -> None:
-    study = prior_study(12)
+    study = prior_study(8)
     assert study["within_quantile"] >= 11 / 12 and study["limit_touched"] == 0
 
 

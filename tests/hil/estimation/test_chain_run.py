@@ -41,6 +41,7 @@ from hil.results.parts import Quantity
 from hil.results.result import SettledResult
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
+from tests.support.edits import replaced
 from tests.support.paths import CONFIGS
 
 FOUR = CONFIGS / "fake_open_manipulator_x.toml"
@@ -48,9 +49,10 @@ TEXT = FOUR.read_text(encoding="utf-8")
 
 
 def short(folder: Path) -> Config:
-    """The configuration with a period of 5 s, next to its URDF."""
+    """The configuration with half its period and rate, next to its URDF."""
     (folder / "open_manipulator_x_like.urdf").write_bytes((CONFIGS / "open_manipulator_x_like.urdf").read_bytes())
-    (folder / "arm.toml").write_text(TEXT.replace("period = 10.0", "period = 5.0"), encoding="utf-8")
+    text = replaced(TEXT, ("period = 10.0", "period = 5.0"), ("rate = 400.0", "rate = 200.0"))
+    (folder / "arm.toml").write_text(text, encoding="utf-8")
     return load_config(folder / "arm.toml")
 
 
@@ -93,7 +95,7 @@ def test_with_identified_ratios_the_truth_scales_with_the_first_torque_constant_
     """All values of a spatial arm scale with it, inertias as well as friction."""
     rows = ("inertia_zz_1", "moment_z_2", "viscous_1", "coulomb_3")
     ratios = {f"torque_scale_{joint}": Quantity(1.0, 1e-3, "1") for joint in (2, 3, 4)}
-    scaled = {name: replace(each, value=1.02 * each.value) for name, each in result.parameters.items()}
+    scaled = {name: replace(each, value=1.03 * each.value) for name, each in result.parameters.items()}
     changed = replace(result, parameters=scaled, extra={**result.extra, **ratios})
 
     def in_std(factor: float) -> dict[str, float]:
@@ -104,7 +106,7 @@ def test_with_identified_ratios_the_truth_scales_with_the_first_torque_constant_
         lines = (line.split() for line in capsys.readouterr().out.splitlines())
         return {words[0]: abs(float(words[-1])) for words in lines if words and words[0] in rows}
 
-    as_given, in_its_unit = in_std(1.0), in_std(1.02)
+    as_given, in_its_unit = in_std(1.0), in_std(1.03)
     for name in rows:
         assert in_its_unit[name] < 4.0 < as_given[name], name
 

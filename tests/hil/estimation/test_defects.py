@@ -66,7 +66,7 @@ def named(recordings: Sequence[Recording], model: Model) -> str:
     ],
 )
 def test_a_change_in_the_course_of_a_recording_is_named(change: str, size: float, said: str, value: float) -> None:
-    found = named([pendulum(change, size)], Model(1, "stribeck"))
+    found = named([pendulum(change, size)], Model(1, "coulomb"))
     assert found.startswith(said) and bool(found) is bool(said)
     if said:
         numbers = found.removeprefix(said).replace("%", " ").split()
@@ -76,7 +76,7 @@ def test_a_change_in_the_course_of_a_recording_is_named(change: str, size: float
 
 def test_a_torque_column_in_another_scale_than_that_of_the_other_file_is_named() -> None:
     other = pendulum(seed=3)
-    found = named([pendulum(), replace(other, torque=1.25 * other.torque)], Model(1, "stribeck"))
+    found = named([pendulum(), replace(other, torque=1.25 * other.torque)], Model(1, "coulomb"))
     assert found.startswith("The motor torque of joint 1 seems to be 0.8") and "in b.csv" in found
 
 

@@ -1,5 +1,7 @@
 """Spatial arms from description, limits and rest pose to the result, on the fake bus; here the smallest one."""
 
+import pickle
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -35,11 +37,35 @@ LEG = CONFIGS / "leg.toml"
 TEXT = replaced(LEG.read_text(encoding="utf-8"), ("period = 10.0", "period = 5.0"), ("rate = 400.0", "rate = 100.0"))
 """A shorter experiment, so that designs and simulations take less time."""
 
-DESIGNED: dict[str, Paths] = {}
+DESIGNED: dict[bytes, Paths] = {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _designed_once() -> Iterator[None]:
+    """Most tests use the same immutable paths, and a design takes as long as most of these tests without it."""
+    of = Paths.of
+
+    def remembered(config: Config, thought: Any, reserve: Reserve = RESERVE, tell: Any = None) -> Paths:
+        key = pickle.dumps((config.model_dump_json(), thought, reserve))
+        if key not in DESIGNED:
+            DESIGNED[key] = of(config, thought, reserve, tell)
+        return replace(DESIGNED[key], config=config)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Paths, "of", remembered)
+        yield
 
 
 def leg(*changes: tuple[str, str]) -> Config:
     return parse_config(replaced(TEXT, *changes), LEG)
+
+
+def fewer_arms(patch: pytest.MonkeyPatch) -> None:
+    """Simulate a sixth of the arms, and the stops of three at a few moments, which take most of a search's time."""
+    for place in ("chain_shares.SEARCH_ARMS", "chain_shares.ARMS", "chain_rehearsal.ARMS"):
+        patch.setattr(f"hil.pilot.{place}", 4 if "SEARCH" in place else 12)
+    patch.setattr(chain_stop, "MOMENTS", 5)
+    patch.setattr(chain_stop, "ARMS", 3)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +73,9 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> hil.Identification:
     folder = tmp_path_factory.mktemp("leg")
     (folder / "leg.urdf").write_bytes((CONFIGS / "leg.urdf").read_bytes())
     (folder / "leg.toml").write_text(TEXT, encoding="utf-8")
-    return hil.identify(folder / "leg.toml", out=folder / "run")
+    with pytest.MonkeyPatch.context() as patch:
+        fewer_arms(patch)
+        return hil.identify(folder / "leg.toml", out=folder / "run")
 
 
 def test_the_leg_is_identified_from_its_description_alone(found: hil.Identification) -> None:
@@ -193,11 +221,7 @@ def searching(config: Config, belief: ChainBelief, paths: Paths, say: Say) -> Ch
 
 
 def search_of(config: Config, belief: ChainBelief, said: list[str]) -> ChainSearch:
-    """A search whose first paths, which are immutable, are designed once for all tests of the same configuration."""
-    key = config.model_dump_json()
-    if key not in DESIGNED:
-        DESIGNED[key] = Paths.of(config, ChainBelief.prior(config).torque)
-    return searching(config, belief, DESIGNED[key], said.append)
+    return searching(config, belief, Paths.of(config, ChainBelief.prior(config).torque), said.append)
 
 
 def heavier(belief: ChainBelief, times: float) -> ChainBelief:
@@ -292,7 +316,8 @@ def test_a_period_too_short_for_a_path_is_a_mistake_in_the_file() -> None:
         parse_config(text, LEG)
 
 
-def test_a_path_that_is_safe_is_kept() -> None:
+def test_a_path_that_is_safe_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    fewer_arms(monkeypatch)
     config = chain_config(leg())
     search = search_of(config, ChainBelief.prior(config), [])
     designed = search.paths
@@ -361,11 +386,9 @@ def test_another_path_starts_with_no_more_amplitude_than_the_one_it_replaces(mon
 
 
 def test_a_dry_run_decides_as_the_pilot_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    for place in ("chain_shares.SEARCH_ARMS", "chain_shares.ARMS", "chain_rehearsal.ARMS"):
-        monkeypatch.setattr(f"hil.pilot.{place}", 4 if "SEARCH" in place else 12)
-    moments, stopped = 5, 3
-    monkeypatch.setattr(chain_stop, "MOMENTS", moments)
-    monkeypatch.setattr(chain_stop, "ARMS", stopped)
+    fewer_arms(monkeypatch)
+    moments, stopped = chain_stop.MOMENTS, chain_stop.ARMS
+    DESIGNED.clear()  # to see a design's progress
     config, told = leg(), list[int]()
     designed = list[tuple[int, int]]()
     first = rehearse(config, 4, tell=lambda _, of: told.append(of), designing=lambda *each: designed.append(each))
@@ -488,9 +511,10 @@ def test_a_search_that_has_simulated_enough_tries_the_least_amplitude_only(monke
 
 
 def test_a_search_is_bounded_and_a_refusal_says_that_it_ended_early(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = chain_config(leg(("rate = 100.0", "rate = 400.0")))  # so fast that no higher rate is advised
+    slow, fast = (chain_config(leg(("rate = 100.0", f"rate = {rate}"))) for rate in (100.0, 400.0))
     said: list[str] = []
-    search = search_of(config, ChainBelief.prior(config), said)
+    belief = ChainBelief.prior(slow)
+    search = searching(fast, belief, Paths.of(slow, belief.torque), said.append)  # no higher rate is advised
     monkeypatch.setattr(search, "_largest", lambda *_: (None, "shank hits floor", 0.0))
     designed = Mock(side_effect=AssertionError)
     monkeypatch.setattr(Paths, "of", designed)
@@ -506,7 +530,8 @@ def test_a_refusal_names_a_rate_only_if_a_motion_is_safe_at_it(
 ) -> None:
     config = chain_config(leg(("rate = 100.0", "rate = 50.0")))
     belief = ChainBelief.prior(config)
-    search, paths, tried = search_of(config, belief, []), None, list[Config]()
+    designed = Paths.of(chain_config(leg()), belief.torque)  # at a rate at which other tests need it
+    search, paths, tried = searching(config, belief, designed, print), None, list[Config]()
 
     def largest(_: object, config: Config, __: object) -> tuple[Any, str, float]:
         tried.append(config)

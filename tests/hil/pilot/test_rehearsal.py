@@ -26,7 +26,7 @@ ARMS = 24
 
 
 def written(folder: Path, kind: tuple[float, float], joints: int = 1, swing: float = 1.2, **joint: Any) -> Path:
-    """The file that `hil init` writes for such an arm, with a shorter period."""
+    """The file that `hil init` writes for such an arm, with a shorter period and half the rate."""
     rest, gravity = kind
     each = tuple(
         JointAnswers(
@@ -43,7 +43,8 @@ def written(folder: Path, kind: tuple[float, float], joints: int = 1, swing: flo
     )
     path = folder / "arm.toml"
     text = arm_toml(ArmAnswers("fake://arm.toml", 1_000_000, each, gravity, "# Test."))
-    text = replaced(text, ("period = 10.0 ", "period = 4.0 "), ("band = [0.1, 5.0]", "band = [0.25, 5.0]"))
+    shorter = ("period = 10.0 ", "period = 4.0 "), ("band = [0.1, 5.0]", "band = [0.25, 5.0]")
+    text = replaced(text, ("rate = 400.0 ", "rate = 200.0 "), *shorter)
     path.write_text(text, encoding="utf-8")
     return path
 
