@@ -26,7 +26,7 @@ from tests.support.motion import seen_moving
 from tests.support.paths import CONFIGS
 
 NAME = "fake_open_manipulator_x.toml"
-RATE = 200
+RATE = 100
 TEXT = replaced(
     (CONFIGS / NAME).read_text(encoding="utf-8"),
     ("period = 10.0", "period = 5.0"),
