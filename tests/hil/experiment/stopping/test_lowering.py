@@ -306,7 +306,9 @@ def test_an_arm_that_cannot_be_heard_for_a_moment_is_lowered(ready: Any) -> None
 def test_an_arm_that_is_pushed_off_its_path_is_lowered_from_where_it_is(ready: Any) -> None:
     from benchmarks.fault_campaign.attack import Attack, Kind
 
-    text, record, _ = driven(ready, (Attack(Kind.PUSHED, SOON_S, SOON_S + 0.15, ready.config.joints[0].id, 1.0, 1.74, "state"),))
+    text, record, _ = driven(
+        ready, (Attack(Kind.PUSHED, SOON_S, SOON_S + 0.15, ready.config.joints[0].id, 1.0, 1.74, "state"),)
+    )
     assert "lowered to its rest pose" in text and "wrong way" not in text
     np.testing.assert_allclose(record["position"][-1], ready.config.arm.rest_pose, atol=0.1)
 
