@@ -15,6 +15,7 @@ A model without a current sensor (XL430-W250) has no current mode and reports a 
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from random import Random
 
 from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError
@@ -37,6 +38,7 @@ Uncertain: the manual gives no figure; existing clients wait 0.3 to 1 s.
 WATCHDOG_UNIT_S = 0.020
 
 _NO_SHADOW_ID = 253
+_GOAL_PWM = 100
 _GOAL_CURRENT = 102
 
 _TORQUE_ON_BY_GOAL_UPDATE = 0x08  # bit of Drive Mode
@@ -278,9 +280,11 @@ class EmulatedServo(Powered):
 
     def write(self, address: int, data: bytes) -> int:
         """Write a range of the control table; return the error number."""
+        # What a control cycle writes takes a fast path with the same result as the general one.
+        if address == _GOAL_PWM and len(data) == 2 and self._goal_pwm_limit >= 0:
+            return self._write_goal_pwm(data)
         if address != _GOAL_CURRENT or len(data) != 2 or not self._takes_goal_current:
             return self._write_stretch(address, data, shadow=False)
-        # What a control cycle writes takes a fast path with the same result as the general one.
         ticks = int.from_bytes(data, "little", signed=True)
         limit = self._current_limit
         if ticks > limit or ticks < -limit:
@@ -288,6 +292,15 @@ class EmulatedServo(Powered):
         self.memory.data[_GOAL_CURRENT : _GOAL_CURRENT + 2] = data
         if self._driven:
             self.motor_current_a = ticks * self._current_per_tick
+        return StatusError.NONE
+
+    def _write_goal_pwm(self, data: bytes) -> int:
+        ticks = int.from_bytes(data, "little", signed=True)
+        if abs(ticks) > self._goal_pwm_limit:
+            return StatusError.DATA_LIMIT
+        self.memory.data[_GOAL_PWM : _GOAL_PWM + 2] = data
+        if self.needs_ticks and self.controller.goals is not None:
+            self.controller.goals = replace(self.controller.goals, pwm=ticks)
         return StatusError.NONE
 
     def write_as_shadow(self, address: int, data: bytes) -> int:
@@ -413,6 +426,9 @@ class EmulatedServo(Powered):
         known = bool(self.model.operating_modes)
         # The fast path bypasses the controller, which computes the current where the supply limits it.
         fast = known and not self._voltage_limited and self._current_limit >= 0
+        accepts = known and not by_goal and watchdog != WATCHDOG_TRIPPED
+        self._goal_pwm_limit = memory.get("PWM Limit") if accepts and "Goal PWM" in memory else -1
+        """Largest Goal PWM on the fast path [ticks]; -1 if it takes the general one."""
         self._takes_goal_current = fast and not by_goal and watchdog != WATCHDOG_TRIPPED
         if self.needs_ticks:
             self.controller.goals = Goals.read(self._mode, memory)

@@ -7,7 +7,9 @@ and no time is lost; the signal is a real one, and everything after it is up to 
 """
 
 import atexit
+import contextlib
 import importlib
+import io
 import os
 import shlex
 import signal
@@ -15,7 +17,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -138,12 +139,12 @@ def _report_servos() -> None:
 
 @dataclass(frozen=True)
 class Interrupted:
-    """A command that was interrupted. next: the command that its messages name; then: the outcome of that command."""
+    """A command that was interrupted. next: the command that its messages name; then: its exit code and output."""
 
     code: int
     said: str
     next: list[str]
-    then: subprocess.CompletedProcess[str] | None
+    then: tuple[int, str] | None
 
     def faults(self, number: signal.Signals) -> list[str]:
         """What is wrong with how it ended."""
@@ -154,19 +155,28 @@ class Interrupted:
             found.append(f"exit code {self.code}")
         if self.then is None:
             found.append("no next command")
-        elif self.then.returncode:
-            found.append(f"{' '.join(self.next)}: exit code {self.then.returncode}: {self.then.stderr[-300:]}")
+        elif self.then[0]:
+            found.append(f"{' '.join(self.next)}: exit code {self.then[0]}: {self.then[1][-300:]}")
         return found
 
 
 def interrupt(stage: str, number: signal.Signals, words: list[str], folder: Path) -> Interrupted:
-    """Run a command in `folder`, interrupt it, and run the command that it names then."""
-    run = partial(subprocess.run, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=600, check=False)
-    done = run([sys.executable, "-m", "tests.support.interrupted", stage, number.name, *words])
+    """Run a command in a process in `folder`, interrupt it, and run the command that it names then in this one."""
+    command = [sys.executable, "-m", "tests.support.interrupted", stage, number.name, *words]
+    done = subprocess.run(
+        command, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=600, check=False
+    )
     named = [line for line in done.stderr.splitlines() if line.startswith("Next: hil ")]
     following = shlex.split(named[-1].removeprefix("Next: ")) if named else []
-    then = run([sys.executable, "-m", *following]) if following else None
-    return Interrupted(done.returncode, done.stderr, following, then)
+    return Interrupted(done.returncode, done.stderr, following, _run(following[1:], folder) if following else None)
+
+
+def _run(words: list[str], folder: Path) -> tuple[int, str]:
+    from tests.support.command_line import hil  # with pytest, which the interrupted process does without
+
+    said = io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        return hil(*words), said.getvalue()
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from hil.drivers.packet import ALERT, HardwareError, Instruction, StatusError, encode
 from hil.fakes.servo.registers import load_model
-from hil.fakes.servo.servo import BOOT_S
+from hil.fakes.servo.servo import BOOT_S, EmulatedServo
 
 Make = Callable[..., Any]
 
@@ -185,6 +185,39 @@ def test_a_goal_beyond_a_limit_that_was_lowered_later_is_limited(bench: Any) -> 
     assert bench.write(1, 64, 1) == 0
     assert bench.read(1, 102, 2, signed=True) == 500
     assert bench.servo().motor_current_a == pytest.approx(100 * bench.servo().model.current_unit_a)
+
+
+@pytest.mark.parametrize("model", ["XL430-W250", "XM430-W350"])
+@pytest.mark.parametrize(
+    "before",
+    [
+        {"Torque Enable": 1},
+        {},
+        {"Torque Enable": 1, "PWM Limit": 300},
+        {"Drive Mode": 8},
+        {"Torque Enable": 1, "Bus Watchdog": 255},
+        {"Operating Mode": 3, "Torque Enable": 1},
+    ],
+    ids=["torque", "no torque", "lower limit", "torque on by goal update", "watchdog tripped", "another mode"],
+)
+def test_a_goal_pwm_written_as_in_a_control_cycle_does_what_it_does_in_any_write(
+    model: str, before: dict[str, int]
+) -> None:
+    """A write addressed to the Secondary ID always takes the general path."""
+    servos = [EmulatedServo(load_model(model), 1) for _ in range(2)]
+    states = []
+    for servo, write in zip(servos, (servos[0].write, servos[1].write_as_shadow), strict=True):
+        servo.memory.set("Operating Mode", 16)
+        for name, value in before.items():
+            servo.memory.set(name, value)
+        servo.fail(HardwareError(0))  # everything that depends on registers is derived anew
+        told = []
+        for goal in (100, -300, 301, 885, -886, -885, 32767):
+            error = write(100, goal.to_bytes(2, "little", signed=True))
+            servo.tick(1e-3, 0.1, 0.2, 0.0)
+            told.append((error, bytes(servo.memory.data), servo.controller.goals, servo.motor_current_a))
+        states.append(told)
+    assert states[0] == states[1]
 
 
 def test_reverse_mode_mirrors_the_turns_too(make_bench: Make) -> None:

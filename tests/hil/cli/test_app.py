@@ -25,7 +25,7 @@ ArmFile = Callable[..., Path]
 
 LONG = (
     ("rate = 400.0", "rate = 200.0"),
-    ("period = 2.0", "period = 100.0"),
+    ("period = 2.0", "period = 30.0"),
     ("band = [0.5, 6.0]", "band = [0.1, 0.3]"),
     (
         "peak_torque = [0.80, 0.42]",
@@ -91,7 +91,7 @@ def test_a_pilot_is_not_recorded_alone(capsys: pytest.CaptureFixture[str]) -> No
 def test_json_is_the_only_thing_on_standard_output_and_a_seed_gives_one_result(
     arm_file: ArmFile, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = arm_file(*FEWER_SAMPLES)
+    path = arm_file(*QUICK)
     assert hil("identify", path, "--out", "a", "--json") == 0
     first = json.loads(capsys.readouterr().out)
     assert hil("identify", path, "--out", "b", "--json") == 0

@@ -2,6 +2,7 @@
 
 import shutil
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from tests.support.interrupted import STAGES, interrupt
 from tests.support.paths import CONFIGS
 
 OFTEN = {"held-out part": signal.SIGINT, "report": signal.SIGTERM}
-"""Stages tried in every run of the tests, and with which signal; each takes two processes."""
+"""Stages tried in every run of the tests, and with which signal; each takes a process."""
 WORDS = {
     "identify": ["identify", "arm.toml", "--out", "run"],
     "scan": ["scan", "arm.toml"],
@@ -35,8 +36,14 @@ def _cases() -> list[object]:
 
 @pytest.mark.parametrize(("name", "number"), _cases())
 def test_a_stop_loses_nothing_that_was_finished(
-    name: str, number: signal.Signals, identified: Path, arm_file: Callable[..., Path], tmp_path: Path
+    name: str,
+    number: signal.Signals,
+    identified: Path,
+    arm_file: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(sys, "argv", sys.argv)
     stage = STAGES[name]
     if stage.pilot or stage.command == "dry-run":
         (tmp_path / "arm.toml").write_text((CONFIGS / "first_time.toml").read_text(encoding="utf-8"), encoding="utf-8")

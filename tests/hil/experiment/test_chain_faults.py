@@ -10,14 +10,13 @@ from benchmarks.spatial.chain_faults import NAMES, figures, inject
 from hil.fakes.bus.faults import Fault, FaultKind
 
 EACH = 3
-FIRST = 3000, 3003
-RATE = 200
+SLOW = [pytest.param(first, 200, marks=pytest.mark.slow) for first in (3000, 3003)]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("first", [FIRST[0], pytest.param(FIRST[1], marks=pytest.mark.slow)])
-def test_random_faults_end_safe_and_where_possible_lying(first: int) -> None:
-    outcomes = [inject(Setting(name, RATE), seed) for name in NAMES for seed in range(first, first + EACH)]
+@pytest.mark.parametrize(("first", "rate"), [(3000, 100), *SLOW])
+def test_random_faults_end_safe_and_where_possible_lying(first: int, rate: int) -> None:
+    outcomes = [inject(Setting(name, rate), seed) for name in NAMES for seed in range(first, first + EACH)]
     told = "\n\n".join(map(str, outcomes))
     counted = figures(outcomes)
     assert not any(counted[bad] for bad in ("misleading", "unreadable", "not_restored")), told

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil import strict_json
@@ -43,6 +43,7 @@ def shooting_results(draw: st.DrawFn) -> ShootingResult:
     )
 
 
+@settings(max_examples=40)
 @given(shooting_results())
 def test_any_result_comes_back_from_strict_json_as_it_was(result: ShootingResult) -> None:
     assert result_from_json(json.loads(strict_json.dumps(result.to_json()))) == result
@@ -113,6 +114,7 @@ def test_a_pair_needs_two_entries() -> None:
     assert to_json(Range((1.0, 2.0))) == {"limits": [1.0, 2.0]}
 
 
+@settings(max_examples=40)
 @given(shooting_results())
 def test_a_result_without_encoder_steps_shows_its_residual_as_an_angle(result: ShootingResult) -> None:
     assert "residual 0.300 encoder steps RMS" in repr(result)

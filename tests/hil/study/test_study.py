@@ -91,13 +91,17 @@ def test_a_study_is_resumed_where_it_stopped(study_file: Path, tmp_path: Path, c
 
 
 def test_the_command_makes_rows_and_a_page(
-    study_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    study_file: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    cluster: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     # A run whose arm exceeds its limits becomes a failed row and does not end the study.
     text = STUDY.replace('"safety.max_missing" = [5, 5, 5, 1]', '"joints.0.velocity_limit" = [15.0, 0.5]')
     study_file.write_text(text.replace("runs = 4", "runs = 2"), encoding="utf-8")
-    assert hil("study", study_file, "--out", "out", "--workers", "1") == 0
+    assert hil("study", study_file, "--out", "out", "--scheduler", cluster) == 0
     said = capsys.readouterr().out
     assert "1 of 2 runs succeeded" in said
     assert "1 failed: SafetyStop" in said

@@ -261,10 +261,10 @@ def stopped_for_a_while(process: int) -> None:
     os.kill(process, signal.SIGCONT)
 
 
-CASES: list[tuple[Hung, signal.Signals]] = [
+CASES = [
     (Terminal, signal.SIGINT),
     (BlockedDisk, signal.SIGTERM),
-    (UnreadPipe, signal.SIGHUP),
+    pytest.param(UnreadPipe, signal.SIGHUP, marks=pytest.mark.slow),  # the program waits as for a terminal
 ]
 OTHERS = [
     (what, number)
