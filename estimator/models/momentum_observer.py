@@ -462,7 +462,7 @@ def _observe_loop(
     return alarm
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy")
+_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False)
 _regressors, _begin_anew, _filter = map(_inner, (_regressors, _begin_anew, _filter))
 _gain, _lacks, _learn = map(_inner, (_gain, _lacks, _learn))
 _keep_dissipative = _inner(_keep_dissipative)
@@ -475,4 +475,4 @@ _static_friction, _is_blocked = map(_inner, (_static_friction, _is_blocked))
 _second_moment, _of_rounding = map(_inner, (_second_moment, _of_rounding))
 _alarms, _teach_noise, _floor, _remember_speed = map(_inner, (_alarms, _teach_noise, _floor, _remember_speed))
 _remember_acceleration, _accelerates, _look_back = map(_inner, (_remember_acceleration, _accelerates, _look_back))
-observe: Callable[..., int] = compiled(_observe_loop)
+observe: Callable[..., int] = compiled(_observe_loop, _nrt=False)
