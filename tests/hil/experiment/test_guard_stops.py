@@ -185,7 +185,9 @@ def test_a_limit_that_another_program_lowered_is_the_cause_that_is_named(
     assert_stopped(ports[0])
 
 
-@pytest.mark.parametrize(("register", "value"), [("PWM Limit", 700), ("Current Limit", 250), ("Goal PWM", 266)])
+@pytest.mark.parametrize(
+    ("register", "value"), [("PWM Limit", 700), ("Current Limit", 250), ("Goal PWM", 266), ("Goal PWM", 0)]
+)
 def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
 ) -> None:
@@ -214,11 +216,15 @@ def test_a_protection_that_another_program_switched_off_is_named_and_restored(
     def cycle() -> None:
         ports[0].bus.servos[2].memory.set("Shutdown", 0)
         ports[0].bus.servos[1].memory.set("Temperature Limit", 100)
+        for name, value in changed.items():
+            ports[0].bus.servos[1].memory.set(name, value)
         if stopped:
             swing_elbow(ports, 25.0)
 
+    changed = {"Status Return Level": 1, "Velocity Limit": 10, "Max Position Limit": 3000, "Secondary(Shadow) ID": 7}
     config, folder = arm(), tmp_path / "run"
     if stopped:
+        changed.pop("Secondary(Shadow) ID")
         stop, _ = run_until_stopped(config, folder, once(cycle), plan)
         said = " ".join(stop.__notes__)
         assert stop.cause is Cause.VELOCITY and "Shutdown" not in str(stop)
@@ -226,6 +232,9 @@ def test_a_protection_that_another_program_switched_off_is_named_and_restored(
         said = run_experiment(config, RunFolder.create(folder, config), config.path, once(cycle), plan)
     assert "Another program changed" in said and "Shutdown is 0 and was 52" in said
     assert "Temperature Limit is 100 and was 80" in said
+    before = {"Status Return Level": 2, "Velocity Limit": 200, "Max Position Limit": 4095, "Secondary(Shadow) ID": 255}
+    assert all(f"{name} is {value} and was {before[name]}" in said for name, value in changed.items())
+    assert {name: ports[0].bus.servos[1].value(name) for name in before} == before
     assert ports[0].bus.servos[2].value("Shutdown") == 52
     assert ports[0].bus.servos[1].value("Temperature Limit") == 80
 
