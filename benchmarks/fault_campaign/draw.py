@@ -47,7 +47,7 @@ WORDS = {
     STRANGER: r"another (program|master)|Drive Mode is|somebody else|not asked for|collision|other master",
     MIXED: r"another servo's|mixed up|swapped|ID has changed|same ID|was not addressed:",
     REPEATED: r"repeated|too late or twice",
-    SETTING: r"changed the settings.{0,80}(Homing Offset|Return Delay Time|PWM Limit|Current Limit|Return Level|Secondary.{12}) is"
+    SETTING: r"changed the settings.{0,80}(Homing Offset|Return (Delay Time|Level)|(PWM|Current) Limit|Secondary.*) is"
     r"|(Homing Offset|Return Delay Time|PWM Limit) was changed during this|Current Limit is \d+, but current_limit",
     HAND: r"pushes or holds|pushing or holding|hit it|slips|begun to slip",
     DISK: r"\bdisk\b|no space|File too large|cannot be written",

@@ -29,7 +29,7 @@ from hil.experiment.checks.joint_faults import JointFaults
 from hil.experiment.command_limits import CommandLimits
 from hil.experiment.deadlines import Deadlines
 from hil.experiment.silence import LATE_WAKE_UP_S, Silence
-from hil.experiment.status_check import StatusCheck
+from hil.experiment.status_check import OLD_REPLIES, StatusCheck
 from hil.plan.find_torque import how_to_find_torque
 from hil.plan.recent_motion import RecentMotion
 
@@ -217,6 +217,8 @@ class Guard:
 
     def goals_are_lost(self, index: int, held: str) -> NoReturn:
         """Raise SafetyStop for a joint that misses many goals; `held` says what was read back."""
+        if self.recent.is_old(index):
+            self._stop(index, *OLD_REPLIES)
         self._stop(
             index,
             Cause.GOALS_LOST,

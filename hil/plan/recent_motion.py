@@ -32,6 +32,8 @@ _STEPS = 2.0
 _MORE = 1.25
 """Tolerance for a velocity that increases within the span, as a multiple of the mean velocity."""
 
+_READINGS = [State._fields.index(each) for each in ("current", "velocity", "position")]
+
 CONTRADICTS = 2.0
 """A velocity contradicts the position if it is beyond this multiple of the range that the position allows: at constant
 acceleration from standstill, the last velocity is twice the mean one.
@@ -97,6 +99,19 @@ class RecentMotion:
         if not travels:
             return self.is_unreachable(joint, velocity)
         return all(not CONTRADICTS * each.low <= velocity <= CONTRADICTS * each.high for each in travels)
+
+    def is_old(self, joint: int) -> bool:
+        """Whether the joint's readings have stayed exactly the same for longer than its velocity allows."""
+        last = self._states[-1] if self._states else None
+        if last is None:
+            return False
+        same = last
+        for state in reversed(self._states):
+            if any(state[each][joint] != last[each][joint] for each in _READINGS):
+                break
+            same = state
+        seconds = last.time_before_write - same.time_before_write
+        return abs(last.velocity[joint]) * seconds > self._steps[joint]
 
     def is_unreachable(self, joint: int, velocity: float) -> bool:
         """Whether no servo of this model turns that fast."""

@@ -152,6 +152,18 @@ def test_what_was_heard_beside_the_replies_explains_lost_goals(arm: Arm, heard: 
         assert stop.value.cause is Cause.GOALS_LOST and ("being lost" in str(stop.value)) == (not heard)
 
 
+@pytest.mark.parametrize(("velocity", "cause"), [(1.0, Cause.STALE), (0.0, Cause.GOALS_LOST)])
+def test_readings_that_stay_the_same_in_motion_are_old_and_show_no_lost_goals(
+    arm: Arm, velocity: float, cause: Cause
+) -> None:
+    guard = Guard(arm())
+    for number in range(4):
+        guard.recent.add(at(number, STILL)._replace(velocity=(0.0, velocity)))
+    with pytest.raises(SafetyStop, match=r"old replies|repeats or delays") as stop:
+        guard.goals_are_lost(1, "its Goal Current reads 3, but 4 was sent")
+    assert stop.value.cause is cause and ("accept goals" in str(stop.value)) == (velocity == 0.0)
+
+
 def test_an_arm_that_is_lowered_may_be_silent_longer(arm: Arm) -> None:
     """Counted from the last exchange that all servos answered, which may be older than the lowering."""
     silent = MISSING._replace(missing=(True, True))

@@ -68,6 +68,32 @@ def test_a_servo_that_holds_the_goal_it_seemed_to_have_missed_answers_a_cycle_la
     assert wrong is not None and wrong[0] is cause and ("a cycle late" in wrong[1]) == (cause is Cause.STALE)
 
 
+@pytest.mark.parametrize(("held", "late"), [((0.03, 0.04), 4), ((0.03, 0.03), 0)])
+def test_a_goal_held_later_than_it_was_sent_shows_how_late_replies_are(
+    arm: Arm, held: Sequence[float], late: int
+) -> None:
+    check = StatusCheck(arm())
+    for number, goal in enumerate((0.03, 0.04, 0.05, 0.06, 0.07, 0.08)):
+        check.sent((goal, 0.0))
+        if number >= 4:
+            wrong = check.look(0, FINE._replace(goal=held[number - 4], tick=1.0 + number), goal, 1.0 + number)
+    assert wrong is not None and (f"{late} cycles late" in wrong[1]) == (wrong[0] is Cause.STALE) == bool(late)
+
+
+@pytest.mark.parametrize(
+    ("ticks", "cause"), [((1.0, 1.0), Cause.STALE), ((1.01, 0.99), Cause.STALE), ((1.01, 1.02), Cause.GOALS_LOST)]
+)
+def test_replies_that_are_old_by_the_servos_clock_show_no_lost_goals(
+    arm: Arm, ticks: Sequence[float], cause: Cause
+) -> None:
+    check = StatusCheck(arm())
+    for number in range(4):
+        assert check.look(0, FINE._replace(tick=0.97 + 0.01 * number), 0.1, 0.97 + 0.01 * number) is None
+    for number, tick in enumerate(ticks):
+        wrong = check.look(0, FINE._replace(goal=0.05, tick=tick), 0.1, 1.01 + 0.01 * number)
+    assert wrong is not None and wrong[0] is cause and ("stale" in wrong[1]) == (cause is Cause.STALE)
+
+
 @pytest.mark.parametrize(
     ("held", "is_foreign"),
     [((0.404, 0.404), True), ((-0.1, -0.11), True), ((0.07, 0.404), True), ((0.07, 0.07), False)],
