@@ -159,9 +159,11 @@ class Servo:
         self, what: str, action: Callable[[], tuple[_T, int, int]], attempts: int = _ATTEMPTS, *, is_read: bool = False
     ) -> _T:
         """Run one SDK exchange until it succeeds, at most `attempts` times; turn result codes into exceptions."""
-        late = False
+        late, others = False, set[int]()
         for left in reversed(range(attempts)):
+            self._sdk.heard = -1
             value, result, error = action()
+            others.add(self._sdk.heard)
             if result == COMM_SUCCESS:
                 break
             late = late or result == COMM_RX_TIMEOUT
@@ -172,6 +174,11 @@ class Servo:
             # Late replies to the requests that timed out may still arrive and would be taken for the next reply.
             self.port.clock.wait_until(self.port.clock.now() + _LATE_S)
             self.port.discard_input()
+        if result == COMM_RX_TIMEOUT and len(others) == 1 and (other := others.pop()) not in (-1, self.id):
+            raise NoReply(
+                f"{self.title} is answered with ID {other} instead of its own ({what}): their IDs or their replies are "
+                "mixed up. Check that every servo has its own ID, and whether a device on the bus changes replies."
+            )
         if result == COMM_RX_TIMEOUT:
             raise NoReply(
                 f"{self.title} does not answer at {self.port.baud} baud on {self.port.url} ({what}). Check its supply "

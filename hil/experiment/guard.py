@@ -153,6 +153,8 @@ class Guard:
         self._status.sent(goals)
         took = after - now
         gap = watchdog_gap if watchdog_gap > took else took
+        if gap > self._status.longest_gap:
+            self._status.longest_gap = gap
         if gap >= self._longest_gap:
             self._deadlines.check_gap(gap)
         if took >= self._late_after:
@@ -244,9 +246,8 @@ class Guard:
         """
         noisy = self._noise.end()
         for joint in noisy:
-            if joint.is_too_noisy:
-                remedy = "Check its supply and its cable; replace the servo if this happens again."
-                self._stop(joint.index, Cause.NOT_FOLLOWING, f"cannot be monitored: {joint.said}. {remedy}")
+            if joint.refused:
+                self._stop(joint.index, Cause.NOT_FOLLOWING, f"cannot be monitored: {joint.said}. {joint.refused}")
         return [f"{self._names[joint.index]}: {joint.said}" for joint in noisy]
 
     @property

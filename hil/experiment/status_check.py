@@ -62,6 +62,8 @@ class StatusCheck:
         self._unit = [joint.drive_mode.goal_unit for joint in config.joints]
         self._missed = [0] * len(config.joints)
         self._has_one_servo = [len(joint.ids) == 1 for joint in config.joints]
+        self.longest_gap = 0.0
+        """Longest time that this program has sent nothing [s]."""
         self._goals: deque[Sequence[float]] = deque(maxlen=_REMEMBERED)
         self._cycles = 0
         # Per joint: goal in the latest status if it differs from that sent [A or V], the number of goals sent when they
@@ -120,16 +122,22 @@ class StatusCheck:
             return None
         if status.watchdog == _TRIPPED:
             return Cause.WATCHDOG, (
-                "has lost its torque: its watchdog tripped (Bus Watchdog reads 255), so it received nothing for "
-                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms. Check its plug and cable, unless the computer kept this "
-                "program waiting."
+                "has lost its torque: its watchdog tripped (Bus Watchdog reads 255). It received nothing for "
+                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms, {self._why_tripped()}."
             )
         if self._may_be_unwatched:
             return None
         return Cause.WATCHDOG, (
-            f"is no longer protected: its Bus Watchdog reads {status.watchdog} but was set to {self._armed}. Another "
-            "program is using this bus, or the servo was rebooted."
+            f"{_unlike_armed(status.watchdog - self._armed if status.watchdog else 0)}: its Bus Watchdog reads "
+            f"{status.watchdog} but was set to {self._armed}. Another program is using this bus"
+            f"{'' if status.watchdog else ', or the servo was rebooted'}."
         )
+
+    def _why_tripped(self) -> str:
+        """Return why a watchdog may have tripped, given how regularly this program has sent packets."""
+        if self.longest_gap > 0.5 * self._armed * WATCHDOG_UNIT:
+            return "unless the computer kept this program waiting: check its plug and cable"
+        return "or another program has set this register: check its plug and cable, and end other programs"
 
     def _goal(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
         if abs(status.goal - sent) < self._half_tick[joint]:
@@ -237,6 +245,13 @@ class StatusCheck:
             for other, (behind, seen_at, readings, _) in enumerate(self._clock)
             if other != joint
         )
+
+
+def _unlike_armed(longer: int) -> str:
+    """What another timeout of the watchdog means; longer: by how much [20 ms], 0 if it is off."""
+    if not longer:
+        return "is no longer protected"
+    return f"stops by itself {'later' if longer > 0 else 'earlier'} than intended"
 
 
 def _wrapped(seconds: float) -> float:

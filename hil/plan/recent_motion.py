@@ -8,6 +8,7 @@ encoder's steps. Each range includes zero, but excludes the direction opposite t
 
 from collections import deque
 from copy import copy
+from itertools import pairwise
 from math import ceil, isnan
 from typing import NamedTuple
 
@@ -99,6 +100,16 @@ class RecentMotion:
         if not travels:
             return self.is_unreachable(joint, velocity)
         return all(not CONTRADICTS * each.low <= velocity <= CONTRADICTS * each.high for each in travels)
+
+    def currents(self, joint: int) -> list[tuple[float, float]]:
+        """Return the goals and currents of the latest exchanges that the joint answered; a current belongs to the goal
+        of the exchange before.
+        """
+        return [
+            (before.goal_current[joint], state.current[joint])
+            for before, state in pairwise(self._states)
+            if not isnan(state.current[joint])
+        ]
 
     def is_old(self, joint: int) -> bool:
         """Whether the joint's readings have stayed exactly the same for longer than its velocity allows."""

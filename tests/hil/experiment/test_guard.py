@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from math import inf, nan, sin, tau
 from random import Random
 from timeit import timeit
@@ -309,6 +310,26 @@ def test_a_current_that_does_not_follow_is_off_or_that_of_another(arm: Arm, carr
     assert ("torque is off" in str(stop.value)) == (carried == 0.0)
 
 
+@pytest.mark.parametrize(
+    ("reads", "said"),
+    [
+        (lambda goal, _: goal - 0.28, "Its torque is not as commanded"),
+        (lambda goal, _: 0.07, "stays the same"),
+        (lambda goal, n: 1e-3 * (n % 2), "Its torque is off"),
+    ],
+    ids=["shifted", "stuck", "none"],
+)
+def test_a_current_that_does_not_follow_is_explained_by_how_it_differs(
+    arm: Arm, reads: Callable[[float, int], float], said: str
+) -> None:
+    """The last reading alone looks like that of a motor without torque."""
+    guard, goals = Guard(arm(), PLANNED), [0.2 + 0.1 * (n % 5) / 5 for n in range(400)]
+    with pytest.raises(SafetyStop, match=said) as stop:
+        for n, (before, goal) in enumerate(pairwise(goals)):
+            guard.look(at(n, STILL._replace(goal_current=(0.0, goal), current=(0.0, reads(before, n)))))
+    assert stop.value.cause is Cause.NOT_FOLLOWING and "current sensor is wrong" in str(stop.value)
+
+
 @pytest.mark.parametrize("moves", [0.0, 0.002])
 def test_readings_that_stay_the_same_under_other_goals_are_frozen(arm: Arm, moves: float) -> None:
     """At first they answer to the goal, which then rises by less than may be missing from a healthy motor's current."""
@@ -406,7 +427,7 @@ def test_a_noisy_current_reading_is_named_and_refused_only_if_it_hides_lost_torq
         for number in range(40):
             each.look(at(500 + number, STILL._replace(goal_current=(0.0, -0.02), current=(0.0, 0.06))))
     assert look(Guard(arm(), (0.05, 0.05)), *[at(n, STILL._replace(current=(0.0, 0.06))) for n in range(20)])
-    with pytest.raises(SafetyStop, match=r"cannot be monitored: its current reading is noisy: .* A RMS"):
+    with pytest.raises(SafetyStop, match=r"its current reading is noisy: .* A RMS.* 25 % of current_limit"):
         at_rest(Guard(arm()), 2.0)
 
 

@@ -19,12 +19,12 @@ from hil.drivers.errors import BusShared, TorqueNotOff, WrongModel, WrongSetting
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
 from hil.experiment import run
 from hil.experiment.checks import work
-from hil.experiment.model_watch import ModelWatch
+from hil.experiment.model_watch import UNLIKE_ANY_ARM, ModelWatch
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress
 from hil.fakes.bus.faults import Fault, FaultKind
 from hil.plan.plan import Plan, make_plan
-from hil.runs.recording import Phase, load_samples
+from hil.runs.recording import Phase, load_samples, sample_type
 from hil.runs.run_folder import RunFolder
 from hil.setup.session import servo_session
 from tests.support.paths import CONFIGS
@@ -207,6 +207,26 @@ def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
         said = str(stop.value)
     assert "'elbow'" in said and str(value) in said
     assert f"{register} is {value} and was " in (run.path / "events.jsonl").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "cause", "text", "is_doubted"),
+    [
+        (1.0, Cause.POSITION, "is at 3 rad.", True),
+        (5.0, Cause.POSITION, "is at 3 rad.", False),
+        (1.0, Cause.UNEXPECTED, f"It {UNLIKE_ANY_ARM}.", True),
+        (1.0, Cause.UNEXPECTED, "It jerked.", False),
+        (1.0, Cause.VELOCITY, "is fast.", False),
+    ],
+)
+def test_mistakes_in_the_description_are_named_only_at_the_beginning(
+    seconds: float, cause: Cause, text: str, is_doubted: bool
+) -> None:
+    samples = np.zeros(1000, sample_type(2))
+    samples["time_before_write"] = np.linspace(0.0, 20.0 + seconds, 1000)
+    samples["goal_current"][samples["time_before_write"] > 20.0] = 0.1
+    run.doubt_description(stop := SafetyStop(text, cause), samples)
+    assert ("direction, id, torque_constant and wiring" in str(stop)) == is_doubted
 
 
 @pytest.mark.parametrize("stopped", [False, True])

@@ -21,12 +21,21 @@ FINE = Status(watchdog=4, goal=0.1, tick=1.0, torque=True, hardware_error=0)
         ({"hardware_error": 32}, Cause.ALERT, "overload"),
         ({"watchdog": 255}, Cause.WATCHDOG, "received nothing for 80 ms"),
         ({"watchdog": 0}, Cause.WATCHDOG, "no longer protected: its Bus Watchdog reads 0 but was set to 4"),
-        ({"watchdog": 5}, Cause.WATCHDOG, "no longer protected"),
+        ({"watchdog": 5}, Cause.WATCHDOG, "stops by itself later than intended: its Bus Watchdog reads 5"),
+        ({"watchdog": 1}, Cause.WATCHDOG, "stops by itself earlier than intended"),
     ],
 )
 def test_what_one_status_shows(arm: Arm, change: dict[str, object], cause: Cause, said: str) -> None:
     wrong = StatusCheck(arm()).look(1, FINE._replace(**change), 0.1, 1.0)
     assert wrong is not None and wrong[0] is cause and said in wrong[1]
+
+
+@pytest.mark.parametrize(("gap", "said"), [(0.01, "another program"), (0.07, "the computer kept this program waiting")])
+def test_why_a_watchdog_tripped_depends_on_how_long_nothing_was_sent(arm: Arm, gap: float, said: str) -> None:
+    check = StatusCheck(arm())
+    check.longest_gap = gap
+    wrong = check.look(1, FINE._replace(watchdog=255), 0.1, 1.0)
+    assert wrong is not None and said in wrong[1] and ("another program" in wrong[1]) == (gap < 0.05)
 
 
 def test_what_a_short_status_leaves_out_is_not_wrong(arm: Arm) -> None:
