@@ -33,8 +33,6 @@ _STEPS = 2.0
 _MORE = 1.25
 """Tolerance for a velocity that increases within the span, as a multiple of the mean velocity."""
 
-_READINGS = [State._fields.index(each) for each in ("current", "velocity", "position")]
-
 CONTRADICTS = 2.0
 """A velocity contradicts the position if it is beyond this multiple of the range that the position allows: at constant
 acceleration from standstill, the last velocity is twice the mean one.
@@ -118,7 +116,7 @@ class RecentMotion:
             return False
         same = last
         for state in reversed(self._states):
-            if any(state[each][joint] != last[each][joint] for each in _READINGS):
+            if _readings(state, joint) != _readings(last, joint):
                 break
             same = state
         seconds = last.time_before_write - same.time_before_write
@@ -163,6 +161,10 @@ def _since(known: list[State], last: State, span: float) -> State:
     """The latest state that is at least `span` [s] older than the last one, or the oldest if there is none."""
     now = last.time_before_write
     return next((state for state in reversed(known) if now - state.time_before_write >= span), known[0])
+
+
+def _readings(state: State, joint: int) -> tuple[float, float, float]:
+    return state.current[joint], state.velocity[joint], state.position[joint]
 
 
 def _took(state: State) -> float:

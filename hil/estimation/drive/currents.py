@@ -112,7 +112,8 @@ def _noise(goal: Array, measured: Array) -> float:
     at_rest = at_rest[np.isfinite(at_rest)]
     still = _sigma(at_rest - np.median(at_rest)) if len(at_rest) >= _FEWEST_AT_REST else 0.0
     lagging = [measured[_RECENT:] - goal[_RECENT - lag :][:count] for lag in range(_RECENT)]
-    return max(still, min(min(_sigma(each), _sigma(np.diff(each, 2)) / 6.0**0.5) for each in lagging))
+    moving = min(min(_sigma(each), _sigma(np.diff(each, 2)) / 6.0**0.5) for each in lagging)
+    return float(max(still, moving))
 
 
 def _sigma(errors: Array) -> float:
