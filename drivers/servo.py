@@ -42,6 +42,8 @@ class Servo:
         self.port = port
         self.id = servo_id
         self.table = table
+        self.answered_pings_only = False
+        """Whether `let_answer` was needed."""
         self.title = title or f"The {table.model} with ID {servo_id}"
         self._sdk_port = SdkPort(port)
         self._sdk = ResyncingPacketHandler()
@@ -150,6 +152,13 @@ class Servo:
             return None, result, error
 
         self._try(f"writing {value} to {register}", send, attempts)
+
+    def let_answer(self) -> None:
+        """Set Status Return Level to 2 if pings are answered, as with level 0. Raises the same errors as `ping`."""
+        self.ping(attempts=1)
+        with suppress(NoReply):
+            self.write_only("Status Return Level", 2, attempts=1)
+        self.answered_pings_only = True
 
     def hardware_error(self) -> HardwareError:
         """Return the Hardware Error Status, the reason for a raised alert bit. Raises the same errors as `read`."""

@@ -193,7 +193,10 @@ def cut_torque(
         wait(watchdog + TRIP_S)
         tell()
         for joint in tuple(left):
-            if confirm(joint, at_once=False) is not None:
+            failed = confirm(joint, at_once=False)
+            if isinstance(failed, NoReply) and _uninterrupted(servos[joint].let_answer, interrupts) is None:
+                failed = confirm(joint, at_once=False)
+            if failed is not None:
                 tell()
     return tuple(joint for joint in servos if joint not in left), tuple((joint, _text(why[joint])) for joint in left)
 

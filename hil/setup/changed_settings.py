@@ -18,7 +18,7 @@ _GOAL_PWM = "Goal PWM"
 """In current mode, a limit of the voltage. A tripped watchdog leaves 0, which then says nothing."""
 
 _BESIDE = frozenset({*PROTECTIVE, STATUS_LEVEL}) - {SECONDARY_ID}
-"""Settings that explain no stop, but are always named."""
+"""Settings that are always named, although they explain no stop, except for a Status Return Level of 0."""
 
 _REGISTERS = (
     _MODE,
@@ -88,6 +88,8 @@ def settings_now(bus: ServoBus) -> Settings:
             again = {register: servo.read(register, attempts=1) for register in reversed(known)}
             if servo.read("ID", attempts=1) == servo.id:
                 found |= {(joint, each): first[each] for each in known if first[each] == again[each]}
+                if servo.answered_pings_only:
+                    found[joint, STATUS_LEVEL] = 0  # until torque was cut
     return found
 
 
@@ -97,12 +99,12 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
     cause: the cause of a stop. Settings that cannot explain it are omitted, except for those in `_BESIDE`.
     """
     differing = {each: value for each, value in before.items() if after.get(each, value) != value}
-    if not any(_may_explain(register, cause) for _, register in differing):
+    if not any(_may_explain(each[1], cause, after[each]) for each in differing):
         return ""
     changed = [
         f"{joint}: {register} is {_told(register, after[joint, register])} and was {_told(register, value)}"
         for (joint, register), value in differing.items()
-        if register in _BESIDE or _may_explain(register, cause)
+        if register in _BESIDE or _may_explain(register, cause, after[joint, register])
     ]
     said = f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."
     if (swapped := _swapped(before, after)) is not None:
@@ -141,7 +143,10 @@ def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago
     return f"{changed_settings(before, after)} This may have happened after the stop: {last}."
 
 
-def _may_explain(register: str, cause: Cause | None) -> bool:
+def _may_explain(register: str, cause: Cause | None, now: int) -> bool:
+    """now: the register's present value."""
+    if register == STATUS_LEVEL and now == 0:
+        return cause in (None, Cause.MISSING)
     if cause is None or register in _BESIDE:
         return cause is None
     return cause in (_LATE if register == _DELAY else _MOVED)

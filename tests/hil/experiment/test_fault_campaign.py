@@ -112,7 +112,7 @@ TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
         (Kind.BIAS, "position", JUMP, NO_TORQUE),
         (Kind.BIAS, "current", NO_TORQUE, JUMP),
         (Kind.REPEAT, "state", TWICE, "its reply is another servo's."),
-        (Kind.REPLAY, "state", OLD_REPLIES[1], TWICE),
+        (Kind.REPLAY, "state", OLD_REPLIES[1], "its reply is another servo's."),
         (Kind.CONSTANT, "current", "carries 0.3 A. Its current reading stays the same, its sensor is wrong.", JUMP),
         (Kind.WATCHDOG_LONG, "state", "stops by itself later than intended: its Bus Watchdog reads 127", JUMP),
         (Kind.SHADOWED, "state", "changed the settings (Secondary(Shadow) ID is 1 and was 255)", TWICE),

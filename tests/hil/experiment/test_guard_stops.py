@@ -259,6 +259,16 @@ def test_a_protection_that_another_program_switched_off_is_named_and_restored(
     assert ports[0].bus.servos[1].value("Temperature Limit") == 80
 
 
+def test_a_servo_that_was_told_to_answer_pings_only_is_named_and_confirmed_off(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    mute = once(lambda: ports[0].bus.servos[1].write(68, b"\0"))
+    stop, _ = run_until_stopped(arm(), tmp_path / "run", mute, plan)
+    assert stop.cause is Cause.MISSING and "Status Return Level is 0 and was 2). Symptom:" in str(stop)
+    assert "Torque is off on both servos" in " ".join(stop.__notes__)
+    assert ports[0].bus.servos[1].value("Status Return Level") == 2
+
+
 @pytest.mark.parametrize("ago", [0.02, 0.2])
 def test_a_mode_that_may_have_changed_after_a_stop_at_a_limit_is_not_said_to_be_its_cause(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, monkeypatch: pytest.MonkeyPatch, ago: float

@@ -44,7 +44,7 @@ class Late:
     """A servo whose replies are `late` requests old."""
 
     def __init__(self, late: int) -> None:
-        self.id = 2
+        self.id, self.answered_pings_only = 2, False
         self.table = {"ID": 2, "Operating Mode": 16, "Drive Mode": 0, "Homing Offset": 0, "Return Delay Time": 0}
         self._replies = [0] * late
 
