@@ -98,8 +98,10 @@ class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
     """The SDK's packet handler, made robust to noise before a reply.
 
     The SDK gives up when bytes that look like the beginning of a packet turn out not to be one. Here, the search
-    continues after them until the timeout.
+    continues after them until the timeout. `heard` is the ID of the last reply found, -1 after a reset.
     """
+
+    heard = -1
 
     def rxPacket(self, port: SdkPort, _fast_option: bool) -> tuple[list[int], int]:  # noqa: N802
         received = b""
@@ -107,6 +109,7 @@ class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
             packet, missing = _first_status(received)
             if packet:
                 port.hear(received.partition(packet)[0])
+                self.heard = packet[4]
                 payload = unstuff(packet[_BEFORE_LENGTH:-2])  # the SDK's own removeStuffing gets some data wrong
                 size = (len(payload) + 2).to_bytes(2, "little")
                 return [*packet[: _BEFORE_LENGTH - 2], *size, *payload, *packet[-2:]], COMM_SUCCESS

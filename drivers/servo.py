@@ -42,6 +42,8 @@ class Servo:
         self.port = port
         self.id = servo_id
         self.table = table
+        self.answered_pings_only = False
+        """Whether `let_answer` was needed."""
         self.title = title or f"The {table.model} with ID {servo_id}"
         self._sdk_port = SdkPort(port)
         self._sdk = ResyncingPacketHandler()
@@ -151,6 +153,13 @@ class Servo:
 
         self._try(f"writing {value} to {register}", send, attempts)
 
+    def let_answer(self) -> None:
+        """Set Status Return Level to 2 if pings are answered, as with level 0. Raises the same errors as `ping`."""
+        self.ping(attempts=1)
+        with suppress(NoReply):
+            self.write_only("Status Return Level", 2, attempts=1)
+        self.answered_pings_only = True
+
     def hardware_error(self) -> HardwareError:
         """Return the Hardware Error Status, the reason for a raised alert bit. Raises the same errors as `read`."""
         return HardwareError(self.read("Hardware Error Status"))
@@ -159,9 +168,11 @@ class Servo:
         self, what: str, action: Callable[[], tuple[_T, int, int]], attempts: int = _ATTEMPTS, *, is_read: bool = False
     ) -> _T:
         """Run one SDK exchange until it succeeds, at most `attempts` times; turn result codes into exceptions."""
-        late = False
+        late, others = False, set[int]()
         for left in reversed(range(attempts)):
+            self._sdk.heard = -1
             value, result, error = action()
+            others.add(self._sdk.heard)
             if result == COMM_SUCCESS:
                 break
             late = late or result == COMM_RX_TIMEOUT
@@ -172,6 +183,11 @@ class Servo:
             # Late replies to the requests that timed out may still arrive and would be taken for the next reply.
             self.port.clock.wait_until(self.port.clock.now() + _LATE_S)
             self.port.discard_input()
+        if result == COMM_RX_TIMEOUT and len(others) == 1 and (other := others.pop()) not in (-1, self.id):
+            raise NoReply(
+                f"{self.title} is answered with ID {other} instead of its own ({what}): their IDs or their replies are "
+                "mixed up. Check that every servo has its own ID, and whether a device on the bus changes replies."
+            )
         if result == COMM_RX_TIMEOUT:
             raise NoReply(
                 f"{self.title} does not answer at {self.port.baud} baud on {self.port.url} ({what}). Check its supply "

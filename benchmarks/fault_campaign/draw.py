@@ -47,7 +47,7 @@ WORDS = {
     STRANGER: r"another (program|master)|Drive Mode is|somebody else|not asked for|collision|other master",
     MIXED: r"another servo's|mixed up|swapped|ID has changed|same ID|was not addressed:",
     REPEATED: r"repeated|too late or twice",
-    SETTING: r"changed the settings.{0,80}(Homing Offset|Return Delay Time|PWM Limit|Current Limit) is"
+    SETTING: r"changed the settings.{0,80}(Homing Offset|Return (Delay Time|Level)|(PWM|Current) Limit|Secondary.*) is"
     r"|(Homing Offset|Return Delay Time|PWM Limit) was changed during this|Current Limit is \d+, but current_limit",
     HAND: r"pushes or holds|pushing or holding|hit it|slips|begun to slip",
     DISK: r"\bdisk\b|no space|File too large|cannot be written",
@@ -121,7 +121,7 @@ CAUSES: dict[str, frozenset[str]] = {
     Kind.REORDERED: _BYTES | {MIXED},
     Kind.RIVAL: _OTHER_GOALS,
     Kind.FACTORY_RESET: frozenset({SILENCE, REBOOT, TORQUE}),
-    Kind.SHADOWED: _OTHER_GOALS,
+    Kind.SHADOWED: _OTHER_GOALS | {SETTING},
     Kind.THROTTLED: _BY_MOTOR,
     Kind.HOMING_MOVED: _FORGED | {LIMIT, POSE, SETTING, STRANGER},  # only another program writes it
     Kind.SLIP: _BY_HAND,
@@ -152,7 +152,10 @@ CAUSES: dict[str, frozenset[str]] = {
 }
 """Causes that a message may name for each fault. The host cannot distinguish a jammed joint from a dead encoder."""
 
-BESIDE: dict[str, frozenset[str]] = {Kind.RAISED_LIMIT: frozenset({SETTING, STRANGER})}
+BESIDE: dict[str, frozenset[str]] = {
+    Kind.RAISED_LIMIT: frozenset({SETTING, STRANGER}),
+    Kind.ANSWERS_LESS: frozenset({SETTING, STRANGER}),
+}
 """What a message may say beside the cause of a stop: a change that another program did make, but that stops nothing."""
 
 _OF_FIELD = {

@@ -13,15 +13,37 @@ from hil.drivers.control_table import Register
 from hil.drivers.errors import DriverError, WrongReply, WrongSetting
 from hil.drivers.servo import Servo
 
-PROTECTIVE = ("Shutdown", "Temperature Limit", "Max Voltage Limit", "Min Voltage Limit")
-"""EEPROM registers that decide when a servo protects itself. An experiment does not set them, but restores them if
-another program has changed them meanwhile.
+STATUS_LEVEL = "Status Return Level"
+SECONDARY_ID = "Secondary(Shadow) ID"
+
+PROTECTIVE = (
+    "Shutdown",
+    "Temperature Limit",
+    "Max Voltage Limit",
+    "Min Voltage Limit",
+    "Velocity Limit",
+    "Max Position Limit",
+    "Min Position Limit",
+    "PWM Slope",
+    SECONDARY_ID,
+)
+"""EEPROM registers that decide when a servo protects itself and whom it obeys. An experiment does not set them, but
+restores them if another program has changed them meanwhile.
+
+Other writable EEPROM registers are not restored:
+- PWM Limit, Drive Mode, Homing Offset, Return Delay Time: a person may have wanted the change, and restoring it
+  unasked would change what angles and goals mean to them. It is reported, with the former value.
+- ID, Baud Rate, Protocol Type: after a change the servo no longer answers here, which the guard reports.
+- Startup Configuration: the SDK's tables lack it; the next start refuses a servo that arms itself.
+- Moving Threshold, External Port Mode: they affect neither the motion nor the replies that this program uses.
 """
 
 EEPROM = ("Current Limit", "Operating Mode", *PROTECTIVE)
 """EEPROM registers that are restored, in this order, since the limit bounds the goal."""
 
+# Not in it: LED, which only shines; Torque Enable, which is cut; Goal Position (see above).
 RAM = (
+    STATUS_LEVEL,  # first, so that the other writes are confirmed
     "Velocity I Gain",
     "Velocity P Gain",
     "Position D Gain",

@@ -17,12 +17,14 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from types import FrameType
 
 from hil.drivers.errors import DriverError, NoReply, PortLost
 from hil.drivers.joint import Joint
 from hil.drivers.packet import BROADCAST_ID, Instruction, encode
 from hil.drivers.port import Port
+from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import Servo
 from hil.drivers.servo_model import WATCHDOG_UNIT
 
@@ -47,6 +49,7 @@ class TorqueOff:
     unwatched: joints, of either group, whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
     rebooted: confirmed joints whose servos had lost the watchdog that was armed before torque came on.
+    tripped: joints whose Bus Watchdog may have acted, which zeroes their goals; it has been cleared since.
     driven: joints in neither group, whose servos' torque is on because another program switches it on whenever it is
     cut.
     """
@@ -56,6 +59,7 @@ class TorqueOff:
     unwatched: frozenset[Joint] = frozenset()
     later: frozenset[Joint] = frozenset()
     rebooted: frozenset[Joint] = frozenset()
+    tripped: frozenset[Joint] = frozenset()
     driven: tuple[Joint, ...] = ()
 
     @property
@@ -84,6 +88,7 @@ class TorqueOff:
             confirmed=(*self.confirmed, joint),
             unconfirmed=tuple(each for each in self.unconfirmed if each[0] != joint),
             later=self.later | {joint},
+            tripped=self.tripped | {joint},
             rebooted=self.rebooted | ({joint} if rebooted else set()),
         )
 
@@ -188,7 +193,10 @@ def cut_torque(
         wait(watchdog + TRIP_S)
         tell()
         for joint in tuple(left):
-            if confirm(joint, at_once=False) is not None:
+            failed = confirm(joint, at_once=False)
+            if isinstance(failed, NoReply) and _uninterrupted(servos[joint].let_answer, interrupts) is None:
+                failed = confirm(joint, at_once=False)
+            if failed is not None:
                 tell()
     return tuple(joint for joint in servos if joint not in left), tuple((joint, _text(why[joint])) for joint in left)
 
@@ -219,10 +227,22 @@ def _tell(port: Port, servos: Mapping[Joint, Servo], register: str, value: int, 
     port.write(times * encode(BROADCAST_ID, Instruction.SYNC_WRITE, body))
 
 
-def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> None:
-    """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more."""
-    for servo in servos.values():
-        _uninterrupted(lambda servo=servo: servo.write_despite_error("Bus Watchdog", 0), interrupts)  # type: ignore[misc]
+def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseException]) -> frozenset[Joint]:
+    """Switch the Bus Watchdogs off once torque is off, since nothing feeds them any more.
+
+    Return the joints whose watchdog has tripped, or may have: this cannot be read afterwards.
+    """
+    tripped = set(servos)
+
+    def disarm(joint: Joint, servo: Servo) -> None:
+        with suppress(Exception):
+            if servo.read_despite_error("Bus Watchdog") != WATCHDOG_TRIPPED:
+                tripped.discard(joint)
+        servo.write_despite_error("Bus Watchdog", 0)
+
+    for each in servos.items():
+        _uninterrupted(partial(disarm, *each), interrupts)
+    return frozenset(tripped)
 
 
 def cut_again(servo: Servo, *, armed: bool) -> bool:

@@ -147,10 +147,10 @@ class TorqueSwitch:
             fell_silent = {joint: self._servos[joint] for joint in confirmed if joint in silent & self._armed}
             rebooted = frozenset(joint for joint, servo in fell_silent.items() if was_rebooted(servo))
             watched = {joint: self._servos[joint] for joint in confirmed if joint not in self._without_watchdog}
-            disarm_watchdogs(watched, interrupts)
+            tripped = disarm_watchdogs(watched, interrupts)
             self._armed.difference_update(watched)
             unwatched = frozenset(self._without_watchdog)
-            self.torque_off_report = TorqueOff(confirmed, unconfirmed, unwatched, rebooted=rebooted)
+            self.torque_off_report = TorqueOff(confirmed, unconfirmed, unwatched, rebooted=rebooted, tripped=tripped)
         if interrupts:
             raise interrupts[0]
         return self.torque_off_report

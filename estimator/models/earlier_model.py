@@ -139,6 +139,8 @@ def unexplained(past: Any, j: int) -> float:
     return float(past[_SLOTS + 1, _FOUND + j])
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False)
+_inner: Any = numba.njit(  # type: ignore[call-overload]
+    nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False
+)
 forget, add, describe, store, compare = map(_inner, (forget, add, describe, store, compare))
 keep, unexplained = map(_inner, (keep, unexplained))

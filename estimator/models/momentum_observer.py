@@ -462,7 +462,9 @@ def _observe_loop(
     return alarm
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False)
+_inner: Any = numba.njit(  # type: ignore[call-overload]
+    nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False
+)
 _regressors, _begin_anew, _filter = map(_inner, (_regressors, _begin_anew, _filter))
 _gain, _lacks, _learn = map(_inner, (_gain, _lacks, _learn))
 _keep_dissipative = _inner(_keep_dissipative)

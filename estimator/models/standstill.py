@@ -142,7 +142,9 @@ def blocked(
     return bool(max(rest[_UP], rest[_DOWN]) > 2.0 * momentum and rest[_LASTS] >= HOLD_S)
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False)
+_inner: Any = numba.njit(  # type: ignore[call-overload]
+    nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False
+)
 forget = _forget = _inner(forget)
 keep = _keep = _inner(keep)
 withstood, is_suspect, look, variance, blocked = map(_inner, (withstood, is_suspect, look, variance, blocked))

@@ -185,7 +185,8 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
     if not worst:
         return "This error does not affect the parameters significantly: including it, each is known to 2 % or better."
     named = sorted(worst, key=lambda name: -worst[name])
-    listed = ", ".join(f"{name} ({percent(worst[name])})" for name in named[:4])
+    known = {name: percent(part) if np.isfinite(part) else "not determined" for name, part in worst.items()}
+    listed = ", ".join(f"{name} ({known[name]})" for name in named[:4])
     more = f" and {len(named) - 4} others" if len(named) > 4 else ""
     if trust == "no":
         return f"This error may bias all parameters, most of all {listed}{more}."
@@ -307,14 +308,14 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
     if part <= WELL_KNOWN:
         return (f"The least certain parameter is {name}, known to within {percent(part)}.",)
     improvement = improvement_of(name, torque_limit)
+    if not np.isfinite(part):
+        return (f"This motion provides no information on {name}. To identify it, use {improvement}.",)
     if part > WEAK and not _is_weak(validation, name):
         share = 100 * validation.torque_std[name]
         return (
             f"The least certain parameter is {name}, known to within {percent(part)}. It hardly affects this arm: "
             f"its standard error is {share:.2g} % of the fitted motion's torque. To improve it, use {improvement}.",
         )
-    if not np.isfinite(part):
-        return (f"This motion provides no information on {name}. To identify it, use {improvement}.",)
     return (
         f"The least certain parameter is {name}, known to within {percent(part)}. To improve it, use {improvement}.",
     )

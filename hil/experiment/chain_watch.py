@@ -23,7 +23,7 @@ from hil.estimator.chain.simulation.motion_observer import ChainObserver
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.experiment.checks.apart import causes_of_standstill
 from hil.experiment.checks.consistency import check_standstill
-from hil.experiment.model_watch import Explain
+from hil.experiment.model_watch import UNLIKE_ANY_ARM, Explain
 from hil.plan.chain_model import known_chain
 from hil.plan.obedience import Residual
 
@@ -136,7 +136,7 @@ class ChainWatch:
         else:
             self._explain(joint, float(lacking), [state for state, _ in self._commanded])
             said = (
-                f"{name} does not move like any arm consistent with the prior and the data so far: "
+                f"{name} {UNLIKE_ANY_ARM} consistent with the prior and the data so far: "
                 f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "
                 "encoder has failed, something is pushing or holding it, or the arm is not the one described."
             )

@@ -29,7 +29,7 @@ from hil.experiment.checks.joint_faults import JointFaults
 from hil.experiment.command_limits import CommandLimits
 from hil.experiment.deadlines import Deadlines
 from hil.experiment.silence import LATE_WAKE_UP_S, Silence
-from hil.experiment.status_check import StatusCheck
+from hil.experiment.status_check import OLD_REPLIES, StatusCheck
 from hil.plan.find_torque import how_to_find_torque
 from hil.plan.recent_motion import RecentMotion
 
@@ -153,6 +153,8 @@ class Guard:
         self._status.sent(goals)
         took = after - now
         gap = watchdog_gap if watchdog_gap > took else took
+        if gap > self._status.longest_gap:
+            self._status.longest_gap = gap
         if gap >= self._longest_gap:
             self._deadlines.check_gap(gap)
         if took >= self._late_after:
@@ -217,6 +219,8 @@ class Guard:
 
     def goals_are_lost(self, index: int, held: str) -> NoReturn:
         """Raise SafetyStop for a joint that misses many goals; `held` says what was read back."""
+        if self.recent.is_old(index):
+            self._stop(index, *OLD_REPLIES)
         self._stop(
             index,
             Cause.GOALS_LOST,
@@ -242,9 +246,8 @@ class Guard:
         """
         noisy = self._noise.end()
         for joint in noisy:
-            if joint.is_too_noisy:
-                remedy = "Check its supply and its cable; replace the servo if this happens again."
-                self._stop(joint.index, Cause.NOT_FOLLOWING, f"cannot be monitored: {joint.said}. {remedy}")
+            if joint.refused:
+                self._stop(joint.index, Cause.NOT_FOLLOWING, f"cannot be monitored: {joint.said}. {joint.refused}")
         return [f"{self._names[joint.index]}: {joint.said}" for joint in noisy]
 
     @property

@@ -27,6 +27,8 @@ from hil.estimator.models.parameters import CONSTANTS
 from hil.experiment.checks.apart import causes_of_standstill
 from hil.experiment.checks.consistency import check_standstill
 
+UNLIKE_ANY_ARM = "does not move like any arm"
+
 ARMS = 64
 WIDENED = 1.5
 """Factor applied to the ensemble's standard deviations, for effects that its model does not include."""
@@ -337,7 +339,7 @@ class ModelWatch:
         else:
             self._explain(joint, lacking, self._recent)
             said = (
-                f"{name} does not move like any arm consistent with the prior and the data so far: "
+                f"{name} {UNLIKE_ANY_ARM} consistent with the prior and the data so far: "
                 f"{lacking:+.3f} N m of the commanded torque is not reflected in its motion. Its motor or its "
                 "encoder has failed, something is pushing or holding it, or the arm is not the one described."
             )

@@ -4,6 +4,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hil import fakes
 from hil.config.schema import Config
 from hil.drivers.bus import ServoBus
@@ -15,6 +18,7 @@ from hil.dry_run.ensemble import Ensemble
 from hil.errors import Cause, ExperimentError, HilError, RunFolderError, SafetyStop, StopRequested
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.experiment.guard import MOST_OUTSIDE_RAD, NONE_HEARD
+from hil.experiment.model_watch import UNLIKE_ANY_ARM
 from hil.experiment.servo_limits import servo_limits
 from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Note, Stream, Watch
@@ -38,6 +42,13 @@ __all__ = ["run_experiment"]
 
 _LAST_SAMPLES = 100
 """Number of samples attached to an exception."""
+
+_FIRST_S = 3.0
+_DESCRIBED = (
+    "Since this is the beginning of a motion, check first whether the configuration fits the arm: each joint's "
+    "direction, id, torque_constant and wiring."
+)
+"""Advice for a stop within this time of the first goal [s], unless an earlier run has shown that the arm obeys."""
 
 _MOST_UNSEEN = 20
 """Number of progress reports that may be queued for the observer (about one second)."""
@@ -154,6 +165,8 @@ def _play(
     except BaseException as error:
         _explain_alert(bus, stream.state, error)
         _explain_by_settings(bus, settings, error, stream.modes_seen_ago)
+        if not has_moved():
+            doubt_description(error, recorder.samples)
         if isinstance(error, DriverError | HilError):
             error.last_samples = recorder.samples[-_LAST_SAMPLES:].copy()
         if not isinstance(error, TorqueNotOff):
@@ -258,6 +271,17 @@ def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, 
         explained.overruled = True
     elif changed := changed_settings(before, now):
         error.add_note(changed)
+
+
+def doubt_description(error: BaseException, samples: NDArray[np.void]) -> None:
+    """Name mistakes in the description of an arm that a guard stopped at the very beginning of its first motion."""
+    stop = error if isinstance(error, SafetyStop) else error.__context__
+    if not isinstance(stop, SafetyStop) or stop.overruled:
+        return
+    driven = np.flatnonzero(samples["goal_current"].any(axis=1))
+    is_doubtful = stop.cause is Cause.POSITION or UNLIKE_ANY_ARM in str(stop)
+    if is_doubtful and driven.size and np.ptp(samples["time_before_write"][driven[0] :]) < _FIRST_S:
+        stop.args = (f"{stop} {_DESCRIBED}",)
 
 
 @contextmanager

@@ -22,6 +22,9 @@ _WRAP_S = 32.768
 _CLOCK_TOLERANCE_S = 0.004
 """Largest lag of a servo's clock, which counts milliseconds, behind its expected value [s]."""
 
+_TICK_S = 3e-3
+"""Time after which a clock that counts milliseconds must have advanced [s]."""
+
 _REBOOTED_S = 1.0  # larger than any delay of a request
 _CLOCK_DRIFT = 0.01
 _LEARNT_READINGS = 3
@@ -34,6 +37,13 @@ _REMEMBERED = 256
 
 _HELD_BEFORE = 4
 """If writes are lost, a servo may also hold one of this many goals that were sent before the latest matching status."""
+
+
+OLD_REPLIES = (
+    Cause.STALE,
+    "returns stale data: its replies do not change, or are late by its own clock. A device between adapter and servo "
+    "repeats or delays them.",
+)
 
 
 class StatusCheck:
@@ -52,6 +62,8 @@ class StatusCheck:
         self._unit = [joint.drive_mode.goal_unit for joint in config.joints]
         self._missed = [0] * len(config.joints)
         self._has_one_servo = [len(joint.ids) == 1 for joint in config.joints]
+        self.longest_gap = 0.0
+        """Longest time that this program has sent nothing [s]."""
         self._goals: deque[Sequence[float]] = deque(maxlen=_REMEMBERED)
         self._cycles = 0
         # Per joint: goal in the latest status if it differs from that sent [A or V], the number of goals sent when they
@@ -61,6 +73,8 @@ class StatusCheck:
         self._is_foreign = [False] * len(config.joints)
         self._missed_at = [-1] * len(config.joints)
         """Number of goals sent when a status last differed, by joint."""
+        self._ticks = [(-1.0, 0.0)] * len(config.joints)
+        """Servo's and computer's clock in the latest status [s], by joint."""
         self._foreign = [ForeignValues() for _ in config.joints]
         """Goals in the status that this program never sent, by joint."""
         # Per joint: smallest servo minus computer clock [s], its time [s], readings, consecutive stale readings.
@@ -95,11 +109,13 @@ class StatusCheck:
                 "has lost its torque: Torque Enable reads 0 although this program switched it on. It was rebooted, its "
                 "supply failed for a moment, or another program is using this bus."
             )
-        return (
-            self.look_at_watchdog(status.watchdog)
-            or self._goal(joint, status, sent, now)
-            or self.look_at_clock(joint, status.tick, now)
-        )
+        (tick, seen), self._ticks[joint] = self._ticks[joint], (status.tick, now)
+        if watchdog := self.look_at_watchdog(status.watchdog):
+            return watchdog
+        goal, clock = self._goal(joint, status, sent, now), self.look_at_clock(joint, status.tick, now)
+        if goal and not clock and ((tick == status.tick and now - seen > _TICK_S) or self._clock[joint][3]):
+            return OLD_REPLIES  # an old reply holds an old goal, which proves nothing about the goals
+        return clock or goal
 
     def look_at_watchdog(self, ticks: int) -> tuple[Cause, str] | None:
         """Check a servo's Bus Watchdog [20 ms]; return the fault's cause and text, or None.
@@ -110,16 +126,22 @@ class StatusCheck:
             return None
         if ticks == _TRIPPED:
             return Cause.WATCHDOG, (
-                "has lost its torque: its watchdog tripped (Bus Watchdog reads 255), so it received nothing for "
-                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms. Check its plug and cable, unless the computer kept this "
-                "program waiting."
+                "has lost its torque: its watchdog tripped (Bus Watchdog reads 255). It received nothing for "
+                f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms, {self._why_tripped()}."
             )
         if self._may_be_unwatched:
             return None
         return Cause.WATCHDOG, (
-            f"is no longer protected: its Bus Watchdog reads {ticks} but was set to {self._armed}. Another "
-            "program is using this bus, or the servo was rebooted."
+            f"{_unlike_armed(ticks - self._armed if ticks else 0)}: its Bus Watchdog reads "
+            f"{ticks} but was set to {self._armed}. Another program is using this bus"
+            f"{'' if ticks else ', or the servo was rebooted'}."
         )
+
+    def _why_tripped(self) -> str:
+        """Return why a watchdog may have tripped, given how regularly this program has sent packets."""
+        if self.longest_gap > 0.5 * self._armed * WATCHDOG_UNIT:
+            return "unless the computer kept this program waiting: check its plug and cable"
+        return "or another program has set this register: check its plug and cable, and end other programs"
 
     def _goal(self, joint: int, status: Status, sent: float, now: float) -> tuple[Cause, str] | None:
         if abs(status.goal - sent) < self._half_tick[joint]:
@@ -136,13 +158,12 @@ class StatusCheck:
         self._missed[joint] += 1
         if self._missed[joint] < _GOALS_MISSED and not is_repeated:
             return None
-        if former is not None and missed_at == self._cycles - 1:
-            half = self._half_tick[joint]
-            if abs(status.goal - self._goals[-2][joint]) < half <= abs(status.goal - former):
-                return Cause.STALE, (
-                    "returns stale data: it holds the goal that it seemed to have missed one cycle before, so its "
-                    "replies are a cycle late. Check the adapter, its latency and its cable."
-                )
+        if former is not None and (late := self._late(joint, status.goal, former, self._cycles - missed_at)):
+            cycles = "a cycle" if late == 1 else f"{late} cycles"
+            return Cause.STALE, (
+                f"returns stale data: it holds a goal that it seemed to have missed before, so its replies are "
+                f"{cycles} late. Check the adapter, its latency and its cable."
+            )
         unit = self._unit[joint]
         held = f"it holds {status.goal:.3f} {unit} but {sent:.3f} {unit} was sent"
         if self._is_foreign[joint] or is_repeated:
@@ -153,9 +174,24 @@ class StatusCheck:
             )
         return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {self.why_lost()}"
 
+    def _late(self, joint: int, held: float, former: float, ago: int) -> int:
+        """How many cycles late a servo answers that holds a goal which it had been sent, but did not hold, when its
+        status last differed, `ago` cycles before; 0 if it need not be late. former: the goal that it held then [A or
+        V].
+        """
+        half = self._half_tick[joint]
+        for cycles, goals in enumerate(reversed(self._goals)):
+            is_held = abs(held - goals[joint]) < half
+            if is_held or abs(former - goals[joint]) < half:
+                return cycles if is_held and cycles >= ago and abs(held - former) >= half else 0
+        return 0
+
     def why_lost(self) -> str:
         """Return why goals are lost: what arrives when nothing should destroys them on the wire."""
-        refused = "Goals are being lost in transit, or the servo refuses them: check its cable and limits."
+        refused = (
+            "Goals are being lost in transit, the servo refuses them (check its cable and limits), or a device on the "
+            "bus repeats its old replies."
+        )
         return self._heard_instead() or refused
 
     def _never_sent(self, joint: int, held: float) -> bool:
@@ -213,6 +249,13 @@ class StatusCheck:
             for other, (behind, seen_at, readings, _) in enumerate(self._clock)
             if other != joint
         )
+
+
+def _unlike_armed(longer: int) -> str:
+    """What another timeout of the watchdog means; longer: by how much [20 ms], 0 if it is off."""
+    if not longer:
+        return "is no longer protected"
+    return f"stops by itself {'later' if longer > 0 else 'earlier'} than intended"
 
 
 def _wrapped(seconds: float) -> float:

@@ -8,6 +8,7 @@ encoder's steps. Each range includes zero, but excludes the direction opposite t
 
 from collections import deque
 from copy import copy
+from itertools import pairwise
 from math import ceil, isnan
 from typing import NamedTuple
 
@@ -98,6 +99,29 @@ class RecentMotion:
             return self.is_unreachable(joint, velocity)
         return all(not CONTRADICTS * each.low <= velocity <= CONTRADICTS * each.high for each in travels)
 
+    def currents(self, joint: int) -> list[tuple[float, float]]:
+        """Return the goals and currents of the latest exchanges that the joint answered; a current belongs to the goal
+        of the exchange before.
+        """
+        return [
+            (before.goal_current[joint], state.current[joint])
+            for before, state in pairwise(self._states)
+            if not isnan(state.current[joint])
+        ]
+
+    def is_old(self, joint: int) -> bool:
+        """Whether the joint's readings have stayed exactly the same for longer than its velocity allows."""
+        last = self._states[-1] if self._states else None
+        if last is None:
+            return False
+        same = last
+        for state in reversed(self._states):
+            if _readings(state, joint) != _readings(last, joint):
+                break
+            same = state
+        seconds = last.time_before_write - same.time_before_write
+        return abs(last.velocity[joint]) * seconds > self._steps[joint]
+
     def is_unreachable(self, joint: int, velocity: float) -> bool:
         """Whether no servo of this model turns that fast."""
         return abs(velocity) > self._fastest[joint]
@@ -137,6 +161,10 @@ def _since(known: list[State], last: State, span: float) -> State:
     """The latest state that is at least `span` [s] older than the last one, or the oldest if there is none."""
     now = last.time_before_write
     return next((state for state in reversed(known) if now - state.time_before_write >= span), known[0])
+
+
+def _readings(state: State, joint: int) -> tuple[float, float, float]:
+    return state.current[joint], state.velocity[joint], state.position[joint]
 
 
 def _took(state: State) -> float:

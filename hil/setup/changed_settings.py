@@ -7,7 +7,7 @@ from itertools import permutations
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
-from hil.drivers.preparation.settings import PROTECTIVE
+from hil.drivers.preparation.settings import PROTECTIVE, SECONDARY_ID, STATUS_LEVEL
 from hil.drivers.servo_model import RETURN_DELAY_UNIT, Mode
 from hil.errors import Cause
 
@@ -15,9 +15,22 @@ __all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "may_be_later
 
 _MODE, _DELAY = "Operating Mode", "Return Delay Time"
 _GOAL_PWM = "Goal PWM"
-"""In current mode, a limit of the voltage; a tripped watchdog leaves 0."""
+"""In current mode, a limit of the voltage. A tripped watchdog leaves 0, which then says nothing."""
 
-_REGISTERS = (_MODE, "Drive Mode", "Homing Offset", "PWM Limit", "Current Limit", _GOAL_PWM, _DELAY, *PROTECTIVE)
+_BESIDE = frozenset({*PROTECTIVE, STATUS_LEVEL}) - {SECONDARY_ID}
+"""Settings that are always named, although they explain no stop, except for a Status Return Level of 0."""
+
+_REGISTERS = (
+    _MODE,
+    "Drive Mode",
+    "Homing Offset",
+    "PWM Limit",
+    "Current Limit",
+    _GOAL_PWM,
+    _DELAY,
+    STATUS_LEVEL,
+    *PROTECTIVE,
+)
 
 WRITTEN = frozenset({"Operating Mode", "Current Limit", _GOAL_PWM})
 """Settings that this program writes itself."""
@@ -64,30 +77,34 @@ def settings_now(bus: ServoBus) -> Settings:
     whose ID is read wrongly: its replies are late, and equal values may be those of other registers.
     """
     found: dict[tuple[Joint, str], int] = {}
+    report = bus.torque_off_report
+    tripped = report.tripped if report else ()
     for joint, servo in bus.drives.items():
-        registers = _REGISTERS if joint.mode is Mode.CURRENT else [each for each in _REGISTERS if each != _GOAL_PWM]
+        has_pwm = joint.mode is Mode.CURRENT and joint not in tripped
+        registers = _REGISTERS if has_pwm else [each for each in _REGISTERS if each != _GOAL_PWM]
         known = [register for register in registers if register in servo.table]
         with suppress(DriverError):
             first = {register: servo.read(register, attempts=1) for register in known}
             again = {register: servo.read(register, attempts=1) for register in reversed(known)}
             if servo.read("ID", attempts=1) == servo.id:
-                same = [register for register in known if first[register] == again[register]]
-                found |= {(joint, each): first[each] for each in same if each != _GOAL_PWM or first[each]}
+                found |= {(joint, each): first[each] for each in known if first[each] == again[each]}
+                if servo.answered_pings_only:
+                    found[joint, STATUS_LEVEL] = 0  # until torque was cut
     return found
 
 
 def changed_settings(before: Settings, after: Settings, cause: Cause | None = None) -> str:
     """Return a message that names the settings that differ; "" if none do.
 
-    cause: the cause of a stop. Settings that cannot explain it are omitted, except for those that protect a servo.
+    cause: the cause of a stop. Settings that cannot explain it are omitted, except for those in `_BESIDE`.
     """
     differing = {each: value for each, value in before.items() if after.get(each, value) != value}
-    if not any(_may_explain(register, cause) for _, register in differing):
+    if not any(_may_explain(each[1], cause, after[each]) for each in differing):
         return ""
     changed = [
         f"{joint}: {register} is {_told(register, after[joint, register])} and was {_told(register, value)}"
         for (joint, register), value in differing.items()
-        if register in PROTECTIVE or _may_explain(register, cause)
+        if register in _BESIDE or _may_explain(register, cause, after[joint, register])
     ]
     said = f"Another program changed the settings of a servo during the run ({'; '.join(changed)})."
     if (swapped := _swapped(before, after)) is not None:
@@ -126,8 +143,11 @@ def may_be_later(before: Settings, after: Settings, cause: Cause, modes_seen_ago
     return f"{changed_settings(before, after)} This may have happened after the stop: {last}."
 
 
-def _may_explain(register: str, cause: Cause | None) -> bool:
-    if cause is None or register in PROTECTIVE:
+def _may_explain(register: str, cause: Cause | None, now: int) -> bool:
+    """now: the register's present value."""
+    if register == STATUS_LEVEL and now == 0:
+        return cause in (None, Cause.MISSING)
+    if cause is None or register in _BESIDE:
         return cause is None
     return cause in (_LATE if register == _DELAY else _MOVED)
 

@@ -183,6 +183,9 @@ def _servo(config: Config, joint_config: JointConfig, joint: Joint, servo: Servo
         fix = f"Check supply and cable. `hil scan {config.port.url}` shows whether it has another ID or baud rate."
         yield Finding(Level.STOP, where, "answers", f"nothing at {config.port.baud} baud", fix)
         return
+    except PortLost as error:
+        yield Finding(Level.STOP, where, "port", "lost", str(error))
+        return
     except DriverError as error:
         yield Finding(Level.STOP, where, "answers", "damaged", str(error))
         return

@@ -7,12 +7,16 @@ import tty
 from collections.abc import Iterator
 from contextlib import suppress
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
-from hil.drivers.errors import PortLost, PortNotOpened
+from hil.drivers.control_table import load_control_table
+from hil.drivers.errors import NoReply, PortLost, PortNotOpened
+from hil.drivers.packet import Instruction, encode
 from hil.drivers.port import NetworkPort, Port, open_port
 from hil.drivers.sdk_port import SdkPort
+from hil.drivers.servo import Servo
 from hil.fakes.bus.clock import VirtualClock
 
 
@@ -54,6 +58,27 @@ def test_input_can_be_discarded(pty: tuple[int, str]) -> None:
     assert port.read(10, 0.0) == b""
     port.close()
     os.close(master)
+
+
+@pytest.mark.parametrize("answering", [2, None])
+def test_a_servo_answered_with_anothers_id_is_not_called_silent(answering: int | None) -> None:
+    clock, received = VirtualClock(), bytearray()
+
+    def read(count: int, timeout: float) -> bytes:
+        taken = bytes(received[:count])
+        del received[:count]
+        clock.wait_until(clock.now() + (0.0 if taken else timeout))
+        return taken
+
+    def write(_: bytes) -> None:
+        if answering is not None:
+            received.extend(encode(answering, Instruction.STATUS, b"\x00\xfc\x03\x2e"))
+
+    port = Mock(clock=clock, baud=1_000_000, latency=1e-3, echoes=False, strangers=0, write=write, read=read)
+    port.wire_time.return_value, port.has_input.return_value = 1e-4, False
+    said = "does not answer" if answering is None else "answered with ID 2 instead of its own .* mixed up"
+    with pytest.raises(NoReply, match=said):
+        Servo(port, 1, load_control_table("XM430-W350")).read("ID")
 
 
 @pytest.mark.parametrize("action", ["read", "write", "discard"])

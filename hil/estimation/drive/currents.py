@@ -30,8 +30,18 @@ _RECENT = 4
 
 _BEYOND, _BEYOND_OFTEN = 0.25, 0.02
 """A current was not the commanded one if it deviates this much from all recent goals and from 0, relative to the
-largest goal. A warning is given if the fraction of such samples exceeds the second value.
+largest goal and beyond its noise. A warning is given if the fraction of such samples exceeds the second value.
 """
+
+_SIGMAS = 3.0
+"""Noise of a reading that counts as no deviation, in standard deviations."""
+
+_QUANTILE, _OF_NORMAL = 0.25, 0.3186
+"""Noise is judged by this quantile of its magnitude, because goals that are altered now and then must not count as
+noise; the second value is that of a normal distribution with a standard deviation of 1.
+"""
+
+_FEWEST_AT_REST = 50
 
 _SMALL, _LEAST = 0.5, 0.1
 """Highest and lowest goals that cannot be clipped but are large enough to judge, relative to the largest measured
@@ -53,12 +63,18 @@ class CurrentFindings:
 
 def current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindings:
     """Compare the currents in `samples` with the commanded ones."""
+    return _findings(config, samples, np.ones(len(samples), bool))
+
+
+def _findings(config: Config, samples: NDArray[np.void], judged: NDArray[np.bool_]) -> CurrentFindings:
+    """Like `current_findings`, but for the judged samples; the others only show how noisy the readings are."""
     lower = "current_limit" if config.experiment.pilot else "peak_torque"
     warnings, names = [], []
-    for name, goal, measured in _currents(config, samples):
-        if said := _other(name, goal, measured):
+    for name, every_goal, every in _currents(config, samples):
+        goal, measured, margin = every_goal[judged], every[judged], _SIGMAS * _noise(every_goal, every)
+        if said := _other(name, goal, measured, margin):
             names.append(name)
-        if said := said or _clipped(name, goal, measured, lower):
+        if said := said or _clipped(name, goal, measured, margin, lower):
             warnings.append(said)
     disturbance = (
         f"The current of {' and '.join(names)} was not the commanded one (see the warning), so the values, especially "
@@ -69,7 +85,7 @@ def current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindin
 
 def settled_current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindings:
     """Like `current_findings`, but only for the periodic samples, on which a settled estimate is based."""
-    return current_findings(config, samples[samples["phase"] == Phase.PERIODIC])
+    return _findings(config, samples, samples["phase"] == Phase.PERIODIC)
 
 
 def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Array, Array]]:
@@ -81,7 +97,31 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
     ]
 
 
-def _other(name: str, goal: Array, measured: Array) -> str:
+def _noise(goal: Array, measured: Array) -> float:
+    """Standard deviation of a current reading, from the recording itself: its scatter at goals that stay the same, or,
+    if that is larger, the deviation from its goals or the second difference of that, whichever is smaller.
+
+    Differences are smaller under a smooth deviation, plain values if goals are altered often. The current may lag
+    behind the goal by a few samples: the lag that leaves the least is the right one.
+    """
+    count = len(goal) - _RECENT
+    if count < _RECENT:
+        return 0.0
+    windows = np.lib.stride_tricks.sliding_window_view(goal, _RECENT)
+    at_rest = measured[_RECENT - 1 :][np.ptp(windows, axis=1) == 0.0]
+    at_rest = at_rest[np.isfinite(at_rest)]
+    still = _sigma(at_rest - np.median(at_rest)) if len(at_rest) >= _FEWEST_AT_REST else 0.0
+    lagging = [measured[_RECENT:] - goal[_RECENT - lag :][:count] for lag in range(_RECENT)]
+    moving = min(min(_sigma(each), _sigma(np.diff(each, 2)) / 6.0**0.5) for each in lagging)
+    return float(max(still, moving))
+
+
+def _sigma(errors: Array) -> float:
+    known = np.abs(errors[np.isfinite(errors)])
+    return float(np.quantile(known, _QUANTILE)) / _OF_NORMAL if len(known) else 0.0
+
+
+def _other(name: str, goal: Array, measured: Array, margin: float) -> str:
     """Describe a current that was not the commanded one; "" if it was, or was merely clipped."""
     if len(goal) < _RECENT or not goal.any():
         return ""
@@ -89,7 +129,7 @@ def _other(name: str, goal: Array, measured: Array) -> str:
     low, high = np.minimum(recent.min(axis=1), 0.0), np.maximum(recent.max(axis=1), 0.0)
     late = measured[_RECENT - 1 :]
     away = np.maximum(low - late, late - high)
-    beyond = float(np.mean(away > _BEYOND * np.abs(goal).max()))
+    beyond = float(np.mean(away > max(_BEYOND * np.abs(goal).max(), margin)))
     why = (
         "goals were altered in transit or by another program, or its current sensor is wrong. Make sure that nothing "
         "else commands the servos, and record again."
@@ -99,7 +139,7 @@ def _other(name: str, goal: Array, measured: Array) -> str:
             f"{name} carried a current opposite to the commanded one, or larger than it, in {100 * beyond:.0f} % "
             f"of the samples: {why}"
         )
-    part = _short_part(goal, measured)
+    part = _short_part(goal, measured, margin)
     if part > OFTEN and _follows_small_goals(goal, measured) < SHORT:
         return (
             f"{name} received less than {100 * SHORT:.0f} % of the commanded current in {100 * part:.0f} % of the "
@@ -108,9 +148,9 @@ def _other(name: str, goal: Array, measured: Array) -> str:
     return ""
 
 
-def _clipped(name: str, goal: Array, measured: Array, lower: str) -> str:
+def _clipped(name: str, goal: Array, measured: Array, margin: float, lower: str) -> str:
     """Describe a motor that receives less current than commanded because its supply sags or its servo limits it."""
-    part = _short_part(goal, measured)
+    part = _short_part(goal, measured, margin)
     if part <= OFTEN:
         return ""
     return (
@@ -128,11 +168,15 @@ def _least(goal: Array) -> Array:
     return np.asarray(np.minimum(np.abs(goal[1:]), np.abs(goal[:-1])) * (goal[1:] * goal[:-1] > 0.0))
 
 
-def _short_part(goal: Array, measured: Array) -> float:
+def _short_part(goal: Array, measured: Array, margin: float) -> float:
     """Fraction of the samples with large goals whose current is too small."""
     least = _least(goal)
     large = (least > LARGE * np.abs(goal).max()) & np.isfinite(measured[1:])
-    return float(np.mean(np.abs(measured[1:][large]) < SHORT * least[large])) if large.any() else 0.0
+    return (
+        float(np.mean(np.abs(measured[1:])[large] < np.minimum(SHORT * least, least - margin)[large]))
+        if large.any()
+        else 0.0
+    )
 
 
 def _follows_small_goals(goal: Array, measured: Array) -> float:

@@ -74,11 +74,14 @@ class CurrentNoise:
 
 @dataclass(frozen=True)
 class Noisy:
-    """A joint whose current reading is noisier than usual; `said` says so, and what it means."""
+    """A joint whose current reading is noisier than usual; `said` says so, and what it means.
+
+    refused: why the joint cannot be monitored, and what to do; "" if it can.
+    """
 
     index: int
     said: str
-    is_too_noisy: bool
+    refused: str
 
 
 class NoiseAllowance:
@@ -118,7 +121,7 @@ class NoiseAllowance:
         noise, self.noise = self._measured.measured()
         self._allow(self.noise)
         return [
-            Noisy(index, self._how_noisy(index, noise[index]), noise[index] > MOST_NOISE * joint.goal_limit)
+            Noisy(index, self._how_noisy(index, noise[index]), _refused(joint, noise[index]))
             for index, joint in enumerate(self._joints)
             if self._records[index]["is_followed"]
             and self.noise[index] > following.usual_sigma(joint, self._planned[index])
@@ -135,3 +138,14 @@ class NoiseAllowance:
             f"its current reading is noisy: {noise:.2g} {unit} RMS at a constant goal; lost torque cannot be seen "
             f"within 0.1 s at goals below {seen:.2g} {unit}"
         )
+
+
+def _refused(joint: JointConfig, noise: float) -> str:
+    name, limit = joint.goal_limit_name, joint.goal_limit
+    if noise <= MOST_NOISE * limit:
+        return ""
+    return (
+        f"At most {MOST_NOISE * limit:.2g} {joint.drive_mode.goal_unit} RMS is accepted, {100 * MOST_NOISE:.0f} % of "
+        f"{name} ({limit:g}). Check its supply and its cable, or raise {name} if the joint bears more; replace the "
+        "servo if this happens again."
+    )

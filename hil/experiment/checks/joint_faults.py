@@ -23,6 +23,9 @@ limit.
 _LACKS_S, _EXPLAINED = 0.1, 0.5
 """The supply explains missing torque if, within the last `_LACKS_S` [s], it caused at least this fraction of it."""
 
+_FEWEST = 4
+"""Number of readings from which a current that does not follow its goal is explained by how it differs."""
+
 Fault = tuple[Cause, str]
 """The cause and a sentence without its subject, the joint."""
 
@@ -175,14 +178,20 @@ class JointFaults:
             )
         along = carried if commanded == 0.0 else carried * copysign(1.0, commanded)
         allowed = self._records[index]["following"]["allowed"]
-        if along > abs(commanded) + allowed or along < -allowed:
+        readings, least = self._recent.currents(index), self._records[index]["goals"]["most"]
+        if _is_stuck(readings, least):
+            return (
+                "Its current reading stays the same while its goal changes: its current sensor is wrong, or another "
+                "program is commanding it."
+            )
+        if along > abs(commanded) + allowed or along < -allowed or _is_shifted(readings, least):
             return "Its torque is not as commanded: another program is commanding it, or its current sensor is wrong."
         weak = "it cannot deliver this much at its speed and supply voltage (safety.follow_share)."
         if along > HARDLY_ANY * abs(commanded):
             return (
                 f"Its goals are being altered in transit or by another program, its current sensor is wrong, or {weak}"
             )
-        return f"Its torque is off, it was rebooted, its watchdog acted, or {weak}"
+        return f"Its torque is off, it was rebooted, its watchdog acted, its current sensor is wrong, or {weak}"
 
     def _disagree(self, index: int, state: State) -> Fault:
         return (
@@ -198,3 +207,21 @@ class JointFaults:
             f"is moving against its command: its motor has taken {self._records[index]['found']:.2f} J out of the arm, "
             "more than friction can account for. Is its direction reversed, or is something else driving the arm?",
         )
+
+
+def _is_stuck(readings: Sequence[tuple[float, float]], least: float) -> bool:
+    """Whether a current stayed exactly the same, other than 0, while its goal changed by more than `least`."""
+    if len(readings) < _FEWEST:
+        return False
+    goals, currents = zip(*readings, strict=True)
+    return len(set(currents)) == 1 and abs(currents[0]) > least and max(goals) - min(goals) > least
+
+
+def _is_shifted(readings: Sequence[tuple[float, float]], least: float) -> bool:
+    """Whether a current follows its goal, which has changed by more than `least`, but at a distance."""
+    if len(readings) < _FEWEST:
+        return False
+    goals = [goal for goal, _ in readings]
+    away = [current - goal for goal, current in readings]
+    changed = max(goals) - min(goals)
+    return changed > least and max(away) - min(away) < 0.4 * changed and min(map(abs, away)) > least

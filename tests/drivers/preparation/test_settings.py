@@ -28,7 +28,8 @@ class Servo:
 
 def test_every_register_is_stored_and_a_tripped_watchdog_as_one_that_is_off() -> None:
     servo: Any = Servo()
-    assert read_settings(servo) == {name: XM430[name].address for name in (*EEPROM, *RAM)} | {"Bus Watchdog": 0}
+    known = {name: XM430[name].address for name in (*EEPROM, *RAM) if name in XM430}
+    assert read_settings(servo) == known | {"Bus Watchdog": 0}
 
 
 @pytest.mark.parametrize("behind", [range(100), range(1, 100), range(13, 100), range(1), range(5, 6), range(2, 20)])

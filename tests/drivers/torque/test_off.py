@@ -39,6 +39,7 @@ class Bench:
     def __init__(self, **fails: list[BaseException]) -> None:
         self.sent: list[tuple[object, float]] = []
         self.attempts: list[int | None] = []
+        self.watchdogs = {FIRST: 0xFF, SECOND: 4}
         clock = VirtualClock()
         self.port: Any = SimpleNamespace(clock=clock, write=self._note)
         self.servos: dict[Joint, Any] = {}
@@ -60,6 +61,7 @@ class Bench:
         return SimpleNamespace(
             id=number,
             table=load_control_table("XM430-W350"),
+            read_despite_error=lambda _: self.watchdogs[number],
             write_despite_error=write,
             write_once=partial(write, attempts=1),
         )
@@ -132,7 +134,7 @@ def test_an_interrupted_write_is_repeated_five_times_at_most(count: int, confirm
 def test_watchdogs_are_switched_off_whatever_fails() -> None:
     bench = Bench(first=[NoReply("nothing")], second=[KeyboardInterrupt()])
     interrupts: list[BaseException] = []
-    disarm_watchdogs(bench.servos, interrupts)
+    assert disarm_watchdogs(bench.servos, interrupts) == {JOINTS[0]}, "the one that had tripped"
     assert [who for who, _ in bench.sent] == [FIRST, SECOND, SECOND] and len(interrupts) == 1
 
 

@@ -46,7 +46,32 @@ def overwritten(every: int) -> np.ndarray:
     return samples
 
 
-@pytest.mark.parametrize("samples", [recording(100.0, 0.7), recording(400.0, 0.6), overwritten(6), overwritten(9)])
+def noisy(samples: np.ndarray, sigma: float, smooth: int = 1) -> np.ndarray:
+    """The samples after a second at rest, with noise [A RMS] on the currents; smooth: samples over which it lasts."""
+    noisy = np.concatenate((np.zeros(200, samples.dtype), samples))
+    noise = np.random.default_rng(0).standard_normal((len(noisy) + smooth - 1, 2))
+    mean = [np.convolve(each, np.full(smooth, smooth**-0.5), "valid") for each in noise.T]
+    noisy["current"] += sigma * np.transpose(mean)
+    return noisy
+
+
+@pytest.mark.parametrize("is_settled", [True, False])
+@pytest.mark.parametrize(("sigma", "smooth"), [(0.1, 1), (0.6, 1), (0.3, 10)])
+def test_noise_of_the_reading_is_no_other_current(sigma: float, smooth: int, is_settled: bool) -> None:
+    config = load_config(CONFIGS / "fake_two_link.toml")
+    find = settled_current_findings if is_settled else current_findings
+    assert find(config, noisy(recording(200.0, 1.0), sigma, smooth)).warnings == ()
+    if smooth == 1:
+        assert current_findings(config, noisy(recording(100.0, 1.0), sigma)[200:]).warnings == (), "never at rest"
+
+
+@pytest.mark.parametrize(
+    "samples",
+    [
+        *(recording(100.0, 0.7), recording(400.0, 0.6), overwritten(6), overwritten(9), overwritten(2)),
+        *(noisy(recording(400.0, 0.6), 0.02), noisy(overwritten(3), 0.1), noisy(overwritten(9), 0.1)),
+    ],
+)
 def test_a_current_that_is_another_one_is_not_said_to_be_clipped(samples: np.ndarray) -> None:
     config = load_config(CONFIGS / "fake_two_link.toml")
     found = settled_current_findings(config, samples)

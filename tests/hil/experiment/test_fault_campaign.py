@@ -24,6 +24,7 @@ from benchmarks.fault_campaign.twin import has_healthy_twin, lagging, wired_othe
 from benchmarks.fault_campaign.witness import CURRENT_MODE, PWM_MODE, Witness
 from benchmarks.faults import campaign, figures
 from hil.drivers.servo_model import Mode
+from hil.experiment.status_check import OLD_REPLIES
 
 INJECTIONS = 300
 
@@ -114,6 +115,11 @@ TWICE = "missed 6 replies in a row. Replies did arrive, but too late or twice."
         (Kind.BIAS, "position", JUMP, NO_TORQUE),
         (Kind.BIAS, "current", NO_TORQUE, JUMP),
         (Kind.REPEAT, "state", TWICE, "its reply is another servo's."),
+        (Kind.REPLAY, "state", OLD_REPLIES[1], "its reply is another servo's."),
+        (Kind.CONSTANT, "current", "carries 0.3 A. Its current reading stays the same, its sensor is wrong.", JUMP),
+        (Kind.WATCHDOG_LONG, "state", "stops by itself later than intended: its Bus Watchdog reads 127", JUMP),
+        (Kind.SHADOWED, "state", "changed the settings (Secondary(Shadow) ID is 1 and was 255)", TWICE),
+        (Kind.IDS_SWAPPED, "state", "is answered with ID 2 instead of its own: their IDs are mixed up.", TWICE),
         (Kind.LAG, "velocity", "is at 1 rad, outside its position limit", "Lower velocity_limit, or raise the voltage"),
     ],
 )

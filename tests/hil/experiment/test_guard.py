@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from math import inf, nan, sin, tau
 from random import Random
 from timeit import timeit
@@ -153,6 +154,18 @@ def test_what_was_heard_beside_the_replies_explains_lost_goals(arm: Arm, heard: 
         assert stop.value.cause is Cause.GOALS_LOST and ("being lost" in str(stop.value)) == (not heard)
 
 
+@pytest.mark.parametrize(("velocity", "cause"), [(1.0, Cause.STALE), (0.0, Cause.GOALS_LOST)])
+def test_readings_that_stay_the_same_in_motion_are_old_and_show_no_lost_goals(
+    arm: Arm, velocity: float, cause: Cause
+) -> None:
+    guard = Guard(arm())
+    for number in range(4):
+        guard.recent.add(at(number, STILL)._replace(velocity=(0.0, velocity)))
+    with pytest.raises(SafetyStop, match=r"old replies|repeats or delays") as stop:
+        guard.goals_are_lost(1, "its Goal Current reads 3, but 4 was sent")
+    assert stop.value.cause is cause and ("accept goals" in str(stop.value)) == (velocity == 0.0)
+
+
 def test_an_arm_that_is_lowered_may_be_silent_longer(arm: Arm) -> None:
     """Counted from the last exchange that all servos answered, which may be older than the lowering."""
     silent = MISSING._replace(missing=(True, True))
@@ -298,6 +311,26 @@ def test_a_current_that_does_not_follow_is_off_or_that_of_another(arm: Arm, carr
     assert ("torque is off" in str(stop.value)) == (carried == 0.0)
 
 
+@pytest.mark.parametrize(
+    ("reads", "said"),
+    [
+        (lambda goal, _: goal - 0.28, "Its torque is not as commanded"),
+        (lambda goal, _: 0.07, "stays the same"),
+        (lambda goal, n: 1e-3 * (n % 2), "Its torque is off"),
+    ],
+    ids=["shifted", "stuck", "none"],
+)
+def test_a_current_that_does_not_follow_is_explained_by_how_it_differs(
+    arm: Arm, reads: Callable[[float, int], float], said: str
+) -> None:
+    """The last reading alone looks like that of a motor without torque."""
+    guard, goals = Guard(arm(), PLANNED), [0.2 + 0.1 * (n % 5) / 5 for n in range(400)]
+    with pytest.raises(SafetyStop, match=said) as stop:
+        for n, (before, goal) in enumerate(pairwise(goals)):
+            guard.look(at(n, STILL._replace(goal_current=(0.0, goal), current=(0.0, reads(before, n)))))
+    assert stop.value.cause is Cause.NOT_FOLLOWING and "current sensor is wrong" in str(stop.value)
+
+
 @pytest.mark.parametrize("moves", [0.0, 0.002])
 def test_readings_that_stay_the_same_under_other_goals_are_frozen(arm: Arm, moves: float) -> None:
     """At first they answer to the goal, which then rises by less than may be missing from a healthy motor's current."""
@@ -408,7 +441,7 @@ def test_a_noisy_current_reading_is_named_and_refused_only_if_it_hides_lost_torq
         for number in range(40):
             each.look(at(500 + number, STILL._replace(goal_current=(0.0, -0.02), current=(0.0, 0.06))))
     assert look(Guard(arm(), (0.05, 0.05)), *[at(n, STILL._replace(current=(0.0, 0.06))) for n in range(20)])
-    with pytest.raises(SafetyStop, match=r"cannot be monitored: its current reading is noisy: .* A RMS"):
+    with pytest.raises(SafetyStop, match=r"its current reading is noisy: .* A RMS.* 25 % of current_limit"):
         at_rest(Guard(arm()), 2.0)
 
 

@@ -19,12 +19,12 @@ from hil.drivers.errors import BusShared, TorqueNotOff, WrongModel, WrongSetting
 from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
 from hil.experiment import run
 from hil.experiment.checks import work
-from hil.experiment.model_watch import ModelWatch
+from hil.experiment.model_watch import UNLIKE_ANY_ARM, ModelWatch
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Progress
 from hil.fakes.bus.faults import Fault, FaultKind
 from hil.plan.plan import Plan, make_plan
-from hil.runs.recording import Phase, load_samples
+from hil.runs.recording import Phase, load_samples, sample_type
 from hil.runs.run_folder import RunFolder
 from hil.setup.session import servo_session
 from tests.support.paths import CONFIGS
@@ -185,7 +185,9 @@ def test_a_limit_that_another_program_lowered_is_the_cause_that_is_named(
     assert_stopped(ports[0])
 
 
-@pytest.mark.parametrize(("register", "value"), [("PWM Limit", 700), ("Current Limit", 250), ("Goal PWM", 266)])
+@pytest.mark.parametrize(
+    ("register", "value"), [("PWM Limit", 700), ("Current Limit", 250), ("Goal PWM", 266), ("Goal PWM", 0)]
+)
 def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, register: str, value: int
 ) -> None:
@@ -207,6 +209,26 @@ def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
     assert f"{register} is {value} and was " in (run.path / "events.jsonl").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize(
+    ("seconds", "cause", "text", "is_doubted"),
+    [
+        (1.0, Cause.POSITION, "is at 3 rad.", True),
+        (5.0, Cause.POSITION, "is at 3 rad.", False),
+        (1.0, Cause.UNEXPECTED, f"It {UNLIKE_ANY_ARM}.", True),
+        (1.0, Cause.UNEXPECTED, "It jerked.", False),
+        (1.0, Cause.VELOCITY, "is fast.", False),
+    ],
+)
+def test_mistakes_in_the_description_are_named_only_at_the_beginning(
+    seconds: float, cause: Cause, text: str, is_doubted: bool
+) -> None:
+    samples = np.zeros(1000, sample_type(2))
+    samples["time_before_write"] = np.linspace(0.0, 20.0 + seconds, 1000)
+    samples["goal_current"][samples["time_before_write"] > 20.0] = 0.1
+    run.doubt_description(stop := SafetyStop(text, cause), samples)
+    assert ("direction, id, torque_constant and wiring" in str(stop)) == is_doubted
+
+
 @pytest.mark.parametrize("stopped", [False, True])
 def test_a_protection_that_another_program_switched_off_is_named_and_restored(
     arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, stopped: bool
@@ -214,11 +236,15 @@ def test_a_protection_that_another_program_switched_off_is_named_and_restored(
     def cycle() -> None:
         ports[0].bus.servos[2].memory.set("Shutdown", 0)
         ports[0].bus.servos[1].memory.set("Temperature Limit", 100)
+        for name, value in changed.items():
+            ports[0].bus.servos[1].memory.set(name, value)
         if stopped:
             swing_elbow(ports, 25.0)
 
+    changed = {"Status Return Level": 1, "Velocity Limit": 10, "Max Position Limit": 3000, "Secondary(Shadow) ID": 7}
     config, folder = arm(), tmp_path / "run"
     if stopped:
+        changed.pop("Secondary(Shadow) ID")
         stop, _ = run_until_stopped(config, folder, once(cycle), plan)
         said = " ".join(stop.__notes__)
         assert stop.cause is Cause.VELOCITY and "Shutdown" not in str(stop)
@@ -226,8 +252,21 @@ def test_a_protection_that_another_program_switched_off_is_named_and_restored(
         said = run_experiment(config, RunFolder.create(folder, config), config.path, once(cycle), plan)
     assert "Another program changed" in said and "Shutdown is 0 and was 52" in said
     assert "Temperature Limit is 100 and was 80" in said
+    before = {"Status Return Level": 2, "Velocity Limit": 200, "Max Position Limit": 4095, "Secondary(Shadow) ID": 255}
+    assert all(f"{name} is {value} and was {before[name]}" in said for name, value in changed.items())
+    assert {name: ports[0].bus.servos[1].value(name) for name in before} == before
     assert ports[0].bus.servos[2].value("Shutdown") == 52
     assert ports[0].bus.servos[1].value("Temperature Limit") == 80
+
+
+def test_a_servo_that_was_told_to_answer_pings_only_is_named_and_confirmed_off(
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan
+) -> None:
+    mute = once(lambda: ports[0].bus.servos[1].write(68, b"\0"))
+    stop, _ = run_until_stopped(arm(), tmp_path / "run", mute, plan)
+    assert stop.cause is Cause.MISSING and "Status Return Level is 0 and was 2). Symptom:" in str(stop)
+    assert "Torque is off on both servos" in " ".join(stop.__notes__)
+    assert ports[0].bus.servos[1].value("Status Return Level") == 2
 
 
 @pytest.mark.parametrize("ago", [0.02, 0.2])

@@ -21,12 +21,21 @@ FINE = Status(watchdog=4, goal=0.1, tick=1.0, torque=True, hardware_error=0)
         ({"hardware_error": 32}, Cause.ALERT, "overload"),
         ({"watchdog": 255}, Cause.WATCHDOG, "received nothing for 80 ms"),
         ({"watchdog": 0}, Cause.WATCHDOG, "no longer protected: its Bus Watchdog reads 0 but was set to 4"),
-        ({"watchdog": 5}, Cause.WATCHDOG, "no longer protected"),
+        ({"watchdog": 5}, Cause.WATCHDOG, "stops by itself later than intended: its Bus Watchdog reads 5"),
+        ({"watchdog": 1}, Cause.WATCHDOG, "stops by itself earlier than intended"),
     ],
 )
 def test_what_one_status_shows(arm: Arm, change: dict[str, object], cause: Cause, said: str) -> None:
     wrong = StatusCheck(arm()).look(1, FINE._replace(**change), 0.1, 1.0)
     assert wrong is not None and wrong[0] is cause and said in wrong[1]
+
+
+@pytest.mark.parametrize(("gap", "said"), [(0.01, "another program"), (0.07, "the computer kept this program waiting")])
+def test_why_a_watchdog_tripped_depends_on_how_long_nothing_was_sent(arm: Arm, gap: float, said: str) -> None:
+    check = StatusCheck(arm())
+    check.longest_gap = gap
+    wrong = check.look(1, FINE._replace(watchdog=255), 0.1, 1.0)
+    assert wrong is not None and said in wrong[1] and ("another program" in wrong[1]) == (gap < 0.05)
 
 
 def test_what_a_short_status_leaves_out_is_not_wrong(arm: Arm) -> None:
@@ -66,6 +75,32 @@ def test_a_servo_that_holds_the_goal_it_seemed_to_have_missed_answers_a_cycle_la
             check.sent((goal, 0.0))
         wrong = check.look(0, FINE._replace(goal=holds), goal, 1.0)
     assert wrong is not None and wrong[0] is cause and ("a cycle late" in wrong[1]) == (cause is Cause.STALE)
+
+
+@pytest.mark.parametrize(("held", "late"), [((0.03, 0.04), 4), ((0.03, 0.03), 0)])
+def test_a_goal_held_later_than_it_was_sent_shows_how_late_replies_are(
+    arm: Arm, held: Sequence[float], late: int
+) -> None:
+    check = StatusCheck(arm())
+    for number, goal in enumerate((0.03, 0.04, 0.05, 0.06, 0.07, 0.08)):
+        check.sent((goal, 0.0))
+        if number >= 4:
+            wrong = check.look(0, FINE._replace(goal=held[number - 4], tick=1.0 + number), goal, 1.0 + number)
+    assert wrong is not None and (f"{late} cycles late" in wrong[1]) == (wrong[0] is Cause.STALE) == bool(late)
+
+
+@pytest.mark.parametrize(
+    ("ticks", "cause"), [((1.0, 1.0), Cause.STALE), ((1.01, 0.99), Cause.STALE), ((1.01, 1.02), Cause.GOALS_LOST)]
+)
+def test_replies_that_are_old_by_the_servos_clock_show_no_lost_goals(
+    arm: Arm, ticks: Sequence[float], cause: Cause
+) -> None:
+    check = StatusCheck(arm())
+    for number in range(4):
+        assert check.look(0, FINE._replace(tick=0.97 + 0.01 * number), 0.1, 0.97 + 0.01 * number) is None
+    for number, tick in enumerate(ticks):
+        wrong = check.look(0, FINE._replace(goal=0.05, tick=tick), 0.1, 1.01 + 0.01 * number)
+    assert wrong is not None and wrong[0] is cause and ("stale" in wrong[1]) == (cause is Cause.STALE)
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,9 @@ def test_a_protection_is_named_beside_the_cause_of_a_stop_but_is_none() -> None:
     alone = {**before, (ELBOW, "Shutdown"): 0}
     assert changed_settings(before, alone, Cause.POSITION) == ""
     assert "Shutdown is 0 and was 52" in changed_settings(before, alone)
+    assert changed_settings(
+        {(ELBOW, "Secondary(Shadow) ID"): 255}, {(ELBOW, "Secondary(Shadow) ID"): 1}, Cause.POSITION
+    )
     both = {**alone, (SHOULDER, LIMIT): 100}
     assert all(each in changed_settings(before, both, Cause.POSITION) for each in ("Shutdown is 0", "Limit is 100"))
 
@@ -41,7 +44,7 @@ class Late:
     """A servo whose replies are `late` requests old."""
 
     def __init__(self, late: int) -> None:
-        self.id = 2
+        self.id, self.answered_pings_only = 2, False
         self.table = {"ID": 2, "Operating Mode": 16, "Drive Mode": 0, "Homing Offset": 0, "Return Delay Time": 0}
         self._replies = [0] * late
 
@@ -54,6 +57,6 @@ class Late:
 def test_settings_are_unknown_if_replies_are_late(late: int) -> None:
     """Several settings are 0, and would be taken for another that is not."""
     servo = Late(late)
-    found = settings_now(cast(Any, SimpleNamespace(drives={ELBOW: servo})))
+    found = settings_now(cast(Any, SimpleNamespace(drives={ELBOW: servo}, torque_off_report=None)))
     known = {(ELBOW, name): value for name, value in servo.table.items() if name != "ID"}
     assert found == ({} if late else known)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from hil import fakes
 from hil.cli.app import app
 from hil.config.schema import Config, load_config
-from hil.drivers.errors import NoReply, WrongSetting
+from hil.drivers.errors import NoReply, PortLost, WrongSetting
 from hil.drivers.port import Port, open_port
 from hil.fakes.bus.bus import FakeBus
 from hil.fakes.bus.faults import Fault
@@ -206,6 +206,15 @@ def test_an_arm_that_needs_two_writes_is_found(arm: Arm, monkeypatch: pytest.Mon
     finding = look(arm())["bus", "rate"]
     assert finding.level is Level.STOP
     assert finding.fix == "Set port.one_write = false and port.fast_sync_read = true."
+
+
+def test_a_cable_that_is_pulled_during_the_check_is_named(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost(*_: object) -> int:
+        raise PortLost("The cable is out.")
+
+    monkeypatch.setattr("hil.drivers.servo.Servo.ping", lost)
+    finding = look(arm())["joint 'shoulder'", "port"]
+    assert (finding.level, finding.found, finding.fix) == (Level.STOP, "lost", "The cable is out.")
 
 
 def test_check_changes_nothing(arm: Arm, ports: list[Any]) -> None:
