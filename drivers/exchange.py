@@ -150,6 +150,8 @@ class Exchange:
         self._usual = self._latest_plan = self._plans[0]
         self._read_back: ReadBack | None = None
         self._interval = interval
+        self._overtime = OVERTIME_SHARE * interval if status is None else 0.0
+        """By how much an overdue read-back may delay the next cycle [s]: not at all if a status shows the same."""
         self.awaited_until = -math.inf
         """Reply deadline of the latest repeated read-back, which may delay the next cycle [s on the port's clock]."""
         self.read_back_at = math.inf
@@ -267,7 +269,7 @@ class Exchange:
         takes = self._takes(read, back)
         latest = due
         if now + takes > due and now >= back.overdue_at:
-            latest += OVERTIME_SHARE * self._interval
+            latest += self._overtime
         if now + takes > latest or self._late_possible:
             back.postponed(now)
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones

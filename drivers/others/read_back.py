@@ -50,8 +50,8 @@ share `_AGAIN_SHARE` of one. In longer ones, read-backs are rarely destroyed, an
 """
 
 OVERDUE_S, OVERTIME_SHARE = 0.05, 0.8
-"""If nothing was read back for `OVERDUE_S` [s] because cycles leave no time for it, a read-back may delay the next
-cycle by up to this fraction of a cycle: without one, a disarmed watchdog or another mode would never be seen.
+"""If nothing was read back for `OVERDUE_S` [s] because cycles leave no time for it, nor for a status, a read-back may
+delay the next cycle by up to this fraction of a cycle: otherwise a disarmed watchdog would never be seen.
 """
 
 LOST_GOALS, LOST_OF = 3, 6
