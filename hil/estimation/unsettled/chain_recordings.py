@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.chain import doubted_inertias
-from hil.config.csv_columns import RecordingConfig
+from hil.config.recording import RecordingConfig
 from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import read_arm
 from hil.description.urdf import rotation_of

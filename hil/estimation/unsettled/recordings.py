@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.arm_model import JointFacts
-from hil.config.csv_columns import Columns, RecordingConfig, load_recording_config
+from hil.config.csv_columns import Columns
+from hil.config.recording import RecordingConfig, load_recording_config
 from hil.errors import ConfigError, CsvError
 from hil.estimation.physical import physical_of
 from hil.estimation.slips.recorded_jumps import jump_sentences

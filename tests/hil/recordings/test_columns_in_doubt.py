@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.config.csv_columns import Columns, parse_recording_config
+from hil.config.csv_columns import Columns
+from hil.config.recording import parse_recording_config
 from hil.errors import ConfigError, CsvError
 from hil.estimation.unsettled import recordings as estimates
 from hil.estimator.errors import ConvergenceError
