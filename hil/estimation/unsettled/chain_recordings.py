@@ -149,13 +149,17 @@ def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior
 
 
 def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> Array | None:
-    """Return the relative torque error on the last part, with parameters from the rest; None if a part is too short."""
+    """Return the relative torque error on the last part, with parameters from the rest.
+
+    None if a part is too short, or stands still.
+    """
     try:
         first = [_part(each, 0.0, FITTED_SHARE) for each in recordings]
         last = [_part(each, FITTED_SHARE, 1.0) for each in recordings]
-        return torque_error(last, identify_recordings(first, model, prior))
+        error = torque_error(last, identify_recordings(first, model, prior))
     except EstimationError:
         return None
+    return None if np.all(np.isnan(error)) else error
 
 
 def _part(recording: Recording, start: float, end: float) -> Recording:
@@ -220,12 +224,21 @@ def _verdict(
         )
     if foretold is None:
         trust = "with care"
-        sentences.append("The recordings are too short to check the prediction on a part that was not fitted.")
+        sentences.append(
+            "The recordings are too short, or end too long after the motion, to check the prediction on a part that "
+            "was not fitted."
+        )
     else:
-        error = float(foretold.max())
-        sentences.append(_foretold_said(error, arm.joints[int(np.argmax(foretold))].name))
+        error = float(np.nanmax(foretold))
+        sentences.append(_foretold_said(error, arm.joints[int(np.nanargmax(foretold))].name))
         wrong = TORQUE_WRONG if explained else TORQUE_UNEXPLAINED
         trust = "no" if error > wrong else "with care" if error > TORQUE_FORETOLD else trust
+        if error > wrong:
+            unexplained = "" if explained else ", and that part of the motion is unexplained,"
+            sentences.append(
+                f"An error above {100 * wrong:.0f} %{unexplained} gives the verdict no: check which column belongs to "
+                "which joint, their units and signs, whether the load changed, and the description of the arm."
+            )
     if found.from_prior:
         trust = lowered(trust, "with care")
         sentences.append(
