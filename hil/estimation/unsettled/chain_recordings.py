@@ -16,7 +16,7 @@ from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
 from hil.estimation.chain_estimate import vague
 from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
-from hil.estimation.unsettled.chain_slips import refuse_chain_slips, torques_apart
+from hil.estimation.unsettled.chain_slips import late_torque, refuse_chain_slips, torques_apart
 from hil.estimator.chain.column_faults import ColumnCheck
 from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.base_parameters import BaseParameters
@@ -74,7 +74,9 @@ def estimate_chain_recordings(
     )
     check = ColumnCheck.of(recordings, ChainModel(base), prior)
     refuse_chain_slips(check, config.joint_names or (), source)
-    contradictory = () if model.torque_scale else torques_apart(check, [joint.name for joint in arm.joints])
+    names = [joint.name for joint in arm.joints]
+    late = late_torque(check, names, all(each.between == "held" for each in recordings))
+    contradictory = () if model.torque_scale or late else torques_apart(check, names)
     found = _identified(recordings, model, prior, bool(contradictory))
     model = found.model
     foretold = _held_out(recordings, model, prior)
@@ -100,7 +102,7 @@ def estimate_chain_recordings(
         validation=Validation(
             residual_over_floor=tuple(found.residual_over_noise.tolist()) if found.simulated else None
         ),
-        verdict=_verdict(found, arm, foretold, prior, contradictory),
+        verdict=_verdict(found, arm, foretold, prior, contradictory, late),
         warnings=doubted_inertias(arm),
         timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),
         chain=ChainFacts(
@@ -192,8 +194,12 @@ def _verdict(
     foretold: Array | None,
     prior: Prior,
     contradictory: Sequence[str] = (),
+    late: Sequence[str] = (),
 ) -> Verdict:
-    """The verdict, with reasons. contradictory: on torques that contradict each other in the regression."""
+    """The verdict, with reasons.
+
+    contradictory: on torques that contradict each other in the regression. late: on torques logged late.
+    """
     names = found.model.base.names
     weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
     trust: Trust = "yes"
@@ -222,23 +228,9 @@ def _verdict(
             'systematic. If the columns hold commands, set columns.between = "held": maximum likelihood is then far '
             "more accurate."
         )
-    if foretold is None:
-        trust = "with care"
-        sentences.append(
-            "The recordings are too short, or end too long after the motion, to check the prediction on a part that "
-            "was not fitted."
-        )
-    else:
-        error = float(np.nanmax(foretold))
-        sentences.append(_foretold_said(error, arm.joints[int(np.nanargmax(foretold))].name))
-        wrong = TORQUE_WRONG if explained else TORQUE_UNEXPLAINED
-        trust = "no" if error > wrong else "with care" if error > TORQUE_FORETOLD else trust
-        if error > wrong:
-            unexplained = "" if explained else ", and that part of the motion is unexplained,"
-            sentences.append(
-                f"An error above {100 * wrong:.0f} %{unexplained} gives the verdict no: check which column belongs to "
-                "which joint, their units and signs, whether the load changed, and the description of the arm."
-            )
+    at_most, why = _judged_prediction(foretold, arm, explained)
+    trust = lowered(trust, at_most)
+    sentences += why
     if found.from_prior:
         trust = lowered(trust, "with care")
         sentences.append(
@@ -256,6 +248,8 @@ def _verdict(
     differ = contradictions(joints, ratios, {}, "column", found.conflicts)
     trust = lowered(trust, "with care" if differ else "")
     sentences += (*differ, *ratios_said(joints, ratios, "column", differ))
+    trust = lowered(trust, "with care" if late else "")
+    sentences += late
     if contradictory and not found.simulated:
         trust = "no"
         sentences += contradictory
@@ -266,6 +260,25 @@ def _verdict(
             "the remaining distance to the minimum. Record faster motion, so that fewer joints stick."
         )
     return Verdict(trust, weakest, tuple(sentences))
+
+
+def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: bool) -> tuple[str, tuple[str, ...]]:
+    """The trust that the prediction of the last part allows ("" for any), and why."""
+    if foretold is None:
+        return "with care", (
+            "The recordings are too short, or end too long after the motion, to check the prediction on a part that "
+            "was not fitted.",
+        )
+    error, wrong = float(np.nanmax(foretold)), TORQUE_WRONG if explained else TORQUE_UNEXPLAINED
+    said = _foretold_said(error, arm.joints[int(np.nanargmax(foretold))].name)
+    if error <= wrong:
+        return "with care" if error > TORQUE_FORETOLD else "", (said,)
+    unexplained = "" if explained else " together with an unexplained part of the motion"
+    return "no", (
+        said,
+        f"An error above {100 * wrong:.0f} %{unexplained} gives the verdict no: check which column belongs to which "
+        "joint, their units and signs, whether the load changed, and the description of the arm.",
+    )
 
 
 def _foretold_said(error: float, joint: str) -> str:
