@@ -74,7 +74,8 @@ def _estimate_planar(
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
     refuse_slips(read.recordings, ", ".join(map(str, paths)), columns.zero)
     jumps = jump_sentences(whole.recordings, whole.names, whole.stepped)
-    given = Given(names=read.names, jumps=jumps, origin=tuple(columns.zero or ()))
+    repeats = all(one is not mean for one, mean in zip(whole.recordings, read.recordings, strict=True))
+    given = Given(names=read.names, jumps=jumps, origin=tuple(columns.zero or ()), repeats=repeats)
     found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped, given)
     result = _doubted(_named(found, read, gravity), read)
     if config.known is not None:
