@@ -18,7 +18,7 @@ from hil.estimation.physical import physical_of
 from hil.estimation.slips.recorded_jumps import jump_sentences
 from hil.estimation.unsettled.chain_recordings import estimate_chain_recordings
 from hil.estimation.unsettled.estimate import Estimated, Given, estimate_any
-from hil.estimation.unsettled.slips import refuse_slips
+from hil.estimation.unsettled.slips import refuse_slips, refuse_stuck
 from hil.estimator.baselines.zero import turned_zeros
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import ConvergenceError, RecordingError
@@ -72,6 +72,7 @@ def _estimate_planar(
     columns, gravity = read.columns, config.arm.gravity
     zeros = (columns.zeros_unknown or config.model.zeros) and gravity > 0.0
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
+    refuse_stuck(read.recordings, ", ".join(map(str, paths)), columns.segment)
     refuse_slips(read.recordings, ", ".join(map(str, paths)), columns.zero)
     jumps = jump_sentences(whole.recordings, whole.names, whole.stepped)
     repeats = all(one is not mean for one, mean in zip(whole.recordings, read.recordings, strict=True))
