@@ -8,9 +8,10 @@ position_unit = "rad"                             # rad, deg, turns
 zero = [-1.5707963, 0.0]                          # rad added to the column: joint 1 from the horizontal
 """
 
+import re
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, PositiveFloat, model_validator
+from pydantic import Field, PositiveFloat, field_validator, model_validator
 
 from hil.config.table import Angle, Table
 
@@ -80,6 +81,13 @@ class Columns(Table):
         1.0, le=60, description="s, duration of each shooting segment; its initial state is estimated"
     )
     zeros_unknown: bool = Field(True, description="estimate each encoder's zero offset")
+
+    @field_validator("torque_unit", mode="before")
+    @classmethod
+    def _with_space(cls, unit: object) -> object:
+        """Accept "mNm" for "mN m"."""
+        joined = {name.replace(" ", ""): name for name in TORQUE_UNITS}
+        return joined.get(re.sub(r"[ *·.]", "", unit), unit) if isinstance(unit, str) else unit
 
     @property
     def drive(self) -> Literal["torque", "current", "voltage", "pwm"] | None:

@@ -59,7 +59,11 @@ def estimate_chain_recordings(
     """
     refused = [option for option in UNSUPPORTED if getattr(config.model, option)]
     if refused:
-        raise ConfigError(f"model.{refused[0]} = true: only planar arms support this term so far; remove it.")
+        raise ConfigError(
+            f"{shown_path}: model.{refused[0]} = true: only planar arms support this term so far; remove it. Spatial "
+            'arms support friction = "coulomb", "stribeck", "stribeck_load" or "auto", zeros, torque_scale and '
+            "base_tilt."
+        )
     began = time.perf_counter()
     arm = _described(config, recordings[0].joints, shown_path)
     gravity = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, -config.arm.gravity])
@@ -135,7 +139,7 @@ def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescripti
     try:
         return read_arm(Path(config.arm.urdf), names)
     except ArmFileError as error:
-        raise ConfigError(f"arm.urdf: {error}") from error
+        raise ConfigError(f"{shown}: arm.urdf: {error}") from error
 
 
 def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior, contradictory: bool) -> RecordedChain:

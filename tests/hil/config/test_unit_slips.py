@@ -92,6 +92,7 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
 """Keys that do not belong in that file, or are tried in another one."""
 EXCEPTIONS: dict[str, dict[str, str]] = {
     "arm": {
+        "experiment.rate x1000": REFUSED,  # nobody gives a rate in mHz
         "joints.torque_constant /1000": OTHER,
         "joints.position_limit /1000": REFUSED,
         "joints.current_limit /1000": OTHER,
@@ -119,6 +120,7 @@ EXCEPTIONS: dict[str, dict[str, str]] = {
         "stabiliser.damping x57.3": OTHER,
     },
     "columns": {
+        "columns.rate x1000": REFUSED,
         "columns.position_step x1000": OTHER,
     },
     "fake": {
