@@ -12,6 +12,7 @@ from functools import cached_property
 from itertools import combinations, product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.estimator import linalg
 from hil.estimator.arrays import Array
@@ -23,6 +24,8 @@ from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.recordings import CUTOFFS, LAG
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError, RecordingError
+
+Mask = NDArray[np.bool_]
 
 SUSPICIOUS = 0.1  # relative torque residual of the worst joint, below which only contradictory torques are sought
 CLEAR = 0.5  # largest ratio of the worst joint's residuals, with a change and as given
@@ -193,7 +196,7 @@ class ColumnCheck:
         (Y, torque), (normal, given) = self._rows, self._given
         every = {late: self._filtered(self.recordings, late)[1] for late in DELAYS.tolist()}
 
-        def delayed(joints: Array) -> tuple[_Solved, float]:
+        def delayed(joints: Mask) -> tuple[_Solved, float]:
             tried = {
                 late: self._solved(normal.driven_by(Y, np.where(joints[:, None], tau, torque)))
                 for late, tau in every.items()

@@ -39,6 +39,7 @@ DEFAULTS = ShootingOptions()
 ALL = slice(None)
 MOST_WEIGHT = 1e9
 ENOUGH = 1.25  # samples of a short segment at a low rate, relative to FEWEST
+MOST_SHORT = 0.6  # of a segment: short ones that had to be longer are not tried
 
 
 @dataclass(frozen=True)
@@ -323,7 +324,9 @@ def estimate_by_shooting(
     coordinates = coarse.coordinates(dict(zip(model.base_names, start.tolist(), strict=True)))
     if near is None:
         least = ENOUGH * FEWEST * max(each.interval for each in recordings) / length
-        short = posed(min(max(options.short, least), 1.0), options.start_segments, options.coarse_step)
+        short = posed(
+            max(options.short, least if least < MOST_SHORT else 0.0), options.start_segments, options.coarse_step
+        )
         long = posed(1.0, options.start_segments, options.coarse_step)
         x = _from_guesses(short, long, coordinates, model, start, options)
     else:
