@@ -32,7 +32,7 @@ from scipy.optimize import minimize
 from scipy.signal import savgol_filter
 
 from benchmarks.machine import machine
-from hil.config.csv_columns import load_recording_config
+from hil.config.recording import load_recording_config
 from hil.estimation.model_from_config import wanted_model
 from hil.estimator.baselines.idim import fit_inverse_dynamics, uniform
 from hil.estimator.data.recording import Recording

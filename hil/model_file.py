@@ -89,7 +89,9 @@ def read_settled_result(path: Path) -> SettledResult:
 
 
 def read_model(path: str | PathLike[str]) -> ArmModel:
-    """Read the identified arm of a run folder or file; see `hil.load_model`. Raises ResultError."""
+    """Read the identified arm of a run folder or file; see `hil.load_model`. Raises ResultError, TypeError."""
+    if not isinstance(path, str | PathLike):
+        raise TypeError(f"path must be a run folder or a file, not {path!r}.")
     try:
         saved = from_json(_SavedModel, _read(Path(path)))
     except FormError as error:

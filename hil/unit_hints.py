@@ -30,7 +30,7 @@ OTHER_UNITS: dict[str, tuple[tuple[_Unit, ...], ...]] = {
     "V": ((("mV", 1e-3),),),
     "ohm": ((("mOhm", 1e-3),),),
     "Hz": ((("kHz", 1e3), ("mHz", 1e-3)), (("rad/s", 1 / math.tau),)),
-    "samples per second": ((("kHz", 1e3), ("mHz", 1e-3)),),
+    "samples per second": ((("kHz", 1e3),),),
     "N m": ((("mN m", 1e-3),), (("N cm", 1e-2),), (("kgf cm", _KGF_CM),)),
     "N m/A": ((("mN m/A", 1e-3),), (("N cm/A", 1e-2),), (("kgf cm/A", _KGF_CM),)),
     "N m/V": ((("mN m/V", 1e-3),), (("N cm/V", 1e-2),), (("kgf cm/V", _KGF_CM),)),

@@ -9,9 +9,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
+from itertools import combinations, product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.estimator import linalg
 from hil.estimator.arrays import Array
@@ -24,27 +25,37 @@ from hil.estimator.chain.recordings import CUTOFFS, LAG
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError, RecordingError
 
+Mask = NDArray[np.bool_]
+
 SUSPICIOUS = 0.1  # relative torque residual of the worst joint, below which only contradictory torques are sought
 CLEAR = 0.5  # largest ratio of the worst joint's residuals, with a change and as given
 WELL = 0.3  # largest relative residual with a change
 GAIN = 0.03  # decrease of the residual's logarithm, mean of the joints, that makes factors of the torques credible
 AS_WELL = 1.05  # ratio of the residuals up to which fewer reversals are preferred
+EQUALLY_FAR = 4.0  # difference of squared distances from the description that decides between two reversals
 SIGNIFICANT = 3.0  # standard errors
 FACTORS = np.exp(np.linspace(-np.log(6.0), np.log(6.0), 41))  # of a torque, that are tried
 STEPS = 1.0 + 0.08 * np.linspace(-1.0, 1.0, 17)  # by which the best factor is refined
+RIDGE = 1e-12  # added to normal equations of unit diagonal, so that a joint that hardly moves leaves them regular
 SWEEPS = 3  # over the joints
+DELAYS = 0.005 * np.arange(-12, 13)  # s, of the torques, that are tried
+LEAST_LATE = 0.01  # s
+LATE = 0.6  # largest ratio of a joint's residuals, with a delay and as given
+ONE_LATE = 0.3  # decrease of the residuals' logarithms, beyond that by a common delay, that makes one joint's credible
 TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 10.0])  # factors that are tried
 
 
 @dataclass(frozen=True)
 class Reversed:
     """Reversed columns. residuals: relative RMS of the worst joint's torque residual with the change, and as given.
-    impossible: whether friction is negative as given, as if all torques are reversed.
+    impossible: whether friction is negative as given, as if all torques or a first, vertical joint are reversed.
     """
 
     residuals: tuple[float, float]
     signs: Signs
     impossible: bool
+    instead: Signs | None = None
+    """A reversal of as few columns that explains the recordings as well."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +64,26 @@ class WrongTimes:
 
     residuals: tuple[float, float]
     factor: float
+
+
+@dataclass(frozen=True)
+class Swapped:
+    """Columns of two joints, counted from 0, that are exchanged. residuals: as for reversed columns."""
+
+    residuals: tuple[float, float]
+    joints: tuple[int, int]
+    columns: str
+    """"torques", "positions", or "torques and positions"."""
+
+
+@dataclass(frozen=True)
+class Late:
+    """Torque that is logged `seconds` later than it acted, or earlier if negative. residuals: of the joint's torque."""
+
+    residuals: tuple[float, float]
+    joint: int | None
+    """The joint, counted from 0; None if all torques are late, and the residuals are those of the worst joint."""
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -65,6 +96,10 @@ class _Solved:
     @property
     def worst(self) -> float:
         return float(self.relative.max())
+
+    def distance(self, prior: Prior) -> float:
+        """Squared distance of the base parameters from the description, in its standard deviations."""
+        return float(np.sum(np.square((self.value[: prior.value.size] - prior.value) / prior.std)))
 
     @property
     def misfit(self) -> float:
@@ -94,14 +129,22 @@ class ColumnCheck:
 
     @cached_property
     def _given(self) -> tuple["_Normal", _Solved]:
-        normal = self._normal(self.recordings)
-        return normal, normal.solved(np.ones(self.model.joints), self.prior)
+        normal = _Normal.of(*self._rows)
+        return normal, self._solved(normal)
+
+    @cached_property
+    def _rows(self) -> tuple[Array, Array]:
+        return self._filtered(self.recordings, 0.0)
+
+    def _filtered(self, recordings: Sequence[Recording], late: float) -> tuple[Array, Array]:
+        rows = [filtered_torque(each, self.model, self.cutoff, self.delay - late) for each in recordings]
+        return np.concatenate([Y for Y, _ in rows], axis=1), np.concatenate([tau for _, tau in rows], axis=1)
 
     def _normal(self, recordings: Sequence[Recording]) -> "_Normal":
-        rows = [filtered_torque(each, self.model, self.cutoff, self.delay) for each in recordings]
-        return _Normal.of(
-            np.concatenate([Y for Y, _ in rows], axis=1), np.concatenate([tau for _, tau in rows], axis=1)
-        )
+        return _Normal.of(*self._filtered(recordings, 0.0))
+
+    def _solved(self, normal: "_Normal") -> _Solved:
+        return normal.solved(np.ones(self.model.joints), self.prior)
 
     @property
     def suspicious(self) -> bool:
@@ -112,7 +155,7 @@ class ColumnCheck:
         """The reversal that explains the recordings much better than the signs as given."""
         given, impossible = self._given[1], self._dissipates_too_little(self._given[1])
         joints = self.model.joints
-        tried: list[tuple[float, int, Signs]] = []
+        tried: list[tuple[int, float, float, Signs]] = []
         for position in _turned(joints):
             turned = [replace(each, position=each.position * np.array(position)[:, None]) for each in self.recordings]
             normal = self._given[0] if min(position) > 0 else self._normal(turned)
@@ -120,13 +163,60 @@ class ColumnCheck:
                 signs = Signs(torque, position)
                 found = normal.solved(np.array(torque, dtype=float), self.prior)
                 if signs.reversed_columns and not self._dissipates_too_little(found):
-                    tried.append((found.worst, len(signs.reversed_columns), signs))
-        least = min((worst for worst, _, _ in tried), default=np.inf)
-        gained = least < CLEAR * given.worst or (impossible and least < AS_WELL * given.worst)
-        if not (gained and least < WELL):
+                    tried.append((len(signs.reversed_columns), found.distance(self.prior), found.worst, signs))
+        least = min((worst for _, _, worst, _ in tried), default=np.inf)
+        tried = sorted((each for each in tried if each[2] <= AS_WELL * least), key=lambda each: each[:2])
+        likelier = impossible and least < AS_WELL * given.worst and tried[0][1] < given.distance(self.prior)
+        if not ((least < CLEAR * given.worst or likelier) and least < WELL):
             return None
-        worst, _, signs = min((each for each in tried if each[0] <= AS_WELL * least), key=lambda each: each[1])
-        return Reversed((worst, given.worst), signs, impossible)
+        count, far, worst, signs = tried[0]
+        other = [each[3] for each in tried[1:2] if each[0] == count and each[1] < far + EQUALLY_FAR]
+        return Reversed((worst, given.worst), signs, impossible, *other)
+
+    def swapped_columns(self) -> Swapped | None:
+        """The exchange of two joints' columns that explains the recordings much better."""
+        torque, given, tried = self._rows[1], self._given[1].worst, []
+        for pair in combinations(range(self.model.joints), 2):
+            order = [*range(self.model.joints)]
+            order[pair[0]], order[pair[1]] = pair[1], pair[0]
+            columns = self._filtered([replace(each, position=each.position[order]) for each in self.recordings], 0.0)[0]
+            for Y, tau, said in (
+                (self._rows[0], torque[order], "torques"),
+                (columns, torque, "positions"),
+                (columns, torque[order], "torques and positions"),
+            ):
+                found = self._solved(_Normal.of(Y, tau))
+                if not self._dissipates_too_little(found):
+                    tried.append((found.worst, pair, said))
+        worst, pair, said = min(tried, default=(np.inf, (0, 0), ""))
+        return Swapped((worst, given), pair, said) if worst < min(CLEAR * given, WELL) else None
+
+    def late_torque(self) -> Late | None:
+        """The delay of one joint's torque, or of all, that explains the recordings better."""
+        (Y, torque), (normal, given) = self._rows, self._given
+        every = {late: self._filtered(self.recordings, late)[1] for late in DELAYS.tolist()}
+
+        def delayed(joints: Mask) -> tuple[_Solved, float]:
+            tried = {
+                late: self._solved(normal.driven_by(Y, np.where(joints[:, None], tau, torque)))
+                for late, tau in every.items()
+            }
+            late = min(tried, key=lambda each: tried[each].misfit)
+            return tried[late], late
+
+        numbers = np.arange(len(torque))
+        common, all_late = delayed(numbers >= 0)
+        alone = [delayed(numbers == joint) for joint in numbers]
+        joint = min(numbers.tolist(), key=lambda each: alone[each][0].misfit)
+        found, late = alone[joint]
+        if common.misfit - ONE_LATE < found.misfit:
+            worst, late, chosen = int(np.argmax(common.relative / given.relative)), all_late, None
+            residuals = (float(common.relative[worst]), float(given.relative[worst]))
+        else:
+            residuals, chosen = (float(found.relative[joint]), float(given.relative[joint])), joint
+        # Whether a torque is that of a sample or of the interval after it is not always known.
+        is_late = abs(late) > 0.99 * max(LEAST_LATE, *(each.interval for each in self.recordings))
+        return Late(residuals, chosen, late) if is_late and residuals[0] < LATE * residuals[1] else None
 
     def contradictory_torques(self) -> tuple[float, ...] | None:
         """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better.
@@ -169,10 +259,11 @@ class ColumnCheck:
             return np.inf
 
     def _dissipates_too_little(self, found: _Solved) -> bool:
-        """Whether more friction terms are significantly negative than positive."""
+        """Whether more friction terms are significantly negative than positive, or all of one joint are negative."""
         start, joints = self.model.base.count, self.model.joints
-        over = (found.value / found.std)[start : start + 2 * joints]
-        return int(np.sum(over < -SIGNIFICANT)) > int(np.sum(over > SIGNIFICANT))
+        over = (found.value / found.std)[start : start + 2 * joints].reshape(2, joints)
+        negative = over < -SIGNIFICANT
+        return bool(np.any(np.all(negative, axis=0))) or int(np.sum(negative)) > int(np.sum(over > SIGNIFICANT))
 
 
 @dataclass(frozen=True)
@@ -192,8 +283,11 @@ class _Normal:
         """Form the equations of a regressor (joints, rows, names) and torques (joints, rows)."""
         rows = torque.shape[1]
         squares = np.stack([Y.T @ Y for Y in columns]) / rows
-        products = np.stack([Y.T @ tau for Y, tau in zip(columns, torque, strict=True)]) / rows
-        return cls(squares, products, np.maximum(np.mean(torque**2, axis=1), 1e-18), rows)
+        return cls(squares, *_driven(columns, torque), rows)
+
+    def driven_by(self, columns: Array, torque: Array) -> "_Normal":
+        """The equations with other torques; `columns` are those of `of`."""
+        return _Normal(self.squares, *_driven(columns, torque), self.rows)
 
     def solved(self, factors: Array, prior: Prior) -> _Solved:
         """Solve with each joint's torque multiplied by its factor (joints,)."""
@@ -206,11 +300,18 @@ class _Normal:
             square[range(count), range(count)] += prior.std**-2
             product_[:count] += prior.value / prior.std**2
             norm = np.sqrt(np.maximum(np.diag(square), 1e-300))
-            inverse = linalg.pinv(square / np.outer(norm, norm), hermitian=True)
+            # An inverse is 30 times faster than a pseudo-inverse, and a thousand combinations are tried.
+            inverse = linalg.inv(square / np.outer(norm, norm) + RIDGE * np.eye(norm.size))
             value = inverse @ (product_ / norm) / norm
             explained = 2.0 * products @ value - np.einsum("i,jik,k->j", value, self.squares, value)
             left = np.maximum(level - explained, 1e-8 * level)
         return _Solved(value, np.sqrt(np.maximum(np.diag(inverse), 1e-300)) / norm, np.sqrt(left / level))
+
+
+def _driven(columns: Array, torque: Array) -> tuple[Array, Array]:
+    """Return `products` and `torque` of normal equations."""
+    products = np.stack([Y.T @ tau for Y, tau in zip(columns, torque, strict=True)]) / torque.shape[1]
+    return products, np.maximum(np.mean(torque**2, axis=1), 1e-18)
 
 
 def _turned(joints: int) -> Iterator[tuple[int, ...]]:

@@ -28,6 +28,7 @@ from hil.estimator.models.conflicts import Conflict
 
 CUTOFFS = (8.0, 4.0, 2.0)  # Hz, of the regression: the first that the recordings' rate and length allow
 LAG = 1e-3  # s: typical lag of a current loop, assumed by the regression
+MOVES = 0.05  # mean size of the smoothed direction of motion, below which a joint stands still
 VELOCITY_SAMPLES = 9  # at the beginning, from which the initial velocity is taken
 
 
@@ -163,12 +164,27 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
 
 def torque_error(recordings: Sequence[Recording], found: RecordedChain) -> Array:
     """Return the RMS error of the torque that the parameters `found` predict for `recordings`, relative to the torque's
-    RMS (joints,).
+    RMS (joints,); NaN for joints that stand still.
+
+    At standstill static friction balances any torque up to its level, so an error below that level is none.
     """
-    value = np.array([found.parameters[name] for name in found.model.linear_names])
     scale = [found.parameters.get(f"torque_scale_{joint}", 1.0) for joint in range(1, found.model.joints + 1)]
     true = [replace(each, torque=each.torque * np.array(scale)[:, None]) for each in recordings]
-    return _torque_residual(true, found.model, value, found.cutoff)
+    Y, torque = _filtered(true, found.model, found.cutoff)
+    error = torque - Y @ np.array([found.parameters[name] for name in found.model.linear_names])
+    joints, viscous = range(found.model.joints), found.model.base.count
+    moves = np.empty(found.model.joints)
+    for joint in joints:
+        velocity, slides = Y[joint, :, viscous + joint], Y[joint, :, viscous + len(joints) + joint]
+        coulomb, rise, fading = (
+            found.parameters.get(f"{term}_{joint + 1}", absent)
+            for term, absent in (("coulomb", 0.0), ("stribeck_rise", 0.0), ("stribeck_velocity", 1.0))
+        )
+        risen = coulomb * rise * np.exp(-np.square(velocity / fading))
+        undetermined = np.maximum(coulomb + risen, 0.0) * np.maximum(1.0 - np.abs(slides), 0.0)
+        error[joint] = np.maximum(np.abs(error[joint] - risen * slides) - undetermined, 0.0)
+        moves[joint] = np.mean(np.abs(slides))
+    return np.where(moves < MOVES, np.nan, _relative(error, torque))
 
 
 def _regression(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> tuple[Array, Array, float]:
@@ -197,10 +213,17 @@ def _repeated(recordings: Sequence[Recording], model: ChainModel, value: Array, 
 
 
 def _torque_residual(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> Array:
+    Y, torque = _filtered(recordings, model, cutoff)
+    return _relative(torque - Y @ value, torque)
+
+
+def _filtered(recordings: Sequence[Recording], model: ChainModel, cutoff: float) -> tuple[Array, Array]:
     rows = [filtered_torque(recording, model, cutoff, LAG) for recording in recordings]
-    torque = np.concatenate([tau for _, tau in rows], axis=1)
-    left = torque - np.concatenate([Y for Y, _ in rows], axis=1) @ value
-    return np.asarray(np.sqrt(np.mean(left**2, axis=1) / np.maximum(np.mean(torque**2, axis=1), 1e-12)))
+    return np.concatenate([Y for Y, _ in rows], axis=1), np.concatenate([tau for _, tau in rows], axis=1)
+
+
+def _relative(error: Array, torque: Array) -> Array:
+    return np.asarray(np.sqrt(np.mean(error**2, axis=1) / np.maximum(np.mean(torque**2, axis=1), 1e-12)))
 
 
 def _beginning(piece: MotionPiece) -> PeriodicMotion:

@@ -22,7 +22,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
 from hil.estimator.data.recording import Recording
-from hil.estimator.data.segments import Grid, RecordingSegment, cut, grid_torque, grid_torque_slopes
+from hil.estimator.data.segments import FEWEST, Grid, RecordingSegment, cut, grid_torque, grid_torque_slopes
 from hil.estimator.errors import ConvergenceError
 from hil.estimator.fit.covariance import by_parameters
 from hil.estimator.fit.reparametrisation import CoordinatePrior, Coordinates, Sizes, scales_of
@@ -38,6 +38,8 @@ from hil.estimator.simulation.presliding_sensitivity import sensitive
 DEFAULTS = ShootingOptions()
 ALL = slice(None)
 MOST_WEIGHT = 1e9
+ENOUGH = 1.25  # samples of a short segment at a low rate, relative to FEWEST
+MOST_SHORT = 0.6  # of a segment: short ones that had to be longer are not tried
 
 
 @dataclass(frozen=True)
@@ -321,7 +323,10 @@ def estimate_by_shooting(
     coarse = posed(1.0, None, options.coarse_step)
     coordinates = coarse.coordinates(dict(zip(model.base_names, start.tolist(), strict=True)))
     if near is None:
-        short = posed(options.short, options.start_segments, options.coarse_step)
+        least = ENOUGH * FEWEST * max(each.interval for each in recordings) / length
+        short = posed(
+            max(options.short, least if least < MOST_SHORT else 0.0), options.start_segments, options.coarse_step
+        )
         long = posed(1.0, options.start_segments, options.coarse_step)
         x = _from_guesses(short, long, coordinates, model, start, options)
     else:

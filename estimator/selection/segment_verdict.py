@@ -95,6 +95,7 @@ def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, 
         *((f"Do not use these numbers: {evidence.reason or 'see the warnings'}.",) if evidence.faulty else ()),
         _left(estimate, evidence, trust),
         _predicted(held_out, estimate.segment_length),
+        *_refused(left, held_out, evidence),
         *conflict_sentences(evidence.conflicts, explained),
         *evidence.doubts,
         *evidence.notes,
@@ -112,6 +113,18 @@ def _trust(left: float, held_out: Array | None, weakest: float, evidence: Segmen
     doubtful = weakest > WEAK or evidence.doubtful or bool(evidence.doubts)
     limit = EXPLAINED if held_out is None else MUCH_LEFT
     return "with care" if doubtful or left > limit or (held_out is not None and worst > GOOD_PREDICTION) else "yes"
+
+
+def _refused(left: float, held_out: Array | None, evidence: SegmentEvidence) -> tuple[str, ...]:
+    """Name the rule by which the verdict is no, and a remedy unless the recordings are already said to be at fault."""
+    if evidence.faulty:
+        return ()
+    remedy = "" if evidence.spoiled else ": check the columns, their units, and whether anything touched the arm"
+    if held_out is None:
+        rule = f"Without that check, a residual above {MUCH_LEFT:g} times the noise gives the verdict no"
+        return (f"{rule}{remedy}.",) if left > MUCH_LEFT else ()
+    wrong = not float(held_out.max()) <= USABLE_PREDICTION
+    return (f"An error above {percent(USABLE_PREDICTION)} gives the verdict no{remedy}.",) if wrong else ()
 
 
 def _left(estimate: ShootingEstimate, evidence: SegmentEvidence, trust: Trust) -> str:

@@ -58,10 +58,12 @@ def estimate(
         ConfigError: `config` is wrong.
         RecordingCutShort: the run holds no settled period; `all_samples` does not need one.
         hil.estimator.errors.EstimationError: the recording does not determine the parameters.
+        TypeError: an argument has the wrong type.
         ValueError: run folders and other recordings are mixed, or there are several run folders.
     """
     tell = forgiving(on_progress)
     paths = _paths(recording)
+    _check_types(config, out, all_samples)
     if are_recordings(paths):
         tell(Progress("estimation", "Estimating by multiple shooting"))
         return _from_files(paths, None if config is None else Path(config), out)
@@ -89,6 +91,14 @@ def _paths(recording: Any) -> list[Path]:
         return [Path(each) for each in ([recording] if isinstance(recording, str | PathLike) else recording)]
     except TypeError:
         raise TypeError(f"recording must be a run folder, a Run, or recordings, not {recording!r}.") from None
+
+
+def _check_types(config: Any, out: Any, all_samples: Any) -> None:
+    for name, value in (("config", config), ("out", out)):
+        if not isinstance(value, str | PathLike | None):
+            raise TypeError(f"{name} must be a path, not {value!r}.")
+    if not isinstance(all_samples, bool):
+        raise TypeError(f"all_samples must be True or False, not {all_samples!r}.")
 
 
 def are_recordings(paths: Sequence[Path]) -> bool:

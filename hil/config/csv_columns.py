@@ -1,31 +1,19 @@
-"""Description of a recording made elsewhere: its columns, their units, and some properties of the arm.
+"""The columns of a recording made elsewhere, and their units: `[columns]` in the TOML file.
 
-The TOML file of an experiment can be used, or a shorter one; tables that only the bus needs are ignored.
-
-    [arm]
-    gravity = 9.81
-    [model]
-    friction = "stribeck"
-    drive = "delay"
-    [columns]
-    time = "time"                                     # in seconds unless time_unit is given
-    position = ["pos_meas1", "pos_meas2"]             # one per joint
-    torque = ["tau_meas1", "tau_meas2"]               # or current, which needs torque_constant
-    position_unit = "rad"                             # rad, deg, turns
-    zero = [-1.5707963, 0.0]                          # rad added to the column: joint 1 from the horizontal
+[columns]
+time = "time"                                     # in seconds unless time_unit is given
+position = ["pos_meas1", "pos_meas2"]             # one per joint
+torque = ["tau_meas1", "tau_meas2"]               # or current, which needs torque_constant
+position_unit = "rad"                             # rad, deg, turns
+zero = [-1.5707963, 0.0]                          # rad added to the column: joint 1 from the horizontal
 """
 
-from pathlib import Path
+import re
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, ValidationError, model_validator
+from pydantic import Field, PositiveFloat, field_validator, model_validator
 
-from hil.config.experiment import ModelConfig
-from hil.config.known_quantities import KnownConfig
-from hil.config.table import Angle, Turned
-from hil.errors import ConfigError
-from hil.toml_errors import describe
-from hil.toml_file import TomlFileError, parse_toml, read_toml_text
+from hil.config.table import Angle, Table
 
 Gain = Annotated[float, Field(gt=0, le=100)]
 Column = Annotated[str, Field(min_length=1)]
@@ -46,11 +34,7 @@ VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3}
 PWM_UNITS = {"1": 1.0, "%": 1e-2}
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class Columns(_Table):
+class Columns(Table):
     """`[columns]`: the meaning and unit of each column. Anything omitted is taken from the column headers."""
 
     time: Column | None = None
@@ -97,6 +81,13 @@ class Columns(_Table):
         1.0, le=60, description="s, duration of each shooting segment; its initial state is estimated"
     )
     zeros_unknown: bool = Field(True, description="estimate each encoder's zero offset")
+
+    @field_validator("torque_unit", mode="before")
+    @classmethod
+    def _with_space(cls, unit: object) -> object:
+        """Accept "mNm" for "mN m"."""
+        joined = {name.replace(" ", ""): name for name in TORQUE_UNITS}
+        return joined.get(re.sub(r"[ *·.]", "", unit), unit) if isinstance(unit, str) else unit
 
     @property
     def drive(self) -> Literal["torque", "current", "voltage", "pwm"] | None:
@@ -161,80 +152,3 @@ class Columns(_Table):
             if count is not None and size != count:
                 entries = "1 entry" if size == 1 else f"{size} entries"
                 raise ValueError(f"columns.{key} has {entries}; position has {count}, one per joint")
-
-
-class JointName(BaseModel):
-    """`[[joints]]`; only the name is used here, for arms with a URDF."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
-
-    name: str | None = None
-
-
-class ArmFacts(BaseModel):
-    """`[arm]`; only gravity and geometry are used here."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", strict=True, allow_inf_nan=False)
-
-    gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
-    urdf: str | None = Field(None, description="URDF or MJCF of a spatial arm, relative to the TOML file")
-    base: list[Turned] = Field(
-        [0.0, 0.0, 0.0], min_length=3, max_length=3, description="with urdf: roll, pitch and yaw of the base, rad"
-    )
-
-
-class RecordingConfig(BaseModel):
-    """The tables of an arm's TOML file that apply to a recording made elsewhere; all of them are optional."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore", strict=True)
-
-    columns: Columns = Columns()
-    arm: ArmFacts = ArmFacts()
-    model: ModelConfig = ModelConfig(friction="auto", drive="delay")
-    known: KnownConfig | None = None
-    joints: list[JointName] = []
-
-    @property
-    def joint_names(self) -> tuple[str, ...] | None:
-        """Names of the joints, from the base outwards; None unless every joint has a name."""
-        names = tuple(joint.name for joint in self.joints if joint.name is not None)
-        return names if names and len(names) == len(self.joints) else None
-
-    @model_validator(mode="after")
-    def _planar_without_urdf(self) -> Self:
-        count = len(self.columns.position or ())
-        if count > PLANAR and self.arm.urdf is None:
-            raise ValueError(
-                f"columns.position: {count} joints need arm.urdf, which gives the geometry, and a [[joints]] table "
-                "with a name for each joint; without a URDF, an arm has one or two joints"
-            )
-        return self
-
-
-def load_recording_config(path: Path) -> RecordingConfig:
-    """Read and check the file; raises ConfigError."""
-    try:
-        text = read_toml_text(path)
-    except TomlFileError as error:
-        raise ConfigError(str(error)) from error
-    return parse_recording_config(text, path)
-
-
-def parse_recording_config(text: str, path: Path) -> RecordingConfig:
-    """Check `text`, the contents of `path`; raises ConfigError."""
-    try:
-        values = parse_toml(text, path)
-    except TomlFileError as error:
-        raise ConfigError(str(error)) from error
-    try:
-        return RecordingConfig.model_validate(_with_urdf_beside(values, path))
-    except ValidationError as error:
-        raise ConfigError(describe(error, path, RecordingConfig)) from error
-
-
-def _with_urdf_beside(values: dict[str, object], path: Path) -> dict[str, object]:
-    """Return the tables with a relative arm.urdf resolved relative to the TOML file's folder."""
-    arm = values.get("arm")
-    if isinstance(arm, dict) and isinstance(arm.get("urdf"), str):
-        return {**values, "arm": {**arm, "urdf": str(path.parent / arm["urdf"])}}
-    return values

@@ -25,6 +25,7 @@ from hil import fakes
 from hil.config.bundled import bundled_configs, find_config, meant
 from hil.config.chain import MOST_JOINTS, chain_slips, describes_planar
 from hil.config.clearance import ClearanceConfig
+from hil.config.csv_columns import Columns
 from hil.config.experiment import ExperimentConfig, ModelConfig, PathConfig
 from hil.config.fake_url import FAKE_URL, url_from
 from hil.config.joint import JointConfig
@@ -196,7 +197,7 @@ class Config(Table):
     stabiliser: StabiliserConfig | None = None
     clearance: ClearanceConfig = ClearanceConfig()
     known: KnownConfig | None = None
-    columns: dict[str, Any] | None = Field(None, description="for CSV files; checked by hil.config.csv_columns")
+    columns: Columns | None = Field(None, description="of recordings made with other tools; hil.config.csv_columns")
     fake: FakeArm | None = None
 
     @model_validator(mode="before")

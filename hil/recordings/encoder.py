@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 Values = NDArray[np.float64]
 
-FEWEST_LEVELS = 5
+FEWEST = 5  # readings
 MOST_OFF = 0.12  # of a step: largest distance of a reading from a whole step, for values rounded in the file
 MOST_SHARE = 0.7  # of the readings: with a larger share of distinct values, no steps are recognised
 
@@ -13,14 +13,14 @@ MOST_SHARE = 0.7  # of the readings: with a larger share of distinct values, no 
 def encoder_step(position: Values) -> float | None:
     """Largest step that divides all differences between readings (samples,), in their unit; None if there is none."""
     finite = position[np.isfinite(position)]
-    if finite.size < FEWEST_LEVELS:
+    if finite.size < FEWEST:
         return None
     levels = np.unique(finite)
     apart = np.diff(levels)
     resolution = 1e-9 * max(1.0, float(np.abs(levels).max()))
     levels = levels[np.concatenate(([True], apart > resolution))]
     apart = np.diff(levels)
-    if levels.size < FEWEST_LEVELS or levels.size > MOST_SHARE * finite.size:
+    if levels.size < 2 or levels.size > MOST_SHARE * finite.size:
         return None
     for guess in (float(np.median(apart)), float(np.min(apart))):
         step = _refined(levels - levels[0], guess)

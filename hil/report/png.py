@@ -9,6 +9,8 @@ import numpy as np
 from hil.drawing import new_figure
 from hil.report.chart import Chart, Figure, Matrix, Series
 
+_LABEL = 0.24  # in, height of a row of a matrix with a legible label
+
 
 def save_png(figure: Figure, path: Path) -> None:
     """Save one figure. Raises MissingExtra if matplotlib is not installed, and OSError if writing fails."""
@@ -17,8 +19,8 @@ def save_png(figure: Figure, path: Path) -> None:
 
 def draw_figures(figures: Sequence[Figure], dpi: int = 90) -> Any:
     """Draw the figures one below the other in a matplotlib figure. Raises MissingExtra."""
-    heights = [8.2 if isinstance(figure, Matrix) else 3.6 for figure in figures]
-    canvas = new_figure(8.8, sum(heights), dpi)
+    heights = [max(8.2, _LABEL * len(figure.labels)) if isinstance(figure, Matrix) else 3.6 for figure in figures]
+    canvas = new_figure(max(8.8, *heights), sum(heights), dpi)
     rows = canvas.subplots(len(figures), 1, squeeze=False, height_ratios=heights)
     for axes, figure in zip(rows[:, 0], figures, strict=True):
         axes.set_title(figure.title, fontsize=11)
@@ -37,7 +39,10 @@ def _draw_chart(axes: Any, chart: Chart) -> None:
     axes.set_yscale("log" if chart.log_y else "linear")
     axes.grid(color="#e3e6ea")
     if any(series.name for series in chart.series):  # beside the axes, so that the legend hides no curve
-        axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        legend = axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        for handle in legend.legend_handles:
+            if hasattr(handle, "set_markersize"):
+                handle.set_markersize(7)  # dots of the curves' size would be invisible
 
 
 def _draw_series(axes: Any, series: Series) -> None:

@@ -11,7 +11,7 @@ from hil.report.chart import BLUE, GREEN, ORANGE, Chart, Figure, Series, thin
 from hil.report.page import FILE_NAME, figures_in, render, write_page
 from hil.report.section import Folded, Picture, Section, Table
 from hil.report.sections.correlation import correlation_of
-from hil.report.sections.friction import friction_curve, friction_interval
+from hil.report.sections.friction import friction_curve, friction_interval, model_curve
 from hil.report.sections.parameters import parameters_of
 from hil.report.sections.verdict import TITLES
 from hil.report.words import percent
@@ -109,9 +109,9 @@ def _friction(shown: _Shown) -> Section:
         at = facts.velocity_limit * np.linspace(-1, 1, _CURVE) ** 3
         curve = friction_curve(shown.model, at)[:, joint]
         low, high = friction_interval(shown.model, shown.result.covariance, at, joint)
-        series = (Series("95 % interval", at, high, BLUE, "area", low), Series("model", at, curve, BLUE))
+        series, said = model_curve(at, curve, low, high)
         chart = Chart(f"friction_{joint + 1}", f"Friction of {facts.name}", "speed [rad/s]", "friction [N m]", series)
-        pictures.append(Picture(chart, f"{facts.name}: friction versus speed, without the constant offset."))
+        pictures.append(Picture(chart, f"{facts.name}: friction versus speed, without the constant offset.{said}"))
     return Section("friction", "Friction", pictures=tuple(pictures))
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hil.config.csv_columns import load_recording_config
+from hil.config.recording import load_recording_config
 from hil.config.schema import load_config
 from hil.errors import ConfigError
 from hil.fakes.description import DescriptionError, load_fake

@@ -13,12 +13,14 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.selection.verdict import MUCH_LEFT
 
+CHANGES = ("step", "linear", "decay")  # courses of defects within a recording
+
 
 @dataclass(frozen=True)
 class Fitted:
     """Fits of recordings. names: names of the recordings. predicted: simulated positions of each (joints, samples)
     [rad]. plain: estimate of a model without terms that could imitate a defect. estimate: estimate of the chosen model.
-    gravity: gravity in the arm's plane [m/s^2].
+    gravity: gravity in the arm's plane [m/s^2]. repeats: whether each recording is the mean of periods that are alike.
     """
 
     recordings: Sequence[Recording]
@@ -27,6 +29,7 @@ class Fitted:
     plain: ShootingEstimate
     estimate: ShootingEstimate
     gravity: float
+    repeats: bool = False
 
 
 def causes(fitted: Fitted) -> tuple[str, ...]:
@@ -35,6 +38,8 @@ def causes(fitted: Fitted) -> tuple[str, ...]:
     """
     recordings, names, estimate = fitted.recordings, fitted.names, fitted.estimate
     defect = likely_defect(recordings, fitted.plain, estimate, fitted.gravity > 0.0)
+    if fitted.repeats and defect is not None and defect.hypothesis.course.kind in CHANGES:
+        defect = None  # what changes while the arm moves makes no two periods alike
     said = () if defect is None else (defect_said(defect, names),)
     if defect is not None and is_certain(defect) and not is_other_arm(defect):
         return said

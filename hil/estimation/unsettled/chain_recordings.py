@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.chain import doubted_inertias
-from hil.config.csv_columns import RecordingConfig
+from hil.config.recording import RecordingConfig
 from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
 from hil.estimation.chain_estimate import vague
 from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
-from hil.estimation.unsettled.chain_slips import refuse_chain_slips, torques_apart
+from hil.estimation.unsettled.chain_slips import late_torque, refuse_chain_slips, torques_apart
 from hil.estimator.chain.column_faults import ColumnCheck
 from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.base_parameters import BaseParameters
@@ -59,7 +59,11 @@ def estimate_chain_recordings(
     """
     refused = [option for option in UNSUPPORTED if getattr(config.model, option)]
     if refused:
-        raise ConfigError(f"model.{refused[0]} = true: only planar arms support this term so far; remove it.")
+        raise ConfigError(
+            f"{shown_path}: model.{refused[0]} = true: only planar arms support this term so far; remove it. Spatial "
+            'arms support friction = "coulomb", "stribeck", "stribeck_load" or "auto", zeros, torque_scale and '
+            "base_tilt."
+        )
     began = time.perf_counter()
     arm = _described(config, recordings[0].joints, shown_path)
     gravity = rotation_of(*config.arm.base).T @ np.array([0.0, 0.0, -config.arm.gravity])
@@ -74,7 +78,9 @@ def estimate_chain_recordings(
     )
     check = ColumnCheck.of(recordings, ChainModel(base), prior)
     refuse_chain_slips(check, config.joint_names or (), source)
-    contradictory = () if model.torque_scale else torques_apart(check, [joint.name for joint in arm.joints])
+    names = [joint.name for joint in arm.joints]
+    late = late_torque(check, names, all(each.between == "held" for each in recordings))
+    contradictory = () if model.torque_scale or late else torques_apart(check, names)
     found = _identified(recordings, model, prior, bool(contradictory))
     model = found.model
     foretold = _held_out(recordings, model, prior)
@@ -100,7 +106,7 @@ def estimate_chain_recordings(
         validation=Validation(
             residual_over_floor=tuple(found.residual_over_noise.tolist()) if found.simulated else None
         ),
-        verdict=_verdict(found, arm, foretold, prior, contradictory),
+        verdict=_verdict(found, arm, foretold, prior, contradictory, late),
         warnings=doubted_inertias(arm),
         timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),
         chain=ChainFacts(
@@ -133,7 +139,7 @@ def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescripti
     try:
         return read_arm(Path(config.arm.urdf), names)
     except ArmFileError as error:
-        raise ConfigError(f"arm.urdf: {error}") from error
+        raise ConfigError(f"{shown}: arm.urdf: {error}") from error
 
 
 def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior, contradictory: bool) -> RecordedChain:
@@ -149,13 +155,17 @@ def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior
 
 
 def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> Array | None:
-    """Return the relative torque error on the last part, with parameters from the rest; None if a part is too short."""
+    """Return the relative torque error on the last part, with parameters from the rest.
+
+    None if a part is too short, or stands still.
+    """
     try:
         first = [_part(each, 0.0, FITTED_SHARE) for each in recordings]
         last = [_part(each, FITTED_SHARE, 1.0) for each in recordings]
-        return torque_error(last, identify_recordings(first, model, prior))
+        error = torque_error(last, identify_recordings(first, model, prior))
     except EstimationError:
         return None
+    return None if np.all(np.isnan(error)) else error
 
 
 def _part(recording: Recording, start: float, end: float) -> Recording:
@@ -188,8 +198,12 @@ def _verdict(
     foretold: Array | None,
     prior: Prior,
     contradictory: Sequence[str] = (),
+    late: Sequence[str] = (),
 ) -> Verdict:
-    """The verdict, with reasons. contradictory: on torques that contradict each other in the regression."""
+    """The verdict, with reasons.
+
+    contradictory: on torques that contradict each other in the regression. late: on torques logged late.
+    """
     names = found.model.base.names
     weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
     trust: Trust = "yes"
@@ -218,14 +232,9 @@ def _verdict(
             'systematic. If the columns hold commands, set columns.between = "held": maximum likelihood is then far '
             "more accurate."
         )
-    if foretold is None:
-        trust = "with care"
-        sentences.append("The recordings are too short to check the prediction on a part that was not fitted.")
-    else:
-        error = float(foretold.max())
-        sentences.append(_foretold_said(error, arm.joints[int(np.argmax(foretold))].name))
-        wrong = TORQUE_WRONG if explained else TORQUE_UNEXPLAINED
-        trust = "no" if error > wrong else "with care" if error > TORQUE_FORETOLD else trust
+    at_most, why = _judged_prediction(foretold, arm, explained)
+    trust = lowered(trust, at_most)
+    sentences += why
     if found.from_prior:
         trust = lowered(trust, "with care")
         sentences.append(
@@ -243,6 +252,8 @@ def _verdict(
     differ = contradictions(joints, ratios, {}, "column", found.conflicts)
     trust = lowered(trust, "with care" if differ else "")
     sentences += (*differ, *ratios_said(joints, ratios, "column", differ))
+    trust = lowered(trust, "with care" if late else "")
+    sentences += late
     if contradictory and not found.simulated:
         trust = "no"
         sentences += contradictory
@@ -253,6 +264,25 @@ def _verdict(
             "the remaining distance to the minimum. Record faster motion, so that fewer joints stick."
         )
     return Verdict(trust, weakest, tuple(sentences))
+
+
+def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: bool) -> tuple[str, tuple[str, ...]]:
+    """The trust that the prediction of the last part allows ("" for any), and why."""
+    if foretold is None:
+        return "with care", (
+            "The recordings are too short, or end too long after the motion, to check the prediction on a part that "
+            "was not fitted.",
+        )
+    error, wrong = float(np.nanmax(foretold)), TORQUE_WRONG if explained else TORQUE_UNEXPLAINED
+    said = _foretold_said(error, arm.joints[int(np.nanargmax(foretold))].name)
+    if error <= wrong:
+        return "with care" if error > TORQUE_FORETOLD else "", (said,)
+    unexplained = "" if explained else " together with an unexplained part of the motion"
+    return "no", (
+        said,
+        f"An error above {100 * wrong:.0f} %{unexplained} gives the verdict no: check which column belongs to which "
+        "joint, their units and signs, whether the load changed, and the description of the arm.",
+    )
 
 
 def _foretold_said(error: float, joint: str) -> str:

@@ -12,15 +12,22 @@ ROUGHLY = 0.05  # assumed relative standard error of a ratio of torques that a r
 
 
 def refuse_chain_slips(check: ColumnCheck | None, joints: Sequence[str], source: str) -> None:
-    """Raise CsvError if signs are reversed or the times have a wrong scale. joints: their names."""
+    """Raise CsvError if signs are reversed, columns swapped or the times scaled. joints: their names."""
     if check is None or not check.suspicious:
         return
-    signs = check.reversed_columns()
+    signs, swapped = check.reversed_columns(), check.swapped_columns()
+    if swapped is not None and (signs is None or swapped.residuals[0] < signs.residuals[0]):
+        names = [joints[joint] if joints else f"joint {joint + 1}" for joint in swapped.joints]
+        raise CsvError(
+            f"{source}: the {swapped.columns} of {names[0]} and {names[1]} seem to be swapped: with them exchanged, "
+            f"{unexplained(*swapped.residuals)}. Exchange them in the file, or in [columns] of --config ARM.toml."
+        )
     if signs is not None:
         gain = "friction is positive instead of negative" if signs.impossible else unexplained(*signs.residuals)
+        instead = f" (or, just as likely, {signs.instead.said(joints)})" if signs.instead else ""
         raise CsvError(
-            f"{source}: {reversal_said(signs.signs, joints)}, {gain}. Change that in the file, or correct the axis in "
-            "the description of the arm; `hil pose` shows each joint's direction."
+            f"{source}: {reversal_said(signs.signs, joints)}, {gain}{instead}. Change that in the file, or correct the "
+            "axis in the description of the arm; `hil pose` shows each joint's direction."
         )
     times = check.wrong_times()
     if times is not None:
@@ -28,6 +35,19 @@ def refuse_chain_slips(check: ColumnCheck | None, joints: Sequence[str], source:
             f"{source}: the times seem to be about {times.factor:.2g} times the true ones: with times divided by this "
             f"factor, {unexplained(*times.residuals)}. Check the unit of time and the sample rate, and arm.gravity."
         )
+
+
+def late_torque(check: ColumnCheck | None, joints: Sequence[str], fitted: bool) -> tuple[str, ...]:
+    """A sentence on a torque that is logged late or early. fitted: whether the fit contains a delay common to all."""
+    late = None if check is None else check.late_torque()
+    if late is None or (late.joint is None and fitted):
+        return ()
+    whose = "All torques seem" if late.joint is None else f"The torque of {joints[late.joint]} seems"
+    direction = "late" if late.seconds > 0.0 else "early"
+    return (
+        f"{whose} to be logged about {1e3 * abs(late.seconds):.0f} ms too {direction}: shifted by that time, "
+        f"{unexplained(*late.residuals)}. Shift the column in the file; a filter that delays it has the same effect.",
+    )
 
 
 def torques_apart(check: ColumnCheck | None, joints: Sequence[str]) -> tuple[str, ...]:

@@ -65,7 +65,7 @@ class Given:
     torque_scale_std: relative standard deviation of the ratio of the torque constants, by parameter. zeros: whether a
     configuration defines the encoder zeros. names: names of the recordings. jumps: a sentence for each joint of a
     recording whose position jumped. torque_source: where the torques come from. origin: the angles [rad] at which the
-    position columns are 0, by default 0.
+    position columns are 0, by default 0. repeats: whether each recording is the mean of periods that are alike.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
@@ -74,6 +74,7 @@ class Given:
     jumps: tuple[str, ...] = ()
     torque_source: Source = "column"
     origin: tuple[float, ...] = ()
+    repeats: bool = False
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
@@ -124,7 +125,7 @@ def estimate_any(
     estimate = considered(recordings, estimate)
     predicted = predicted_positions(recordings, estimate)
     plain = estimate if choice is None else choice.plain
-    fitted = Fitted(recordings, given.names, predicted, plain, estimate, gravity)
+    fitted = Fitted(recordings, given.names, predicted, plain, estimate, gravity, given.repeats)
     why = () if given.jumps else causes(fitted)
     found = doubts_of(recordings, estimate, are_known(fitted, why), gravity > 0.0)
     verdict = _judged(fitted, given, why, held_out, found)

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.arm_model import JointFacts
-from hil.config.csv_columns import Columns, RecordingConfig, load_recording_config
+from hil.config.csv_columns import Columns
+from hil.config.recording import RecordingConfig, load_recording_config
 from hil.errors import ConfigError, CsvError
 from hil.estimation.physical import physical_of
 from hil.estimation.slips.recorded_jumps import jump_sentences
 from hil.estimation.unsettled.chain_recordings import estimate_chain_recordings
 from hil.estimation.unsettled.estimate import Estimated, Given, estimate_any
-from hil.estimation.unsettled.slips import refuse_slips
+from hil.estimation.unsettled.slips import refuse_slips, refuse_stuck
 from hil.estimator.baselines.zero import turned_zeros
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import ConvergenceError, RecordingError
@@ -71,9 +72,11 @@ def _estimate_planar(
     columns, gravity = read.columns, config.arm.gravity
     zeros = (columns.zeros_unknown or config.model.zeros) and gravity > 0.0
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
+    refuse_stuck(read.recordings, ", ".join(map(str, paths)), columns.segment)
     refuse_slips(read.recordings, ", ".join(map(str, paths)), columns.zero)
     jumps = jump_sentences(whole.recordings, whole.names, whole.stepped)
-    given = Given(names=read.names, jumps=jumps, origin=tuple(columns.zero or ()))
+    repeats = all(one is not mean for one, mean in zip(whole.recordings, read.recordings, strict=True))
+    given = Given(names=read.names, jumps=jumps, origin=tuple(columns.zero or ()), repeats=repeats)
     found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped, given)
     result = _doubted(_named(found, read, gravity), read)
     if config.known is not None:

@@ -3,6 +3,8 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from hil.errors import CsvError
 from hil.estimator.baselines.signs import (
     Signs,
@@ -17,6 +19,10 @@ from hil.estimator.data.recording import Recording
 CLEAR = 0.25
 """A mistake is clear only if its correction reduces the torque residual to less than this fraction of its value."""
 
+NEARLY_ALL, STUCK_STEPS = (
+    0.9,
+    10.0,
+)  # fraction of the segments, and the motion in encoder steps below which a joint sticks
 SAME_ANGLE = 0.01  # rad
 
 WELL = 0.3
@@ -62,6 +68,25 @@ def refuse_slips(recordings: Sequence[Recording], source: str, zero: Sequence[fl
             f"{source}: {signs.signs.said()} {verb} reversed: as given, {' and '.join(inertias)} would be negative. "
             "Change that in the file, or reverse the positions."
         )
+
+
+def refuse_stuck(recordings: Sequence[Recording], source: str, segment: float) -> None:
+    """Raise CsvError if a joint hardly moves in nearly all segments of length `segment` [s].
+
+    Its encoder then shows little but friction, whose fit would take minutes.
+    """
+    for joint in range(recordings[0].joints):
+        steps = [
+            float(np.ptp(part)) / float(each.position_step[joint])
+            for each in recordings
+            for part in np.array_split(each.filled()[joint], max(1, round(float(np.ptp(each.time)) / segment)))
+        ]
+        if float(np.quantile(steps, NEARLY_ALL)) < STUCK_STEPS:
+            raise CsvError(
+                f"{source}: joint {joint + 1} sticks: in {100 * NEARLY_ALL:.0f} % of the segments of {segment:g} s it "
+                f"moves by less than {STUCK_STEPS:g} encoder steps, so that friction hides everything else. Drive it "
+                "harder, or record with a finer encoder; longer segments (columns.segment) help if it creeps."
+            )
 
 
 def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None) -> None:

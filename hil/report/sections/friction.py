@@ -13,6 +13,8 @@ from hil.results.parts import Covariance
 from hil.runs.period_file import PlayedPeriod
 
 _CURVE = 401  # points on the curve
+_FEWER = 4
+_LINE = 0.01  # width of a line, relative to the height of the curve
 _DOTS = 400  # of each motion
 _DRAWS = 200  # parameter draws for the interval
 
@@ -61,16 +63,25 @@ def _curve(
     at = fastest * np.linspace(-1, 1, _CURVE) ** 3
     curve = friction_curve(data.model, at)[:, joint]
     low, high = friction_interval(data.model, data.result.covariance, at, joint)
+    line, said = model_curve(at, curve, low, high)
     series = (
         Series("from the measured motion", measured[0][joint], measured[1][joint], GREY, "dots"),
-        Series("from the model's motion", simulated[0][joint], simulated[1][joint], ORANGE, "dots"),
-        Series("95 % interval", at, high, BLUE, "area", low),
-        Series("model", at, curve, BLUE),
+        # Fewer, since both motions are so alike that these would hide those of the measured one.
+        Series("from the model's motion", simulated[0][joint, ::_FEWER], simulated[1][joint, ::_FEWER], ORANGE, "dots"),
+        *line,
     )
     chart = Chart(f"friction_{joint + 1}", f"Friction of {name}", "speed [rad/s]", "friction [N m]", series)
     load = data.model.values.get(f"load_{joint + 1}")
     more = f" It also grows with the motor torque, by {load:.3g} N m per N m, which is not drawn." if load else ""
-    return Picture(chart, f"{name}: friction versus speed, without the constant offset.{more}")
+    return Picture(chart, f"{name}: friction versus speed, without the constant offset.{said}{more}")
+
+
+def model_curve(at: Array, curve: Array, low: Array, high: Array) -> tuple[tuple[Series, ...], str]:
+    """The model's friction with its interval, or a sentence if that is narrower than the line."""
+    line = Series("model", at, curve, BLUE)
+    if float(np.max(high - low)) < _LINE * float(np.ptp(curve)):
+        return (line,), " The 95 % interval is narrower than the line."
+    return (Series("95 % interval", at, high, BLUE, "area", low), line), ""
 
 
 def friction_curve(model: ArmModel, speed: Array) -> Array:

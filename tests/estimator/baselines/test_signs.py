@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.config.csv_columns import load_recording_config
+from hil.config.recording import load_recording_config
 from hil.errors import CsvError
 from hil.estimation.unsettled.slips import refuse_slips
 from hil.estimator.baselines import signs

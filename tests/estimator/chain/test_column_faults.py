@@ -23,10 +23,10 @@ LINKS = np.array(
 )
 
 
-def model() -> ChainModel:
-    """Three links in a vertical plane."""
+def model(first: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> ChainModel:
+    """Three links, the last two in a vertical plane. first: axis of the first joint."""
     along = np.array([[0.0, 0.0, 0.0], [0.16, 0.0, 0.0], [0.14, 0.0, 0.0]])
-    axis = np.array([[0.0, 1.0, 0.0]] * 3)
+    axis = np.array([first, (0.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
     return ChainModel(BaseParameters.of(Chain(np.stack([np.eye(3)] * 3), along, axis, np.array([0.0, 0.0, -9.81]))))
 
 
@@ -73,6 +73,45 @@ def test_reversed_columns_are_found(torque: tuple[int, ...], position: tuple[int
     assert check.suspicious
     assert found is not None
     assert (found.signs.torque, found.signs.position) == (torque, position)
+
+
+def test_a_reversed_angle_of_a_vertical_first_joint_is_found_by_its_negative_friction() -> None:
+    arm = model(first=(0.0, 0.0, 1.0))
+    good = recorded(arm, 3)
+    assert not checked(good, arm).suspicious
+    check = checked(replace(good, position=good.position * np.array([[-1.0], [1.0], [1.0]])), arm)
+    found = check.reversed_columns()
+    assert check.suspicious
+    assert found is not None
+    assert found.impossible
+    assert found.signs.reversed_columns == ("the position of joint 1",)
+
+
+@pytest.mark.parametrize(
+    ("columns", "torque", "position"), [("torques", (1, 0, 2), (0, 1, 2)), ("positions", (0, 1, 2), (0, 2, 1))]
+)
+def test_swapped_columns_are_found(columns: str, torque: tuple[int, ...], position: tuple[int, ...]) -> None:
+    arm = model()
+    good = recorded(arm, 3)
+    assert checked(good, arm).swapped_columns() is None
+    check = checked(replace(good, torque=good.torque[[*torque]], position=good.position[[*position]]), arm)
+    found = check.swapped_columns()
+    assert check.suspicious
+    assert found is not None
+    assert (found.columns, found.joints) == (columns, (0, 1) if columns == "torques" else (1, 2))
+
+
+def test_a_late_torque_is_found() -> None:
+    arm = model()
+    good = recorded(arm, 3)
+    assert checked(good, arm).late_torque() is None
+    shifted = np.roll(good.torque, 3, axis=1)  # by 30 ms
+    late = np.array([[False], [True], [False]])
+    one = checked(replace(good, torque=np.where(late, shifted, good.torque)), arm).late_torque()
+    every = checked(replace(good, torque=shifted), arm).late_torque()
+    assert one is not None and every is not None
+    assert (one.joint, every.joint) == (1, None)
+    assert [one.seconds, every.seconds] == pytest.approx([0.03, 0.03], abs=0.006)
 
 
 def test_a_torque_of_the_wrong_size_is_found() -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from hil.config.csv_columns import RecordingConfig
+from hil.config.recording import RecordingConfig
 from hil.config.schema import Config
 from hil.fakes.description import FakeArm
 from hil.toml_errors import describe, fields_of, model_in
@@ -82,9 +82,9 @@ UNITS_OF_KNOWN = {
     "rotor_inertia": "kg m^2",
 }  # fmt: skip
 LEFT_OUT: dict[str, tuple[str, ...]] = {
-    "arm": ("joints.torque_per_volt", "joints.voltage_limit", "known.armature_2", "known.rotor_inertia_1"),
-    "pwm": ("joints.torque_constant", "joints.current_limit", "arm.prior", "known", "safety", "experiment"),
-    "spatial": ("arm.prior", "arm.link_lengths", "joints", "experiment", "safety", "known"),
+    "arm": ("columns", "joints.torque_per_volt", "joints.voltage_limit", "known.armature_2", "known.rotor_inertia_1"),
+    "pwm": ("columns", "joints.torque_constant", "joints.current_limit", "arm.prior", "known", "safety", "experiment"),
+    "spatial": ("columns", "arm.prior", "arm.link_lengths", "joints", "experiment", "safety", "known"),
     "columns": ("known",),
     "fake": ("arm.drives.coulomb_width",),  # excludes presliding, which is tried
     "chain": ("chain.drives", "servos"),
@@ -92,6 +92,7 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
 """Keys that do not belong in that file, or are tried in another one."""
 EXCEPTIONS: dict[str, dict[str, str]] = {
     "arm": {
+        "experiment.rate x1000": REFUSED,  # nobody gives a rate in mHz
         "joints.torque_constant /1000": OTHER,
         "joints.position_limit /1000": REFUSED,
         "joints.current_limit /1000": OTHER,
@@ -119,6 +120,7 @@ EXCEPTIONS: dict[str, dict[str, str]] = {
         "stabiliser.damping x57.3": OTHER,
     },
     "columns": {
+        "columns.rate x1000": REFUSED,
         "columns.position_step x1000": OTHER,
     },
     "fake": {

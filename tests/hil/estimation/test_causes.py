@@ -222,3 +222,18 @@ def test_without_gravity_its_torques_are_not_called_uncertain() -> None:
     for gravity in (True, False):
         assert ("gravity_1" in str(doubts_of([healthy()], estimate, False, gravity).warnings)) is gravity
         assert ("gravity_1" in relative_std([healthy()], estimate, gravity)) is gravity
+
+
+@pytest.mark.parametrize(("repeats", "kind", "named"), [(True, "step", 0), (False, "step", 1), (True, "always", 1)])
+def test_periods_that_are_alike_contain_no_change(
+    repeats: bool, kind: str, named: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    course = SimpleNamespace(kind=kind, time=6.5, recording=0)
+    hypothesis = SimpleNamespace(kind="torque", course=course, joints=(2,), unknowns=1)
+    fit = SimpleNamespace(left=0.7, unknowns=np.array([-0.18]))
+    defect = SimpleNamespace(hypothesis=hypothesis, fit=fit, given=SimpleNamespace(left=1.6))
+    monkeypatch.setattr(looked_for, "likely_defect", lambda *_: defect)
+    monkeypatch.setattr(looked_for, "disagreement", lambda *_: ())
+    estimate: Any = SimpleNamespace(residual_over_noise=np.ones(2), segment_length=1.0, zeros=np.empty((0, 2)))
+    fitted = Fitted([healthy()], ("arm.csv",), [healthy().position], estimate, estimate, 9.81, repeats)
+    assert len(causes(fitted)) == named

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.config.csv_columns import Columns, parse_recording_config
+from hil.config.csv_columns import Columns
+from hil.config.recording import parse_recording_config
 from hil.errors import ConfigError, CsvError
 from hil.estimation.unsettled import recordings as estimates
 from hil.estimator.errors import ConvergenceError
@@ -119,3 +120,8 @@ def test_a_dataset_whose_description_is_no_table_is_refused(text: str, tmp_path:
     (tmp_path / "meta" / "info.json").write_text(text, encoding="utf-8")
     with pytest.raises(CsvError, match=r"info\.json must hold an object"):
         read_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("unit", ["mNm", "mN m", "mN*m"])
+def test_a_torque_unit_needs_no_space(unit: str) -> None:
+    assert Columns.model_validate({"torque_unit": unit}).torque_unit == "mN m"

@@ -236,6 +236,8 @@ def test_an_encoder_step_is_found_through_the_digits_that_were_written() -> None
         assert encoder_step(np.round(np.round(angle / step) * step, 5)) == pytest.approx(step, rel=1e-3)
     assert encoder_step(angle) is None
     assert encoder_step(np.full(50, 1.0)) is None
+    # A joint that hardly moves shows a few steps: these are no jumps.
+    assert encoder_step(np.repeat([0.0, step, 2.0 * step, step], 300)) == pytest.approx(step)
 
 
 def test_a_periodic_recording_is_averaged() -> None:

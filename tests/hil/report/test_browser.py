@@ -95,7 +95,7 @@ def test_a_visit(identified: Path, width: int) -> None:
     assert seen["seconds"] < MOST_SECONDS
     assert seen["overflow"] <= 0
     assert seen["moved"], "the slider moves the arm"
-    assert len(seen["figures"]) == 16
+    assert len(seen["figures"]) == 15
     assert all(drawn > 0.5 * min(width, 600) for _, drawn in seen["figures"])
     assert "measured: " in seen["reading"] and "predicted: " in seen["reading"]
     assert seen["zoomed"] != seen["before"] == seen["after"]
