@@ -29,6 +29,12 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
     return dispatcher
 
 
+def inner(function: Any, **options: Any) -> Any:
+    """Compile a function to be called by compiled loops: it runs without the GIL and has no wrapper for C."""
+    compile_it: Any = numba.njit
+    return compile_it(nogil=True, error_model="numpy", no_cfunc_wrapper=True, **options)(function)
+
+
 def only_version(dispatcher: Any) -> Any:
     """Return the machine code of a compiled function that has been called with arguments of one set of types.
 

@@ -11,12 +11,13 @@ The terms of a joint's equation, `torque - row theta`, are summed over time, so 
 moments requires one subtraction. These functions are part of compiled loops.
 """
 
+from functools import partial
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import inner
 
 BACK = (5, 10, 20)
 """Numbers of lessons (updates of the model) over which the mean is taken."""
@@ -139,8 +140,6 @@ def unexplained(past: Any, j: int) -> float:
     return float(past[_SLOTS + 1, _FOUND + j])
 
 
-_inner: Any = numba.njit(  # type: ignore[call-overload]
-    nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False
-)
+_inner = partial(inner, _nrt=False)  # nothing in them allocates
 forget, add, describe, store, compare = map(_inner, (forget, add, describe, store, compare))
 keep, unexplained = map(_inner, (keep, unexplained))

@@ -32,13 +32,13 @@ are not independent. Therefore each one has only a fraction of the full weight.
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled
+from hil.estimator.compiled import compiled, inner
 from hil.estimator.models import earlier_model, standstill
 
 NAMES = (
@@ -462,9 +462,7 @@ def _observe_loop(
     return alarm
 
 
-_inner: Any = numba.njit(  # type: ignore[call-overload]
-    nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False
-)
+_inner = partial(inner, _nrt=False)  # nothing in them allocates
 _regressors, _begin_anew, _filter = map(_inner, (_regressors, _begin_anew, _filter))
 _gain, _lacks, _learn = map(_inner, (_gain, _lacks, _learn))
 _keep_dissipative = _inner(_keep_dissipative)

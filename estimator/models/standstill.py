@@ -14,12 +14,13 @@ it: a torque that did not move it before never raises an alarm again.
 These functions are part of compiled loops, which pass a joint's equation, `torque - row theta`, once per sample.
 """
 
+from functools import partial
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import inner
 
 WITHIN_RAD = 0.004
 """Largest change of the angle of a joint that is at rest [rad]; covers encoder noise and gear play."""
@@ -142,9 +143,7 @@ def blocked(
     return bool(max(rest[_UP], rest[_DOWN]) > 2.0 * momentum and rest[_LASTS] >= HOLD_S)
 
 
-_inner: Any = numba.njit(  # type: ignore[call-overload]
-    nogil=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False
-)
+_inner = partial(inner, _nrt=False)  # nothing in them allocates
 forget = _forget = _inner(forget)
 keep = _keep = _inner(keep)
 withstood, is_suspect, look, variance, blocked = map(_inner, (withstood, is_suspect, look, variance, blocked))

@@ -8,11 +8,10 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.estimator.chain.model.kernels import place
-from hil.estimator.compiled import compiled
+from hil.estimator.compiled import compiled, inner
 
 BASE = np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 """Frame of the base: rotation matrix row by row, then origin."""
@@ -165,7 +164,6 @@ def _least_loop(chain: Any, shapes: Any, pairs: Any, needed: Any, q: Any, room: 
                 room[k], worst[k] = left, p
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
-_segments, _to_box, _box, _at, _distance = map(_inner, (_segments, _to_box, _box, _at, _distance))
+_segments, _to_box, _box, _at, _distance = map(inner, (_segments, _to_box, _box, _at, _distance))
 all_distances: Callable[..., None] = compiled(_all_loop)
 least_room: Callable[..., None] = compiled(_least_loop)

@@ -39,11 +39,11 @@ a joint is a record of the type `MEMORY`.
 from collections.abc import Iterable
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.drivers.state import State
 from hil.errors import Cause, SafetyStop
+from hil.estimator.compiled import inner
 from hil.experiment.velocity import bias, lag
 
 __all__ = ["MEMORY", "begin", "check_standstill", "look", "lost", "moved_at_standstill"]
@@ -425,12 +425,11 @@ def _explained(fading: Any, unsure: float, velocity: float, lag: float, scale: f
     return allowed, lag * (velocity - fading.mean)
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
-_explained = _inner(_explained)
+_explained = inner(_explained)
 _restart, _add, _is_wrong, _has_jumped, _forget_sums, _begin_same, _is_frozen = map(
-    _inner, (_restart, _add, _is_wrong, _has_jumped, _forget_sums, _begin_same, _is_frozen)
+    inner, (_restart, _add, _is_wrong, _has_jumped, _forget_sums, _begin_same, _is_frozen)
 )
 NOISE_RAD, NOISE_TIMES, _look_at_bias, _unexplained = bias.NOISE_RAD, bias.NOISE_TIMES, bias.look, bias.unexplained
 _add_to_lags, _forget_block = lag.add, lag.forget
-_creeps = _inner(_creeps)
-_looks_long, _learn, look, lost = map(_inner, (_looks_long, _learn, look, lost))
+_creeps = inner(_creeps)
+_looks_long, _learn, look, lost = map(inner, (_looks_long, _learn, look, lost))

@@ -33,10 +33,10 @@ a joint is a record of the type `MEMORY`.
 
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.config.joint import JointConfig
+from hil.estimator.compiled import inner
 
 __all__ = ["GOALS", "MEMORY", "allow_noise", "begin", "is_frozen", "look", "seen_above", "usual_sigma"]
 
@@ -196,5 +196,4 @@ def is_frozen(goals: Any, goal: float, carried: float, seconds: float, stands: b
     return bool(goals.highest - goals.lowest > goals.most)
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
-look, is_frozen = map(_inner, (look, is_frozen))
+look, is_frozen = map(inner, (look, is_frozen))

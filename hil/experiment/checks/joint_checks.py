@@ -10,11 +10,10 @@ from collections.abc import Callable
 from struct import Struct
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.drivers.state import State
-from hil.estimator.compiled import compiled, only_version
+from hil.estimator.compiled import compiled, inner, only_version
 from hil.experiment.checks import consistency, following, work
 
 FINE = -1
@@ -179,6 +178,5 @@ def _look_loop(
     return FINE
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
-_may_be_outside, _fault = map(_inner, (_may_be_outside, _fault))
+_may_be_outside, _fault = map(inner, (_may_be_outside, _fault))
 _look: Callable[..., int] = compiled(_look_loop)

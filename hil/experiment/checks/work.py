@@ -9,8 +9,9 @@ a joint is a record of the type `MEMORY`.
 
 from typing import Any
 
-import numba
 import numpy as np
+
+from hil.estimator.compiled import inner
 
 __all__ = ["MEMORY", "TOLERANCE_RAD", "begin", "look"]
 
@@ -57,4 +58,4 @@ def look(joints: Any, joint: int, goal: float, moved: float) -> float:
     return float(-done) if done < memory.least - _OF_OTHERS * others else -1.0
 
 
-look = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(look)  # type: ignore[call-overload]
+look = inner(look)

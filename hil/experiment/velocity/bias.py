@@ -9,7 +9,7 @@ and cannot widen it. If twice these errors do not explain the distance, the posi
 
 from typing import Any
 
-import numba
+from hil.estimator.compiled import inner
 
 STEP_RAD_S = 0.025
 """Resolution of the velocity register [rad/s]."""
@@ -53,6 +53,5 @@ def unexplained(bias: Any, apart: float, moving: float) -> float:
     return float(apart - min(max(apart, low), high))
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
-unexplained = _inner(unexplained)
-look = _inner(look)
+unexplained = inner(unexplained)
+look = inner(look)

@@ -12,8 +12,9 @@ depends on the frequency of the motion.
 
 from typing import Any
 
-import numba
 import numpy as np
+
+from hil.estimator.compiled import inner
 
 BLOCK_S, BLOCKS = 0.1, 4
 """Duration of a block [s], and the number of blocks that are compared with all earlier ones."""
@@ -125,7 +126,6 @@ def _fitted(sums: Any) -> tuple[float, float, float, float, float]:
     return lag, scale, determinant / far_2, max(left / seconds, NOISE_RAD * NOISE_RAD), determinant / lag_2
 
 
-_inner: Any = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)  # type: ignore[call-overload]
-_fitted = _inner(_fitted)
-_completes_block = _inner(_completes_block)
-add, forget = map(_inner, (add, forget))
+_fitted = inner(_fitted)
+_completes_block = inner(_completes_block)
+add, forget = map(inner, (add, forget))
