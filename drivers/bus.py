@@ -337,10 +337,13 @@ class ServoBus(TorqueSwitch):
 
     @property
     def watchdog_changed(self) -> tuple[int, int] | None:
-        """Index of a joint whose Bus Watchdog, read back last, is not as armed, and its value [20 ms]; else None."""
-        armed = self.armed_ticks
+        """Index of a joint whose Bus Watchdog, read back last, is not as armed, and its value [20 ms]; else None.
+
+        One that has tripped is not included: why is only known once the time without packets has been looked at.
+        """
+        expected = self.armed_ticks, WATCHDOG_TRIPPED
         for place, ticks in self.prepared.watchdogs:
-            if ticks != armed and self._drives[place] in self._armed:
+            if ticks not in expected and self._drives[place] in self._armed:
                 return self._of[place], ticks
         return None
 

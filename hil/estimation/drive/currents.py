@@ -41,7 +41,8 @@ _QUANTILE, _OF_NORMAL = 0.25, 0.3186
 noise; the second value is that of a normal distribution with a standard deviation of 1.
 """
 
-_FEWEST_AT_REST = 50
+_FEWEST_AT_REST = 30
+"""Number of consecutive readings at one goal from which they show their noise."""
 
 _SMALL, _LEAST = 0.5, 0.1
 """Highest and lowest goals that cannot be clipped but are large enough to judge, relative to the largest measured
@@ -108,9 +109,11 @@ def _noise(goal: Array, measured: Array) -> float:
     if count < _RECENT:
         return 0.0
     windows = np.lib.stride_tricks.sliding_window_view(goal, _RECENT)
-    at_rest = measured[_RECENT - 1 :][np.ptp(windows, axis=1) == 0.0]
-    at_rest = at_rest[np.isfinite(at_rest)]
-    still = _sigma(at_rest - np.median(at_rest)) if len(at_rest) >= _FEWEST_AT_REST else 0.0
+    at_rest = np.flatnonzero(np.ptp(windows, axis=1) == 0.0) + _RECENT - 1
+    # The arm may be held by one current at the start and by another at the end.
+    parts = np.split(measured[at_rest], np.flatnonzero(np.diff(at_rest) > 1) + 1)
+    levelled = [part - np.nanmedian(part) for part in parts if np.isfinite(part).sum() >= _FEWEST_AT_REST]
+    still = _sigma(np.concatenate(levelled)) if levelled else 0.0
     lagging = [measured[_RECENT:] - goal[_RECENT - lag :][:count] for lag in range(_RECENT)]
     moving = min(min(_sigma(each), _sigma(np.diff(each, 2)) / 6.0**0.5) for each in lagging)
     return float(max(still, moving))
@@ -172,11 +175,9 @@ def _short_part(goal: Array, measured: Array, margin: float) -> float:
     """Fraction of the samples with large goals whose current is too small."""
     least = _least(goal)
     large = (least > LARGE * np.abs(goal).max()) & np.isfinite(measured[1:])
-    return (
-        float(np.mean(np.abs(measured[1:])[large] < np.minimum(SHORT * least, least - margin)[large]))
-        if large.any()
-        else 0.0
-    )
+    if not large.any():
+        return 0.0
+    return float(np.mean(np.abs(measured[1:])[large] < np.minimum(SHORT * least, least - margin)[large]))
 
 
 def _follows_small_goals(goal: Array, measured: Array) -> float:

@@ -19,10 +19,8 @@ from hil.estimator.data.recording import Recording
 CLEAR = 0.25
 """A mistake is clear only if its correction reduces the torque residual to less than this fraction of its value."""
 
-NEARLY_ALL, STUCK_STEPS = (
-    0.9,
-    10.0,
-)  # fraction of the segments, and the motion in encoder steps below which a joint sticks
+NEARLY_ALL = 0.9  # fraction of the segments
+STUCK_STEPS = 10.0  # motion in encoder steps below which a joint sticks
 SAME_ANGLE = 0.01  # rad
 
 WELL = 0.3

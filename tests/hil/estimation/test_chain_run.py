@@ -49,9 +49,9 @@ TEXT = FOUR.read_text(encoding="utf-8")
 
 
 def short(folder: Path) -> Config:
-    """The configuration with half its period and rate, next to its URDF."""
+    """The configuration at half its rate, next to its URDF; half its period would leave moment_z_2 uncertain by 0.6 %."""
     (folder / "open_manipulator_x_like.urdf").write_bytes((CONFIGS / "open_manipulator_x_like.urdf").read_bytes())
-    text = replaced(TEXT, ("period = 10.0", "period = 5.0"), ("rate = 400.0", "rate = 200.0"))
+    text = replaced(TEXT, ("rate = 400.0", "rate = 200.0"))
     (folder / "arm.toml").write_text(text, encoding="utf-8")
     return load_config(folder / "arm.toml")
 

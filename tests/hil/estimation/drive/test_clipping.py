@@ -55,6 +55,20 @@ def noisy(samples: np.ndarray, sigma: float, smooth: int = 1) -> np.ndarray:
     return noisy
 
 
+def held(samples: np.ndarray, before: float, after: float) -> np.ndarray:
+    """The samples after and before a second at rest, in which goals and currents have these values [A]."""
+    rest = [np.zeros(200, samples.dtype) for _ in range(2)]
+    for part, value in zip(rest, (before, after), strict=True):
+        part["goal_current"] = part["current"] = value
+    return np.concatenate((rest[0], samples, rest[1]))
+
+
+def test_currents_that_hold_the_arm_are_no_noise() -> None:
+    config = load_config(CONFIGS / "fake_two_link.toml")
+    assert settled_current_findings(config, held(recording(200.0, 1.0), 0.3, -0.2)).warnings == ()
+    assert len(settled_current_findings(config, held(overwritten(5), 0.3, -0.2)).warnings) == 2
+
+
 @pytest.mark.parametrize("is_settled", [True, False])
 @pytest.mark.parametrize(("sigma", "smooth"), [(0.1, 1), (0.6, 1), (0.3, 10)])
 def test_noise_of_the_reading_is_no_other_current(sigma: float, smooth: int, is_settled: bool) -> None:
