@@ -49,7 +49,7 @@ TEXT = FOUR.read_text(encoding="utf-8")
 
 
 def short(folder: Path) -> Config:
-    """The configuration at half its rate, next to its URDF; half its period would leave moment_z_2 uncertain by 0.6 %."""
+    """The configuration at half its rate, next to its URDF; half its period leaves moment_z_2 uncertain by 0.6 %."""
     (folder / "open_manipulator_x_like.urdf").write_bytes((CONFIGS / "open_manipulator_x_like.urdf").read_bytes())
     text = replaced(TEXT, ("rate = 400.0", "rate = 200.0"))
     (folder / "arm.toml").write_text(text, encoding="utf-8")
