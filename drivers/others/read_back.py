@@ -49,7 +49,7 @@ _SHORT_CYCLE_S = 0.005
 share `_AGAIN_SHARE` of one. In longer ones, read-backs are rarely destroyed, and a delay leaves joints unobserved.
 """
 
-OVERDUE_S, OVERTIME_SHARE = 0.05, 0.8
+OVERDUE_S, OVERTIME_SHARE = 0.15, 0.8
 """If nothing was read back for `OVERDUE_S` [s] because cycles leave no time for it, nor for a status, a read-back may
 delay the next cycle by up to this fraction of a cycle: otherwise a disarmed watchdog would never be seen.
 """

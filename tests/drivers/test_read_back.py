@@ -176,7 +176,7 @@ def test_a_watchdog_changed_by_another_program_is_seen_at_any_rate(
     with driven(fake_config(interval=interval)) as bus:
         clock, servo = bus.port.clock, bus.port._serial.bus.servos[2]
         start = clock.now()
-        for cycle in range(round(0.5 / interval)):
+        for cycle in range(round(0.6 / interval)):
             clock.wait_until(start + cycle * interval)
             latest = max(latest, clock.now() - start - cycle * interval)
             bus.exchange([0.01 * (cycle % 30), 0.1])
@@ -187,7 +187,7 @@ def test_a_watchdog_changed_by_another_program_is_seen_at_any_rate(
                 bus.check_not_overruled(due)
             if bus.watchdog_changed is not None:
                 break
-            assert not is_changed or clock.now() < start + 0.2 + 0.15
+            assert not is_changed or clock.now() < start + 0.2 + 0.35
         assert bus.watchdog_changed == (1, ticks) and clock.now() > start + 0.2
     assert latest < interval, "no sample is missed"
 
