@@ -161,11 +161,14 @@ class TorqueSwitch:
         Nothing is read back: a servo that misses the packet keeps its previous timeout.
         """
         if seconds < self._watchdog:
-            tell_watchdogs(self.port, {drive: self._servos[drive] for drive in self._armed}, seconds)
+            self._tell_watchdogs(seconds)
 
     def rearm_watchdogs(self) -> None:
         """Set the armed Bus Watchdogs again, after another program has changed them. Nothing is read back."""
-        tell_watchdogs(self.port, {drive: self._servos[drive] for drive in self._armed}, self._watchdog)
+        self._tell_watchdogs(self._watchdog)
+
+    def _tell_watchdogs(self, seconds: float) -> None:
+        tell_watchdogs(self.port, {drive: self._servos[drive] for drive in self._armed}, seconds)
 
     def repeat_torque_off(self) -> None:
         """Send torque off to all servos once more without waiting for an answer, in case a silent servo receives it."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hil.estimator import linalg
 from hil.estimator.arrays import Array
 from hil.estimator.baselines.signs import Signs
-from hil.estimator.chain.fit.regression import filtered_torque
+from hil.estimator.chain.fit.regression import filtered_torques
 from hil.estimator.chain.fit.stage1 import PASSES
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
@@ -109,7 +109,7 @@ class _Solved:
 
 @dataclass(frozen=True)
 class ColumnCheck:
-    """Recordings of a chain whose columns are in doubt. cutoff [Hz], delay [s]: see `filtered_torque`."""
+    """Recordings of a chain whose columns are in doubt. cutoff [Hz], delay [s]: see `filtered_torques`."""
 
     recordings: Sequence[Recording]
     model: ChainModel
@@ -137,8 +137,7 @@ class ColumnCheck:
         return self._filtered(self.recordings, 0.0)
 
     def _filtered(self, recordings: Sequence[Recording], late: float) -> tuple[Array, Array]:
-        rows = [filtered_torque(each, self.model, self.cutoff, self.delay - late) for each in recordings]
-        return np.concatenate([Y for Y, _ in rows], axis=1), np.concatenate([tau for _, tau in rows], axis=1)
+        return filtered_torques(recordings, self.model, self.cutoff, self.delay - late)
 
     def _normal(self, recordings: Sequence[Recording]) -> "_Normal":
         return _Normal.of(*self._filtered(recordings, 0.0))

@@ -13,7 +13,7 @@ import numpy as np
 from hil.estimator.arrays import Array
 from hil.estimator.blas import one_blas_thread
 from hil.estimator.chain.conflicts import chain_conflicts
-from hil.estimator.chain.fit.regression import filtered_torque, fit_filtered
+from hil.estimator.chain.fit.regression import filtered_torque, filtered_torques, fit_filtered
 from hil.estimator.chain.fit.stage1 import ChainLinear
 from hil.estimator.chain.fit.stage2 import fit_periods
 from hil.estimator.chain.identify import BELIEVED, largest_ratio
@@ -170,7 +170,7 @@ def torque_error(recordings: Sequence[Recording], found: RecordedChain) -> Array
     """
     scale = [found.parameters.get(f"torque_scale_{joint}", 1.0) for joint in range(1, found.model.joints + 1)]
     true = [replace(each, torque=each.torque * np.array(scale)[:, None]) for each in recordings]
-    Y, torque = _filtered(true, found.model, found.cutoff)
+    Y, torque = filtered_torques(true, found.model, found.cutoff, LAG)
     error = torque - Y @ np.array([found.parameters[name] for name in found.model.linear_names])
     joints, viscous = range(found.model.joints), found.model.base.count
     moves = np.empty(found.model.joints)
@@ -213,13 +213,8 @@ def _repeated(recordings: Sequence[Recording], model: ChainModel, value: Array, 
 
 
 def _torque_residual(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> Array:
-    Y, torque = _filtered(recordings, model, cutoff)
+    Y, torque = filtered_torques(recordings, model, cutoff, LAG)
     return _relative(torque - Y @ value, torque)
-
-
-def _filtered(recordings: Sequence[Recording], model: ChainModel, cutoff: float) -> tuple[Array, Array]:
-    rows = [filtered_torque(recording, model, cutoff, LAG) for recording in recordings]
-    return np.concatenate([Y for Y, _ in rows], axis=1), np.concatenate([tau for _, tau in rows], axis=1)
 
 
 def _relative(error: Array, torque: Array) -> Array:

@@ -33,7 +33,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled
 from hil.estimator.models.parameters import Physics, place_of
 from hil.estimator.options import IntegrationOptions
-from hil.estimator.simulation.bristles import bend, first_bend, has_bristles, inner, without_dry_friction
+from hil.estimator.simulation.bristles import bend, first_bend, has_bristles, inlined, without_dry_friction
 
 # Indices of joint 1's constants in `Physics.vector`; joint 2's follow.
 VISCOUS, COULOMB, OFFSET, WIDTH, RISE, FADING = map(
@@ -277,6 +277,6 @@ def _loop(
 # Functions called only from compiled code need no wrappers, which take a second to compile. They are inlined because
 # the reference counting for their arrays would take longer than the arithmetic of a step.
 bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent = map(
-    inner, (bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent)
+    inlined, (bump_at, bend_at, _drive, _forces, pieces_now, step_on, step_bent)
 )
 _simulate: Callable[..., None] = compiled(_loop)

@@ -16,12 +16,13 @@ encoder steps RMS for 5 to 1000 N m/rad.
 """
 
 import math
+from functools import partial
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
+from hil.estimator.compiled import inner
 from hil.estimator.models.parameters import SLIDING, Physics, place_of
 
 # Indices of joint 1's constants in `Physics.vector`; joint 2's follow.
@@ -83,7 +84,5 @@ def without_dry_friction(vector: Array) -> Array:
     return left
 
 
-inner: Any = numba.njit(  # type: ignore[call-overload]
-    nogil=True, error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
-)
-bend = inner(bend)
+inlined = partial(inner, forceinline=True, no_cpython_wrapper=True)
+bend = inlined(bend)

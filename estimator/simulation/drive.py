@@ -8,11 +8,10 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled
+from hil.estimator.compiled import compiled, inner
 
 
 def motor_torque(
@@ -137,5 +136,5 @@ def _follow(command: Any, j: int, rate: float, lag: float, lagging: Any) -> None
             by_a = (by_a + samples * a ** (samples - 1) * y) / (1.0 - left)
 
 
-_follow = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(_follow)  # type: ignore[call-overload]
+_follow = inner(_follow, no_cpython_wrapper=True)
 _average: Callable[..., None] = compiled(_average_loop)

@@ -5,14 +5,14 @@ Equations, integration and feedback are those of `hil.estimator.simulation.close
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled
+from hil.estimator.compiled import compiled, inner
 from hil.estimator.models.parameters import Physics
 from hil.estimator.options import IntegrationOptions
 from hil.estimator.simulation.arm import finer_pieces, steps_per_sample
@@ -122,8 +122,7 @@ def _two(torque: Array) -> Array:
     return both
 
 
-def _inner(function: Callable[..., Any]) -> Any:
-    return numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)  # type: ignore[call-overload]
+_inner = partial(inner, no_cpython_wrapper=True)
 
 
 # Compiled code takes its arguments by position.

@@ -423,13 +423,11 @@ class EmulatedServo(Powered):
             self.motor_current_a = 0.0
         self._current_limit: int = memory.get("Current Limit") if "Goal Current" in memory else -1
         by_goal = memory.get("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE
-        known = bool(self.model.operating_modes)
-        # The fast path bypasses the controller, which computes the current where the supply limits it.
-        fast = known and not self._voltage_limited and self._current_limit >= 0
-        accepts = known and not by_goal and watchdog != WATCHDOG_TRIPPED
+        accepts = bool(self.model.operating_modes) and not by_goal and watchdog != WATCHDOG_TRIPPED
         self._goal_pwm_limit = memory.get("PWM Limit") if accepts and "Goal PWM" in memory else -1
         """Largest Goal PWM on the fast path [ticks]; -1 if it takes the general one."""
-        self._takes_goal_current = fast and not by_goal and watchdog != WATCHDOG_TRIPPED
+        # The fast path bypasses the controller, which computes the current where the supply limits it.
+        self._takes_goal_current = accepts and not self._voltage_limited and self._current_limit >= 0
         if self.needs_ticks:
             self.controller.goals = Goals.read(self._mode, memory)
         self.changed()

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, NoReturn
 
-import numba
 import numpy as np
 
 from hil.config.experiment import ExperimentConfig
@@ -21,7 +20,7 @@ from hil.drivers.state import State
 from hil.dry_run.ensemble import Ensemble, prior_ensemble
 from hil.errors import Cause, SafetyStop
 from hil.estimator.arrays import Array
-from hil.estimator.compiled import compiled, only_version
+from hil.estimator.compiled import compiled, inner, only_version
 from hil.estimator.models.momentum_observer import NAMES, MomentumObserver, observe
 from hil.estimator.models.parameters import CONSTANTS
 from hil.experiment.checks.apart import causes_of_standstill
@@ -149,7 +148,7 @@ def _jolting(joints: Any, former: Any, velocity: Any, seconds: float, now: float
     return found
 
 
-_jolting = numba.njit(nogil=True, error_model="numpy")(_jolting)
+_jolting = inner(_jolting)
 
 
 _TIMES = np.dtype(

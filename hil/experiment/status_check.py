@@ -12,12 +12,12 @@ from itertools import islice
 from hil.config.schema import Config
 from hil.drivers.others.foreign_values import ForeignValues
 from hil.drivers.packet import HardwareError
+from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import describe_error
 from hil.drivers.servo_model import WATCHDOG_UNIT
 from hil.drivers.state import Status
 from hil.errors import Cause
 
-_TRIPPED = 255
 _WRAP_S = 32.768
 _CLOCK_TOLERANCE_S = 0.004
 """Largest lag of a servo's clock, which counts milliseconds, behind its expected value [s]."""
@@ -122,9 +122,9 @@ class StatusCheck:
 
         While the arm is lowered, an unprotected servo is accepted: cutting torque would drop the arm.
         """
-        if ticks == self._armed or (self._bears_errors and ticks != _TRIPPED):
+        if ticks == self._armed or (self._bears_errors and ticks != WATCHDOG_TRIPPED):
             return None
-        if ticks == _TRIPPED:
+        if ticks == WATCHDOG_TRIPPED:
             return Cause.WATCHDOG, (
                 "has lost its torque: its watchdog tripped (Bus Watchdog reads 255). It received nothing for "
                 f"{1e3 * self._armed * WATCHDOG_UNIT:.0f} ms, {self._why_tripped()}."

@@ -28,14 +28,20 @@ def fit_filtered(
     cutoff: cut-off frequency of the filter [Hz]. delay: delay of the torque [s]. Raises RecordingError if the recording
     cannot be filtered.
     """
-    rows = [filtered_torque(recording, model, cutoff, delay) for recording in recordings]
-    Y = np.concatenate([columns for columns, _ in rows], axis=1)
-    tau = np.concatenate([torque for _, torque in rows], axis=1)
+    Y, tau = filtered_torques(recordings, model, cutoff, delay)
     left = np.maximum(np.sqrt(np.mean(tau**2, axis=1)), 1e-9)
     for _ in range(PASSES):
         theta, std = solve(Y, tau, 1.0 / left, prior)
         left = np.maximum(np.sqrt(np.mean((tau - Y @ theta) ** 2, axis=1)), 1e-9)
     return theta, std
+
+
+def filtered_torques(
+    recordings: Sequence[Recording], model: ChainModel, cutoff: float, delay: float
+) -> tuple[Array, Array]:
+    """Return the rows of `filtered_torque` of all recordings, one after the other."""
+    rows = [filtered_torque(recording, model, cutoff, delay) for recording in recordings]
+    return np.concatenate([Y for Y, _ in rows], axis=1), np.concatenate([tau for _, tau in rows], axis=1)
 
 
 def filtered_torque(recording: Recording, model: ChainModel, cutoff: float, delay: float) -> tuple[Array, Array]:

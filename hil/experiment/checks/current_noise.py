@@ -87,8 +87,8 @@ class Noisy:
 class NoiseAllowance:
     """Adapts the joints' thresholds to the noise of their current readings.
 
-    records: the joints' records (`joint_checks.JOINT`), whose thresholds are set here and whenever the noise becomes
-    better known. planned: largest goal of each joint [A, or V under PWM]. interval: time between two exchanges [s].
+    records: the joints' records (`joint_checks.JOINT`), whose thresholds are set whenever the noise becomes better
+    known. planned: largest goal of each joint [A, or V under PWM]. interval: time between two exchanges [s].
     noise: noise of each joint's readings [A or V]; None if not known.
     """
 
@@ -105,7 +105,8 @@ class NoiseAllowance:
         self._measured = CurrentNoise(config.joints)
         self.noise = [0.0] * len(config.joints) if noise is None else noise
         """Noise of each joint's current readings, or its upper bound [A or V]; 0 if not known."""
-        self._allow(self.noise)
+        if noise is not None:
+            self._allow(noise)
 
     def begin(self) -> None:
         """Accept any reading until some have shown their noise."""
