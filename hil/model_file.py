@@ -37,7 +37,7 @@ def _read(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         if file.suffix.lower() != ".json":
             raise ResultError(
-                f"{file} is not a model file of hil. Give a run folder, its result.json, or the TOML or JSON file of "
+                f"{file} is not a hil model file. Give a run folder, its result.json, or a TOML or JSON file from "
                 "hil export."
             ) from error
         raise ResultError(f"{file} is incomplete or damaged: {error}. Recreate it with hil estimate RUN.") from error

@@ -54,7 +54,7 @@ friction and inertia cannot be several times as large as the planned torque, bec
 the excitation is slower than `_USUAL_HZ`, they can, in proportion: long, heavy arms are excited slowly.
 """
 _USUAL_HZ = 0.7
-"""Geometric mean of the lowest and the highest frequency from which the excitation is not called slow."""
+"""Geometric mean of the lowest and highest frequencies below which the excitation counts as slow."""
 _FLAT = 0.3
 """Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the units of `_INERTIA`."""
 _NEAR_LIMIT = 0.05

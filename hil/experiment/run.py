@@ -45,7 +45,7 @@ _LAST_SAMPLES = 100
 
 _FIRST_S = 3.0
 _DESCRIBED = (
-    "Since this is the beginning of a motion, check first whether the configuration fits the arm: each joint's "
+    "Since the motion had just begun, check first whether the configuration fits the arm: each joint's "
     "direction, id, torque_constant and wiring."
 )
 """Advice for a stop within this time of the first goal [s], unless an earlier run has shown that the arm obeys."""
@@ -274,7 +274,7 @@ def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, 
 
 
 def doubt_description(error: BaseException, samples: NDArray[np.void]) -> None:
-    """Name mistakes in the description of an arm that a guard stopped at the very beginning of its first motion."""
+    """If the guard stopped the arm early in its first motion, name mistakes in the description as a possible cause."""
     stop = error if isinstance(error, SafetyStop) else error.__context__
     if not isinstance(stop, SafetyStop) or stop.overruled:
         return

@@ -70,8 +70,8 @@ def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
         return (
             f"The velocity columns are {factor:.3g} times the rates at which the positions change: the times, or "
             f"both velocities, have a wrong scale. If times are {factor:.3g} times too long, inertias are "
-            f"{factor**2:.3g} times too large: check the unit of time and the sample rate. If only the unit of the "
-            "velocities is another one, leave these columns out: nothing else uses them.",
+            f"{factor**2:.3g} times too large: check the unit of time and the sample rate. If only the "
+            "velocities have another unit, leave these columns out: nothing else uses them.",
         )
     return tuple(
         f"Column {found[joint - 1].column!r} is {factors[joint - 1]:.3g} times the rate at which the position of joint "

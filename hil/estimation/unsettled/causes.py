@@ -39,7 +39,7 @@ def causes(fitted: Fitted) -> tuple[str, ...]:
     recordings, names, estimate = fitted.recordings, fitted.names, fitted.estimate
     defect = likely_defect(recordings, fitted.plain, estimate, fitted.gravity > 0.0)
     if fitted.repeats and defect is not None and defect.hypothesis.course.kind in CHANGES:
-        defect = None  # what changes while the arm moves makes no two periods alike
+        defect = None  # a change while the arm moves would make periods differ
     said = () if defect is None else (defect_said(defect, names),)
     if defect is not None and is_certain(defect) and not is_other_arm(defect):
         return said
@@ -54,7 +54,7 @@ def causes(fitted: Fitted) -> tuple[str, ...]:
 
 
 def are_known(fitted: Fitted, found: tuple[str, ...]) -> bool:
-    """Whether `found`, the sentences of `causes`, name a cause and not only where the residual is large."""
+    """Whether `found`, from `causes`, names a cause and not only where the residual is large."""
     where = fitted.recordings, fitted.names, fitted.predicted, fitted.estimate.segment_length
     return bool(found) and found != local_residual(*where)
 
