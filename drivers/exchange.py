@@ -233,7 +233,7 @@ class Exchange:
 
     @property
     def lost(self) -> Overruled | None:
-        """A servo that read-backs show to have missed many of the latest goals; None if there is none."""
+        """A servo that has missed many of the latest goals, according to read-backs; else None."""
         return self._read_back.lost if self._read_back is not None else None
 
     def overruled(self, due: float) -> Overruled | None:

@@ -96,7 +96,7 @@ class TorqueOff:
         return " ".join((self._outcome(), *self._answers()))
 
     def _answers(self) -> Iterator[str]:
-        """Yield sentences on servos that were silent or rebooted and have answered since."""
+        """Yield sentences about servos that were silent or rebooted and have answered since."""
         for joint in self.confirmed:
             if joint in self.later:
                 yield f"{joint.title} did not answer at first, but answers again."

@@ -68,7 +68,7 @@ def run_experiment(
     plan: Plan | None = None,
     arms: Ensemble | ChainArms | None = None,
 ) -> str:
-    """Run the configured experiment and record it in `run`. Returns a sentence on the final torque state.
+    """Run the configured experiment and record it in `run`. Returns a sentence about the final torque state.
 
     Args:
         config: configuration of the arm.
@@ -258,7 +258,7 @@ def _check_unchanged(bus: ServoBus) -> Settings:
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, modes_seen_ago: float) -> None:
     """Name settings that another program changed. They are read only once torque is off, because reading takes time.
 
-    A change that can explain a stop is named before it; all others, including any that may have come later, after it.
+    Changes that can explain a stop are named before its message; others, including any that may be later, after it.
     """
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return

@@ -62,7 +62,7 @@ def guessed(table: Table, columns: Columns) -> Columns:
 
 
 def said(columns: Columns, table: Table) -> str:
-    """Sentences on how the columns were interpreted, and which were not used."""
+    """Sentences about how the columns were interpreted, and which were not used."""
     drive = columns.drive or "torque"
     time = _described("time", [columns.time], columns, table) if columns.time else f"{columns.rate:g} samples a second"
     position = _described("position", columns.position or [], columns, table)

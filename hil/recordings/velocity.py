@@ -60,7 +60,7 @@ def contradict(found: Sequence[Rate]) -> bool:
 
 
 def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
-    """Sentences on velocities that contradict the positions."""
+    """Sentences about velocities that contradict the positions."""
     factors = _factors(found)
     wrong = [joint for joint, factor in enumerate(factors, 1) if abs(math.log(factor)) > APART]
     if not wrong:
@@ -88,7 +88,7 @@ def _factors(found: Sequence[Rate]) -> list[float]:
 
 
 def notes(found: Sequence[Rate]) -> tuple[str, ...]:
-    """Sentences on velocities that are not simultaneous with the positions."""
+    """Sentences about velocities that are not simultaneous with the positions."""
     return tuple(
         f"Column {rate.column!r} is {1e3 * abs(rate.late):.2g} ms {'behind' if rate.late > 0.0 else 'ahead of'} the "
         "position; velocities are not used."

@@ -20,7 +20,7 @@ CHANGES = ("step", "linear", "decay")  # courses of defects within a recording
 class Fitted:
     """Fits of recordings. names: names of the recordings. predicted: simulated positions of each (joints, samples)
     [rad]. plain: estimate of a model without terms that could imitate a defect. estimate: estimate of the chosen model.
-    gravity: gravity in the arm's plane [m/s^2]. repeats: whether each recording is the mean of periods that are alike.
+    gravity: gravity in the arm's plane [m/s^2]. repeats: whether each recording is the mean of similar periods.
     """
 
     recordings: Sequence[Recording]
@@ -33,8 +33,8 @@ class Fitted:
 
 
 def causes(fitted: Fitted) -> tuple[str, ...]:
-    """Sentences on the cause: a defect of whole recordings, recordings that disagree, a local defect, a clipped torque
-    or a clock that drifts. If none is found, they say where the residual is large.
+    """Sentences about the cause: a defect of whole recordings, recordings that disagree, a local defect, a clipped
+    torque or a clock that drifts. If none is found, they say where the residual is large.
     """
     recordings, names, estimate = fitted.recordings, fitted.names, fitted.estimate
     defect = likely_defect(recordings, fitted.plain, estimate, fitted.gravity > 0.0)

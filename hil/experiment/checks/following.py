@@ -117,7 +117,7 @@ def begin(memory: Any, goals: Any, joint: JointConfig, planned: float, follow_sh
 
 
 def usual_sigma(joint: JointConfig, planned: float) -> float:
-    """Return the standard deviation of current errors that is assumed of any sensor [A or V]."""
+    """Return the standard deviation of current errors assumed for any sensor [A or V]."""
     return max(SIGMA_SHARE * planned, SIGMA_TICKS * abs(joint.joint.drive_unit(12.0)))
 
 
