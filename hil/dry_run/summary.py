@@ -251,8 +251,8 @@ def _stops(config: Config, stopping: Stopping) -> list[str]:
         )
     else:
         lines += [
-            f"Whenever the arm is stopped, {joint.name} overshoots its limits by {_far(stopped[index])}; if the program is "
-            f"killed or the cable unplugged, by {_far(silent[index])}."
+            f"Whenever the arm is stopped, {joint.name} overshoots its limits by {_far(stopped[index])}; if the "
+            f"program is killed or the cable unplugged, by {_far(silent[index])}."
             for index, joint in enumerate(config.joints)
         ]
     lines += [

@@ -204,7 +204,7 @@ def _moved_without_torque(config: Config, bus: ServoBus, recorder: Recorder) -> 
 def _try_again(bus: ServoBus, note: Note) -> None:
     """Keep cutting the torque of servos that did not answer, for as long as a servo takes to boot.
 
-    Their watchdogs have acted by now, if they were still armed, so packets can no longer delay them.
+    Their watchdogs, if still armed, have tripped by now, so packets can no longer delay them.
     """
     clock = bus.port.clock
     end = clock.now() + REBOOT_S

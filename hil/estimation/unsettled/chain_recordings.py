@@ -202,7 +202,7 @@ def _verdict(
 ) -> Verdict:
     """The verdict, with reasons.
 
-    Sentences: contradictory: about torques that contradict each other in the regression; late: about late torques.
+    contradictory, late: sentences about torques that contradict each other in the regression, or are logged late.
     """
     names = found.model.base.names
     weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]

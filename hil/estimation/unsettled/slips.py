@@ -107,7 +107,7 @@ def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequenc
 
 
 def reversal_said(signs: Signs, joints: Sequence[str] = ()) -> str:
-    """Say which signs are reversed; the gain from changing them must follow. joints: names, by default numbers."""
+    """Say which signs are reversed; the caller appends the gain from a change. joints: names, by default numbers."""
     if signs.are_several:
         return f"{signs.said(joints)} are reversed: with these signs changed"
     return f"{signs.said(joints)} is reversed: with the sign changed"

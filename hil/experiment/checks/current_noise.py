@@ -1,7 +1,7 @@
 """Noise of the current readings, measured while the arm rests, and what it means for the check of the current.
 
 The thresholds of `following` assume no more noise than usual. A noisier sensor gets wider ones, so that a healthy motor
-is not stopped; the user is told below which goal lost torque can then no longer be detected quickly.
+is not stopped; the user is told the goal below which lost torque is then not detected quickly.
 """
 
 from collections import deque

@@ -15,8 +15,8 @@ current is any value between the last two goals, because a reply may be measured
 latest goal, and may be off by a scale error of `GAIN_ERROR`.
 
 Successive errors may be correlated, so each sample is weighted by the time that it represents. Nor must chance decide
-in one of thousands of checks: the unweighted sum must also reach h = `LEAST_RATIO`, which has a probability of at most
-exp(-h) for a healthy motor from any one check on.
+in one of thousands of checks: the unweighted sum must also reach h = `LEAST_RATIO`, which a healthy motor's does with a
+probability of at most exp(-h) after any given check.
 
 While a joint stands still, its readings may also freeze at the commanded current, and the goal may take seconds to get
 far from it. But a motor's current follows its goal: if all three readings stay exactly the same although the goals

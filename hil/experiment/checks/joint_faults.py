@@ -191,7 +191,7 @@ class JointFaults:
             return (
                 f"Its goals are being altered in transit or by another program, its current sensor is wrong, or {weak}"
             )
-        return f"Its torque is off, it was rebooted, its watchdog acted, its current sensor is wrong, or {weak}"
+        return f"Its torque is off, it was rebooted, its watchdog tripped, its current sensor is wrong, or {weak}"
 
     def _disagree(self, index: int, state: State) -> Fault:
         return (

@@ -128,7 +128,7 @@ def test_a_plan_that_passes_a_limit_is_stopped_there() -> None:
         ),
         (
             0.2,
-            "Whenever the arm is stopped, shoulder overshoots its limits by up to 0.20 rad; if the program is killed or ",
+            "Whenever the arm is stopped, shoulder overshoots its limits by up to 0.20 rad; if the program is killed ",
         ),
     ],
 )
