@@ -42,7 +42,7 @@ def _read(path: Path) -> dict[str, Any]:
             ) from error
         raise ResultError(f"{file} is incomplete or damaged: {error}. Recreate it with hil estimate RUN.") from error
     if not isinstance(result, dict) or "schema" not in result:
-        raise ResultError(f"{file} is not a result file of hil: it has no schema.")
+        raise ResultError(f"{file} is not a hil result file: it has no schema.")
     if result["schema"] != SCHEMA:
         raise ResultError(
             f"{file}: schema is {result['schema']!r}, but this version of hil reads {SCHEMA}; the file was written by "

@@ -260,7 +260,7 @@ CASES: list[tuple[str, int, str]] = [
     ("study arm.toml", 2, "describes an arm, not a study"),
     ("check arm.toml extra", 2, "extra"),
     ("dry-run arm.toml --arms ten", 2, "--arms"),
-    ("dry-run arm.toml --result arm.toml", 2, "is not a result file of hil"),
+    ("dry-run arm.toml --result arm.toml", 2, "is not a hil result file"),
     ("dry-run arm.toml --picture x.pdf", 2, "must end in .png, .svg or .html"),
     ("dry-run arm.toml --picture nowhere/x.png", 2, "the folder nowhere does not exist"),
     ("scan fake_tow_link", 2, "did you mean fake_two_link?"),
