@@ -119,7 +119,7 @@ class Shooting:
         self._scales = (torque, velocity)
         self._model = model
         self._trust = np.ones((len(self.segments), model.joints))
-        self._driven: dict[tuple[float, float], list[tuple[Array, Array]]] = {}
+        self._driven: dict[tuple[float, ...], list[tuple[Array, Array]]] = {}
 
     def coordinates(self, base: Mapping[str, float]) -> Coordinates:
         """Return the parameters' coordinates; `base`: approximate base parameters by name [SI]."""
@@ -271,11 +271,13 @@ class Shooting:
 
     def _torque(self, segment: RecordingSegment, physics: Physics) -> tuple[Array, Array]:
         """Return the motor torque over a segment's grid steps (joints, steps) and its slopes (2, joints, steps)."""
-        key = (physics.delay, physics.lag)
+        joints = self._model.joints
+        times = physics.delays[:joints], physics.lags[:joints]
+        key = tuple(np.concatenate(times).tolist())
         driven = self._driven.get(key)
         if driven is None:
             pairs = list(zip(self._recordings, self._grids, strict=True))
-            driven = [(grid_torque(*pair, *key), grid_torque_slopes(*pair, *key)) for pair in pairs]
+            driven = [(grid_torque(*pair, *times), grid_torque_slopes(*pair, *times)) for pair in pairs]
             if len(self._driven) > 8:
                 self._driven.clear()
             self._driven[key] = driven
@@ -377,7 +379,8 @@ def _fit(
 ) -> Segmented:
     residual, derivative = partial(problem.residual, coordinates), partial(problem.derivative, coordinates)
     expected = problem.expected(coordinates, shared, own)
-    return minimise_segmented(residual, derivative, shared, own, ftol, options.minimiser, expected)
+    move = coordinates.moved_in_proportion
+    return minimise_segmented(residual, derivative, shared, own, ftol, options.minimiser, expected, move)
 
 
 def _estimate(

@@ -23,6 +23,7 @@ TYPICAL_CABLE = 0.15  # stiffness of a stiff cable, as a fraction of the RMS tor
 TYPICAL_COGGING = 0.01  # typical cogging, as a fraction of the RMS torque; only a scale
 LEAST_RISE = 0.05  # Stribeck rise below which nothing is disguised
 TYPICAL_SQUARE = 1.0 / 3.0  # mean square of a joint's speed, relative to that of its highest; only a guess
+MOST_DECREASE = 0.8  # of a positive base parameter in one step, relative to itself
 TYPICAL_BEND = 0.01  # rad: typical presliding deflection; only a scale
 
 
@@ -71,6 +72,23 @@ class Coordinates:
         widths = np.flatnonzero(self._floors)
         least = self.options.min_width * self._floors[widths]
         y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), least))
+        return y
+
+    def moved_in_proportion(self, x: Array, step: Array) -> Array:
+        """Return the point that `step` (coordinates,) reaches from `x` if the base parameters themselves, rather than
+        their coordinates, change in proportion to it; both arrays may end with other coordinates.
+
+        Torques are linear in the base parameters. If a joint hardly moves, only sums of inertias are determined: a
+        straight valley in the parameters, but one so curved in their coordinates that a fit creeps along it.
+        """
+        y, count = x + step, len(self.names)
+        linear = np.flatnonzero(self._positive_base)
+        y[linear] = x[linear] + np.log1p(np.maximum(step[linear], -MOST_DECREASE))
+        value, bound, rate = self.values(x[:count]), self.values(y[:count]), self.slopes(x[:count])
+        for share, first, second in self._shares:
+            part = (value[share] + rate[share] @ step[:count]) / np.sqrt(bound[first] * bound[second])
+            if abs(part) < self.options.max_initial_share:
+                y[share] = np.arctanh(part)
         return y
 
     def limit(self, x: Array, least: Array, most: Array, max_relative_decrease: float) -> None:
@@ -133,6 +151,11 @@ class Coordinates:
     @cached_property
     def _either_sign(self) -> Array:
         return np.array([term_of(name).range == "any" for name in self.names])
+
+    @cached_property
+    def _positive_base(self) -> Array:
+        terms = [term_of(name) for name in self.names]
+        return np.array([term.part == "base" and term.range == "positive" for term in terms])
 
     @cached_property
     def _floors(self) -> Array:

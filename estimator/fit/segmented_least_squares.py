@@ -26,6 +26,9 @@ Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
 coordinates, then its own (rows, shared + own).
 """
 
+Move = Callable[[Array, Array], Array]
+"""Returns the shared coordinates (shared,) that a step (shared,) reaches from others, to first order their sum."""
+
 DEFAULTS = SegmentedMinimiserOptions()
 MIN_SEGMENTS = 3
 MIN_EIGENVALUE = 1e-12  # relative to the largest; directions below have no effect on the residual
@@ -163,6 +166,7 @@ def minimise_segmented(
     ftol: float,
     options: SegmentedMinimiserOptions = DEFAULTS,
     expected: Expected | None = None,
+    move: Move = np.add,
 ) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
@@ -176,6 +180,7 @@ def minimise_segmented(
         ftol: stop when the relative decrease of a step is below this.
         options: limits of the iteration.
         expected: prior on the shared coordinates.
+        move: returns the shared coordinates that a step reaches.
 
     Raises:
         ConvergenceError: if the simulation diverges, or if the relative decrease still exceeds `options.unfinished`
@@ -195,7 +200,8 @@ def minimise_segmented(
             blocks = _blocks(derivative, shared, own, threads)
             gained = 0.0
             while damping < options.max_damping:
-                there = _stepped(blocks, prior, shared, own, damping, options.max_step)
+                step, own_there = _stepped(blocks, prior, shared, own, damping, options.max_step)
+                there = move(shared, step), own_there
                 rows_there = _residuals(residual, *there, threads)
                 gained = cost - _cost(rows_there) - prior.cost(there[0])
                 if gained > 0.0:
@@ -251,4 +257,4 @@ def _stepped(
     step = -linalg.lstsq(matrix, gradient / scale, rcond=1e-13)[0] / scale
     step = np.clip(step, -max_step, max_step)
     own_step = -known - np.einsum("sij,j->si", solve, step)
-    return shared + step, own + np.clip(own_step, -max_step, max_step)
+    return step, own + np.clip(own_step, -max_step, max_step)

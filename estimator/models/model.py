@@ -49,7 +49,8 @@ class Model:
         cable: adds cable_stiffness q to the load torque (the angle at which the cable is slack is part of the offset).
         encoder: a joint at q is measured to be at q + encoder_sin_once sin q + encoder_cos_once cos q +
             encoder_sin_twice sin 2q + encoder_cos_twice cos 2q.
-        lags: the second joint's torque has the lag lag + lag_difference.
+        lags: the second joint's torque has the lag lag + lag_difference, or with a pure delay the delay
+            delay + lag_difference.
 
     Raises ModelError for other names, for other than one or two joints, and for torque_scale with one joint.
     """

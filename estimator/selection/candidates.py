@@ -267,9 +267,7 @@ def richer_models(model: Model) -> dict[str, Model]:
 
 
 def _may_be(option: str, model: Model) -> bool:
-    if option == "lags":
-        return model.joints == 2 and model.drive != "delay"
-    return option != "torque_scale" or model.joints == 2
+    return option not in ("torque_scale", "lags") or model.joints == 2
 
 
 def _started(name: str, change: float, known: Mapping[str, float]) -> float:

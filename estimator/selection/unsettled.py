@@ -94,7 +94,7 @@ def choose_by_shooting(
             "a specific model"
         )
     joints = recordings[0].joints
-    unknown: tuple[Option, ...] = ("torque_scale",) if joints == 2 else ()
+    unknown: tuple[Option, ...] = ("torque_scale", "lags") if joints == 2 else ()
     search = _Search(recordings, start, length, zeros, options, "torque_scale" if torque_scale else None)
     plain = search.fit(Model(joints, "stribeck", drive, unknown), options=QUICK)
     if plain is None:
