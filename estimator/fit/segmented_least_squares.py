@@ -75,6 +75,8 @@ class Segmented:
     scores: Array
     """Gradient of each segment with respect to the shared coordinates, with its own eliminated (segments, shared)."""
     iterations: int
+    variance: float
+    """Mean square of the residuals per degree of freedom."""
     expected: Expected | None = None
     """The prior's contribution to `information` (shared, shared)."""
 
@@ -86,6 +88,9 @@ class Segmented:
         times the number of coordinates, correlations cannot be estimated; then a single factor scales the covariance
         for white noise. The covariance is infinite for coordinates that can change, alone or together, without
         affecting the residual.
+
+        At the minimum, the scores are smaller than those at the true values, most of all if few segments determine a
+        coordinate. No variance is therefore less than that for white noise with the variance of the residuals.
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.
@@ -103,6 +108,9 @@ class Segmented:
             if self.expected is not None:
                 meat += self.expected.weight * np.diag(self.expected.precision)
             covariance = bread @ meat @ bread
+        floor = self.variance * np.diag(bread) / np.maximum(np.diag(covariance), 1e-300)
+        wider = np.sqrt(np.maximum(floor, 1.0))
+        covariance *= np.outer(wider, wider)
         if groups is not None and np.unique(groups).size > 1:
             together = np.stack([self.scores[groups == group].sum(axis=0) for group in np.unique(groups)])
             fewer = len(together) / (len(together) - 1)
@@ -214,7 +222,9 @@ def minimise_segmented(
                 blocks = _blocks(derivative, shared, own, threads)
                 information, scores, _, _ = blocks.reduced(0.0)
                 information = information + np.diag(prior.precision)
-                return Segmented(shared, own, cost, information, scores, iteration, prior)
+                freedom = sum(map(np.count_nonzero, rows)) - shared.size - own.size  # residuals of 0 are missing
+                variance = _cost(rows) / max(freedom, 1)
+                return Segmented(shared, own, cost, information, scores, iteration, variance, prior)
     raise ConvergenceError(
         f"after {options.max_iterations} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} per "
         "iteration: try a simpler friction model or shorter segments"

@@ -234,10 +234,22 @@ def test_what_changes_together_and_leaves_no_trace_is_not_known() -> None:
     """Of three coordinates, the motion reveals the first and the sum of the others."""
     information = np.array([[4.0, 0.0, 0.0], [0.0, 9.0, 9.0], [0.0, 9.0, 9.0]])
     scores = np.array([[1.0, 0.5, 0.5], [-0.5, 1.0, 1.0]])
-    found = Segmented(np.zeros(3), np.zeros((2, 4)), 1.0, information, scores, 1)
+    found = Segmented(np.zeros(3), np.zeros((2, 4)), 1.0, information, scores, 1, 0.0)
     std = np.sqrt(np.diag(found.covariance()))
     assert np.isfinite(std[0]) and std[0] > 0.0
     assert np.isinf(std[1:]).all()
+
+
+@pytest.mark.parametrize("segments", [4, 40])
+def test_scores_that_the_fit_has_made_small_do_not_make_it_certain(segments: int) -> None:
+    """Errors are at least those of white noise; larger scores, as of correlated residuals, still increase them."""
+    scores = np.random.default_rng(3).normal(size=(segments, 2)) * np.array([0.1, 1.0]) * np.sqrt(8.0 / segments)
+    scores[:, 1] *= 5.0
+    information = np.diag([4.0, 9.0])
+    least = Segmented(np.zeros(2), np.zeros((segments, 4)), 1.0, information, 0.01 * scores, 1, 1.2).covariance()
+    assert np.diag(least) == pytest.approx([1.2 / 4.0, 1.2 / 9.0])
+    usual = Segmented(np.zeros(2), np.zeros((segments, 4)), 1.0, information, scores, 1, 1.2).covariance()
+    assert usual[0, 0] >= 1.2 / 4.0 and usual[1, 1] > 5.0 * 1.2 / 9.0
 
 
 def test_recordings_that_disagree_make_all_less_certain() -> None:
@@ -247,7 +259,7 @@ def test_recordings_that_disagree_make_all_less_certain() -> None:
     noise = random.normal(size=(12, 2))
     repeated = np.repeat([[3.0, -1.0], [-2.0, 2.0], [-1.0, -1.0]], 4, axis=0)
     alone, alike = (
-        Segmented(np.zeros(2), np.zeros((12, 4)), 1.0, np.eye(2), scores, 1) for scores in (noise, repeated)
+        Segmented(np.zeros(2), np.zeros((12, 4)), 1.0, np.eye(2), scores, 1, 0.0) for scores in (noise, repeated)
     )
     grown = [np.diag(found.covariance(groups) / found.covariance()) for found in (alone, alike)]
     assert grown[0].max() < 2.5
