@@ -87,7 +87,7 @@ class Recording:
     def mean_torque(self, edges: Array, delay: float | Array) -> Array:
         """Return the mean torque between neighbouring `edges` (n,) [s], with a delay of `delay` [s].
 
-        The result has the shape (joints, n - 1) [N m]. delay: one value or one per joint.
+        Returns (joints, n - 1) [N m]. delay: one value or one per joint.
         """
         at = self.time - self.command_to_sample
         delays = np.broadcast_to(delay, self.joints)

@@ -131,17 +131,15 @@ def _lagging(torque: Array, step: float, lag: float) -> Array:
 
 def grid_torque_slopes(recording: Recording, grid: Grid, delays: Array, lags: Array) -> Array:
     """Differentiate `grid_torque` with respect to each joint's delay and lag (2, joints, steps) [N m/s], by central
-    differences. Without a lag, both are the same, as the derivative with respect to a tiny lag would be.
+    differences. Without a lag, both are the same, as for a tiny lag.
     """
 
-    def at(delays: Array, lags: Array) -> Array:
-        return grid_torque(recording, grid, delays, lags)
+    def by(delay: Array | float, lag: Array | float) -> Array:
+        less, more = (grid_torque(recording, grid, delays + s * delay, lags + s * lag) for s in (-1.0, 1.0))
+        return np.asarray((more - less) / (2.0 * np.reshape(delay + lag, (-1, 1))))
 
-    late = (at(delays + DIFFERENCE, lags) - at(delays - DIFFERENCE, lags)) / (2.0 * DIFFERENCE)
-    if not np.all(lags > 0.0):
-        return np.stack((late, late))
-    change = np.minimum(DIFFERENCE, 0.1 * lags)
-    return np.stack((late, (at(delays, lags + change) - at(delays, lags - change)) / (2.0 * change[:, None])))
+    late = by(DIFFERENCE, 0.0)
+    return np.stack((late, by(0.0, np.minimum(DIFFERENCE, 0.1 * lags)) if np.all(lags > 0.0) else late))
 
 
 def _cubic(place: Array, steps: int) -> tuple[Indices, Array]:

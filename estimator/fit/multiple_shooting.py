@@ -8,9 +8,7 @@ state between them.
 
 Short segments are fitted first, since they converge even from a poor initial guess; a subset of them suffices to get
 close to the minimum. Longer segments then refine the result, first with coarse integration steps. A segment whose
-residual is larger than usual is downweighted accordingly. An example is a segment in which a joint stuck, which no
-smooth friction law reproduces; with equal weights, such segments would dominate. The typical size of small terms
-(`Term.spread`) serves as a prior, weighted relative to the residual.
+residual is larger than usual is downweighted accordingly. `Term.spread` serves as a prior.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -300,8 +298,6 @@ def estimate_by_shooting(
 ) -> ShootingEstimate:
     """Estimate parameters by maximum likelihood over all `recordings`, cut into segments.
 
-    The result is deterministic.
-
     Args:
         recordings: recordings of one arm.
         model: the model to fit.
@@ -379,8 +375,8 @@ def _fit(
 ) -> Segmented:
     residual, derivative = partial(problem.residual, coordinates), partial(problem.derivative, coordinates)
     expected = problem.expected(coordinates, shared, own)
-    move = coordinates.moved_in_proportion
-    return minimise_segmented(residual, derivative, shared, own, ftol, options.minimiser, expected, move)
+    moved = coordinates.moved_in_proportion
+    return minimise_segmented(residual, derivative, shared, own, ftol, options.minimiser, expected, moved)
 
 
 def _estimate(

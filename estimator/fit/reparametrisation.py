@@ -23,7 +23,7 @@ TYPICAL_CABLE = 0.15  # stiffness of a stiff cable, as a fraction of the RMS tor
 TYPICAL_COGGING = 0.01  # typical cogging, as a fraction of the RMS torque; only a scale
 LEAST_RISE = 0.05  # Stribeck rise below which nothing is disguised
 TYPICAL_SQUARE = 1.0 / 3.0  # mean square of a joint's speed, relative to that of its highest; only a guess
-MOST_DECREASE = 0.8  # of a positive base parameter in one step, relative to itself
+MOST_DECREASE = 0.8  # of a base parameter in one step, relative to itself
 TYPICAL_BEND = 0.01  # rad: typical presliding deflection; only a scale
 
 
@@ -75,18 +75,17 @@ class Coordinates:
         return y
 
     def moved_in_proportion(self, x: Array, step: Array) -> Array:
-        """Return the point that `step` (coordinates,) reaches from `x` if the base parameters themselves, rather than
-        their coordinates, change in proportion to it; both arrays may end with other coordinates.
+        """Return the point that `step` (coordinates,) reaches from `x`; both arrays may end with other coordinates.
 
-        Torques are linear in the base parameters. If a joint hardly moves, only sums of inertias are determined: a
-        straight valley in the parameters, but one so curved in their coordinates that a fit creeps along it.
+        Base parameters themselves change in proportion: valleys of undetermined sums of inertias are straight in these.
         """
         y, count = x + step, len(self.names)
-        linear = np.flatnonzero(self._positive_base)
-        y[linear] = x[linear] + np.log1p(np.maximum(step[linear], -MOST_DECREASE))
-        value, bound, rate = self.values(x[:count]), self.values(y[:count]), self.slopes(x[:count])
+        for index, term in enumerate(map(term_of, self.names)):
+            if term.part == "base" and term.range == "positive":
+                y[index] = x[index] + np.log1p(max(step[index], -MOST_DECREASE))
+        value, there, slope = self.values(x[:count]), self.values(y[:count]), self.slopes(x[:count])
         for share, first, second in self._shares:
-            part = (value[share] + rate[share] @ step[:count]) / np.sqrt(bound[first] * bound[second])
+            part = (value[share] + slope[share] @ step[:count]) / np.sqrt(there[first] * there[second])
             if abs(part) < self.options.max_initial_share:
                 y[share] = np.arctanh(part)
         return y
@@ -151,11 +150,6 @@ class Coordinates:
     @cached_property
     def _either_sign(self) -> Array:
         return np.array([term_of(name).range == "any" for name in self.names])
-
-    @cached_property
-    def _positive_base(self) -> Array:
-        terms = [term_of(name) for name in self.names]
-        return np.array([term.part == "base" and term.range == "positive" for term in terms])
 
     @cached_property
     def _floors(self) -> Array:

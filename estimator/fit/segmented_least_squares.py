@@ -2,7 +2,7 @@
 
 A segment's own unknowns only affect its own residuals, so the normal equations have an arrowhead structure: each
 segment's block is eliminated separately (Schur complement), and the corresponding columns of the Jacobian are computed
-for all segments at once. Hundreds of initial states cost as much as four.
+for all segments at once.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,9 +26,6 @@ Derivative = Callable[[int, Array, Array], tuple[Array, Array]]
 coordinates, then its own (rows, shared + own).
 """
 
-Move = Callable[[Array, Array], Array]
-"""Returns the shared coordinates (shared,) that a step (shared,) reaches from others, to first order their sum."""
-
 DEFAULTS = SegmentedMinimiserOptions()
 MIN_SEGMENTS = 3
 MIN_EIGENVALUE = 1e-12  # relative to the largest; directions below have no effect on the residual
@@ -44,11 +41,7 @@ class Expected:
     precision: Array
     """Inverse variances times `weight` (shared,), 0 without a prior."""
     weight: float = 1.0
-    """Mean square of the residual in units of the noise.
-
-    If the residual is larger than the noise, the data carry correspondingly less information, so the prior is weighted
-    by this factor.
-    """
+    """Mean square of the residual in units of the noise."""
 
     @classmethod
     def nothing(cls, size: int) -> "Expected":
@@ -76,7 +69,7 @@ class Segmented:
     """Gradient of each segment with respect to the shared coordinates, with its own eliminated (segments, shared)."""
     iterations: int
     variance: float
-    """Mean square of the residuals per degree of freedom."""
+    """Sum of squares per degree of freedom."""
     expected: Expected | None = None
     """The prior's contribution to `information` (shared, shared)."""
 
@@ -89,8 +82,7 @@ class Segmented:
         for white noise. The covariance is infinite for coordinates that can change, alone or together, without
         affecting the residual.
 
-        At the minimum, the scores are smaller than those at the true values, most of all if few segments determine a
-        coordinate. No variance is therefore less than that for white noise with the variance of the residuals.
+        Scores at the minimum are smaller than at the true values, so no variance is less than for white residuals.
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.
@@ -108,8 +100,7 @@ class Segmented:
             if self.expected is not None:
                 meat += self.expected.weight * np.diag(self.expected.precision)
             covariance = bread @ meat @ bread
-        floor = self.variance * np.diag(bread) / np.maximum(np.diag(covariance), 1e-300)
-        wider = np.sqrt(np.maximum(floor, 1.0))
+        wider = np.maximum(np.sqrt(self.variance * np.diag(bread) / np.maximum(np.diag(covariance), 1e-300)), 1.0)
         covariance *= np.outer(wider, wider)
         if groups is not None and np.unique(groups).size > 1:
             together = np.stack([self.scores[groups == group].sum(axis=0) for group in np.unique(groups)])
@@ -174,11 +165,11 @@ def minimise_segmented(
     ftol: float,
     options: SegmentedMinimiserOptions = DEFAULTS,
     expected: Expected | None = None,
-    move: Move = np.add,
+    move: Callable[[Array, Array], Array] = np.add,
 ) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
-    `residual` and `derivative` are called from several threads; the result does not depend on the number of threads.
+    `residual` and `derivative` are called from several threads, whose number does not change the result.
 
     Args:
         residual: returns the residuals of a segment.
@@ -188,7 +179,7 @@ def minimise_segmented(
         ftol: stop when the relative decrease of a step is below this.
         options: limits of the iteration.
         expected: prior on the shared coordinates.
-        move: returns the shared coordinates that a step reaches.
+        move: returns the shared coordinates that a step from others reaches.
 
     Raises:
         ConvergenceError: if the simulation diverges, or if the relative decrease still exceeds `options.unfinished`

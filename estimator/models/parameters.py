@@ -51,9 +51,7 @@ class Physics:
     encoder: Array = field(default_factory=lambda: np.zeros((2, len(ENCODER))))
     """Encoder errors by joint, in the order of ENCODER (2, terms) [rad]."""
     lag_difference: float = 0.0
-    """Lag of the second joint's torque minus the lag of the first joint's torque; without a lag, the difference of
-    their delays [s].
-    """
+    """Lag (without a lag, delay) of the second joint's torque minus that of the first joint's torque [s]."""
 
     @classmethod
     def of(cls, parameters: Mapping[str, float]) -> "Physics":

@@ -84,8 +84,8 @@ def held_out_errors(
     """Return the RMS error of predicted segments relative to the motion's RMS, per joint (joints,), and its median.
 
     The initial state of a segment is estimated from its first third; the rest is predicted from the torque alone. The
-    median is taken over segments, since the error of a segment in which the arm tumbles can be arbitrarily large. A
-    prediction that diverges counts as wrong by half a turn.
+    median is taken over segments, since the error can be huge if the arm tumbles. A prediction that diverges counts as
+    wrong by half a turn.
     """
     problem = _posed(recordings, estimate, of)
     values, joints = estimate.parameters, estimate.model.joints

@@ -2,8 +2,7 @@
 
 The procedure is the same as for settled periods (`hil.estimator.selection.settled`). Stribeck friction is fitted first.
 If it does not explain the motion, or if score tests find a significant term, all other smooth terms are added at once,
-with their typical sizes as a prior; then insignificant terms are removed. Every fit but the first starts from an
-earlier result.
+with their typical sizes as a prior; then insignificant terms are removed.
 
 If the motion is explained down to the noise, the likelihood decides. Otherwise a richer model may merely compensate for
 another missing term. Then every other segment of each recording is fitted and the rest are predicted, also by models
@@ -46,9 +45,7 @@ class SegmentTrial:
     held_out: Array | None
     """RMS error relative to the motion's RMS (joints,); None if the fit did not converge."""
     score: float
-    """Median of the segments' relative errors over all joints, since the error of a segment in which the arm tumbles
-    can be huge.
-    """
+    """Median of the segments' relative errors over all joints."""
     seconds: float
 
 

@@ -103,9 +103,7 @@ class Stabilised:
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
-    """Return the physics with a pure delay added to the lag, and `command_to_sample` [s] subtracted, by which commands
-    act earlier.
-    """
+    """Return the physics with the delay added to the lag, less `command_to_sample` [s]: commands act earlier."""
     return replace(physics, lag=max(physics.lag + physics.delay - command_to_sample, 1e-5), delay=0.0)
 
 

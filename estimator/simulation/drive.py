@@ -1,8 +1,4 @@
-"""Motor torque from the commanded torque: held, delayed, and averaged over each integration step.
-
-The code is compiled because the likelihood needs it in every simulation; in numpy, it would take up a third of the
-simulation time.
-"""
+"""Motor torque from the commanded torque: held, delayed, and averaged over each integration step."""
 
 import math
 from collections.abc import Callable
@@ -37,7 +33,7 @@ def torque_and_slopes(
 ) -> tuple[Array, Array]:
     """Return `motor_torque` and its derivatives (2, joints, samples, steps) [N m/s] with respect to delay and lag.
 
-    Without a lag, the derivatives with respect to both are the same, as those with respect to a tiny lag would be.
+    Without a lag, both are the same, as for a tiny lag.
     If a command changes exactly at the edge of a step and there is no lag, the derivative with respect to delay is
     one-sided, towards smaller delays.
     """
@@ -52,7 +48,7 @@ def _torque(
     joints, samples = command.shape
     total = np.zeros((joints, samples + 1))
     np.cumsum(command, axis=1, out=total[:, 1:])
-    delays, lags = (np.full(joints, each) if np.ndim(each) == 0 else np.array(each[:joints]) for each in (delay, lag))
+    delays, lags = (np.resize(np.asarray(each, dtype=np.float64), joints) for each in (delay, lag))
     edges = np.arange(steps + 1) / (steps * rate) + command_to_sample - delays[:, None]
     shifts = np.floor(edges * rate)
     phases = edges - shifts / rate

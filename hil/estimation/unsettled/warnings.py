@@ -127,21 +127,19 @@ def _flat(recordings: Sequence[Recording], joint: int, name: str, unexplained: b
 
 
 def _early(recordings: Sequence[Recording], estimate: ShootingEstimate) -> list[str]:
-    """Detect torques that are logged after they acted: their fitted delay is negative."""
+    """Detect a torque that is logged after it acted: its fitted delay is negative."""
     if "delay" not in estimate.names:
         return []
-    found, own = [], "lag_difference_2" in estimate.names and "lag" not in estimate.names
-    for joint in range(1, 3 if own else 2):
-        at = [estimate.names.index(name) for name in ("delay", *(("lag_difference_2",) if joint == 2 else ()))]
-        delay, std = float(estimate.value[at].sum()), float(np.sqrt(estimate.covariance[np.ix_(at, at)].sum()))
-        intervals = -delay / float(np.median([each.interval for each in recordings]))
-        if delay + CERTAIN * std < 0.0 and intervals >= LEAST_EARLY:
-            found.append(
-                f"The delay{f' of joint {joint}' if own else ''} is negative, {1e3 * delay:.3g} ms ({intervals:.2g} "
-                "samples): the torque acted before the time at which it is logged, or the positions are logged too "
-                "early. The fit allows for it; correct the times, or shift the torque column, before you use the delay."
-            )
-    return found
+    index = estimate.names.index("delay")
+    delay, std = float(estimate.value[index]), float(estimate.std[index])
+    intervals = -delay / float(np.median([each.interval for each in recordings]))
+    if delay + CERTAIN * std >= 0.0 or intervals < LEAST_EARLY:
+        return []
+    return [
+        f"The delay is negative, {1e3 * delay:.3g} ms ({intervals:.2g} samples): the torque acted before the time at "
+        "which it is logged, or the positions are logged too early. The fit allows for it; correct the times, or shift "
+        "the torque column, before you use the delay."
+    ]
 
 
 def _weak(estimate: ShootingEstimate, gravity: bool) -> list[str]:
