@@ -6,8 +6,8 @@ identification techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical
 The segments are not joined, since effects that a rigid arm does not have, such as backlash and flexing, may change the
 state between them.
 
-Short segments are fitted first, since they converge even from a poor initial guess; a subset of them suffices to get
-close to the minimum. Longer segments then refine the result, first with coarse integration steps. A segment whose
+Short segments are fitted first, since they converge even from a poor initial guess. Longer segments then refine the
+result, first with coarse integration steps. A segment whose
 residual is larger than usual is downweighted accordingly. `Term.spread` serves as a prior.
 """
 
@@ -308,7 +308,7 @@ def estimate_by_shooting(
             every start. They can only be determined with gravity.
         of: which segments of each recording to fit; the others are left for validation.
         near: estimate with another model or other segments of the same recordings, used as the only initial guess.
-        options: tolerances and limits.
+        options: tolerances.
 
     Raises:
         RecordingError: if no segment is long enough.

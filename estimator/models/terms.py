@@ -278,7 +278,7 @@ _DECLARED = (
     Term(
         "lag_difference",
         "s",
-        "lag of the joint's torque relative to joint 1's; without a lag, the difference of their delays",
+        "lag of the joint's torque relative to joint 1's; without lags, of its delay",
         part="lags",
         first_joint=2,
         range="any",

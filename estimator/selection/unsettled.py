@@ -1,6 +1,6 @@
 """Friction model selection for recordings without a settled period.
 
-The procedure is the same as for settled periods (`hil.estimator.selection.settled`). Stribeck friction is fitted first.
+As for settled periods (`hil.estimator.selection.settled`), Stribeck friction is fitted first.
 If it does not explain the motion, or if score tests find a significant term, all other smooth terms are added at once,
 with their typical sizes as a prior; then insignificant terms are removed.
 
