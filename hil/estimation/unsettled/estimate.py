@@ -44,7 +44,7 @@ JUMPED = (
     "A position jumped (see the warnings), so angles before and after the jump are inconsistent: use only the part "
     "before or after it, or put each part in a separate file."
 )
-NOT_HERE = ("ripple", "cogging", "encoder", "lags")
+NOT_HERE = ("ripple", "cogging", "encoder")
 
 
 @dataclass(frozen=True)
