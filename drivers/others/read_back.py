@@ -204,7 +204,7 @@ class ReadBack:
 
     def _are_latest(self, servos: Sequence[Answer], goals: Sequence[int]) -> bool:
         """Return whether all servos hold their latest goals and report no error, as usual."""
-        watchdogs = []
+        watchdogs: list[tuple[int, int]] = []
         for answer, goal in zip(servos, goals, strict=True):
             if not answer or answer[0] or answer[-1] != goal:
                 return False
