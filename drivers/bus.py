@@ -337,9 +337,9 @@ class ServoBus(TorqueSwitch):
 
     @property
     def watchdog_changed(self) -> tuple[int, int] | None:
-        """Index of a joint whose Bus Watchdog, read back last, is not as armed, and its value [20 ms]; else None.
+        """Index of a joint whose Bus Watchdog, as last read back, is not as armed, and its value [20 ms]; else None.
 
-        One that has tripped is not included: why is only known once the time without packets has been looked at.
+        A tripped watchdog is not included: its cause depends on how long no packets were sent.
         """
         expected = self.armed_ticks, WATCHDOG_TRIPPED
         for place, ticks in self.prepared.watchdogs:

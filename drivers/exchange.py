@@ -151,7 +151,7 @@ class Exchange:
         self._read_back: ReadBack | None = None
         self._interval = interval
         self._overtime = OVERTIME_SHARE * interval if status is None else 0.0
-        """By how much an overdue read-back may delay the next cycle [s]: not at all if a status shows the same."""
+        """How long an overdue read-back may delay the next cycle [s]: 0 if a status read shows the same."""
         self.awaited_until = -math.inf
         """Reply deadline of the latest repeated read-back, which may delay the next cycle [s on the port's clock]."""
         self.read_back_at = math.inf
@@ -228,12 +228,12 @@ class Exchange:
 
     @property
     def watchdogs(self) -> Sequence[tuple[int, int]]:
-        """Index of each servo in the latest read-back of goals, and its Bus Watchdog."""
+        """Index and Bus Watchdog of each servo in the latest read-back of goals."""
         return () if self._read_back is None else self._read_back.watchdogs
 
     @property
     def lost(self) -> Overruled | None:
-        """A servo that read-backs show to have missed many of the latest goals; None if there is none."""
+        """A servo that has missed many of the latest goals, according to read-backs; else None."""
         return self._read_back.lost if self._read_back is not None else None
 
     def overruled(self, due: float) -> Overruled | None:
@@ -264,7 +264,7 @@ class Exchange:
         return self._wire_s[read] + max(off_wire, back.longest)
 
     def _held(self, back: ReadBack, due: float) -> Overruled | None:
-        """Read back once if this is possible before `due` [s], or a little later if it is overdue."""
+        """Read back once if that can end by `due` [s], or slightly later if a read-back is overdue."""
         port, now, read = self._port, self._now(), back.read
         takes = self._takes(read, back)
         latest = due

@@ -52,7 +52,7 @@ class SdkPort:
             port.overheard = b""
 
     def hear(self, received: bytes) -> None:
-        """Count another master's instructions among bytes other than a reply."""
+        """Count another master's instructions among bytes that belong to no reply."""
         if received and not self._port.echoes:
             self._port.strangers += sum(not packet.is_status for packet in Framer().feed(received))
 
@@ -95,7 +95,7 @@ class SdkPort:
 
 
 class ResyncingPacketHandler(Protocol2PacketHandler):  # type: ignore[misc]
-    """The SDK's packet handler, made robust to noise before a reply.
+    """The SDK's packet handler, made robust against noise before a reply.
 
     The SDK gives up when bytes that look like the beginning of a packet turn out not to be one. Here, the search
     continues after them until the timeout. `heard` is the ID of the last reply found, -1 after a reset.

@@ -154,7 +154,7 @@ class Servo:
         self._try(f"writing {value} to {register}", send, attempts)
 
     def let_answer(self) -> None:
-        """Set Status Return Level to 2 if pings are answered, as with level 0. Raises the same errors as `ping`."""
+        """Set Status Return Level to 2 if the servo answers pings (as at level 0). Raises the same errors as `ping`."""
         self.ping(attempts=1)
         with suppress(NoReply):
             self.write_only("Status Return Level", 2, attempts=1)
@@ -185,8 +185,8 @@ class Servo:
             self.port.discard_input()
         if result == COMM_RX_TIMEOUT and len(others) == 1 and (other := others.pop()) not in (-1, self.id):
             raise NoReply(
-                f"{self.title} is answered with ID {other} instead of its own ({what}): their IDs or their replies are "
-                "mixed up. Check that every servo has its own ID, and whether a device on the bus changes replies."
+                f"Requests to {self.title} are answered with ID {other} ({what}): the servos' IDs or replies "
+                "are mixed up. Check that every servo has its own ID, and whether a device on the bus changes replies."
             )
         if result == COMM_RX_TIMEOUT:
             raise NoReply(

@@ -30,7 +30,7 @@ def compiled(function: Callable[..., Any], **options: Any) -> Any:
 
 
 def inner(function: Any, **options: Any) -> Any:
-    """Compile a function to be called by compiled loops: it runs without the GIL and has no wrapper for C."""
+    """Compile a function to be called by compiled loops: it runs without the GIL and has no C wrapper."""
     compile_it: Any = numba.njit
     return compile_it(nogil=True, error_model="numpy", no_cfunc_wrapper=True, **options)(function)
 

@@ -50,7 +50,7 @@ def _guarded(function: Callable[Arguments, Result]) -> Callable[Arguments, Resul
                 raise
             raise ConvergenceError(
                 f"the equations of the fit cannot be solved ({error}): a simulated motion diverges, or the motion "
-                "provides no information on some parameter. Check the units and signs of torque and angle, and "
+                "provides no information about some parameter. Check the units and signs of torque and angle, and "
                 "whether the arm was the same throughout the recording"
             ) from error
 

@@ -37,12 +37,12 @@ def _read(path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         if file.suffix.lower() != ".json":
             raise ResultError(
-                f"{file} is not a model file of hil. Give a run folder, its result.json, or the TOML or JSON file of "
+                f"{file} is not a hil model file. Give a run folder, its result.json, or a TOML or JSON file from "
                 "hil export."
             ) from error
         raise ResultError(f"{file} is incomplete or damaged: {error}. Recreate it with hil estimate RUN.") from error
     if not isinstance(result, dict) or "schema" not in result:
-        raise ResultError(f"{file} is not a result file of hil: it has no schema.")
+        raise ResultError(f"{file} is not a hil result file: it has no schema.")
     if result["schema"] != SCHEMA:
         raise ResultError(
             f"{file}: schema is {result['schema']!r}, but this version of hil reads {SCHEMA}; the file was written by "

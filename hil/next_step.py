@@ -20,7 +20,7 @@ def command(*words: object) -> str:
 
 
 def _quoted(word: str) -> str:
-    """Quote a word, as $'...' (bash) if it has characters that cannot be printed."""
+    """Quote a word, as $'...' (bash) if it has unprintable characters."""
     if word.isprintable():
         return shlex.quote(word)
     # Python writes bytes alike, and in single quotes if a double one is among them.

@@ -210,7 +210,7 @@ def _meant(value: object, expected: str) -> str:
 
 def meant_name(given: str, names: Sequence[str]) -> str:
     """Return the intended name: the same except for case, spaces and dashes, or the most similar one; "" if none is
-    similar. Short names are not similar: grad is not rad.
+    similar. Short names never count as similar: grad is not rad.
     """
     plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in names}
     bare = re.sub(r"[^a-z0-9]", "", given.lower())

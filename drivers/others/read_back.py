@@ -50,8 +50,8 @@ share `_AGAIN_SHARE` of one. In longer ones, read-backs are rarely destroyed, an
 """
 
 OVERDUE_S, OVERTIME_SHARE = 0.15, 0.8
-"""If nothing was read back for `OVERDUE_S` [s] because cycles leave no time for it, nor for a status, a read-back may
-delay the next cycle by up to this fraction of a cycle: otherwise a disarmed watchdog would never be seen.
+"""If nothing was read back for `OVERDUE_S` [s] because cycles leave no time for that or a status read, a read-back
+may delay the next cycle by up to this fraction of a cycle: otherwise, a disarmed watchdog would never be seen.
 """
 
 LOST_GOALS, LOST_OF = 3, 6
@@ -82,8 +82,8 @@ class Overruled(NamedTuple):
 class ReadBack:
     """Reads back the goals that the servos hold right before a cycle, and occasionally their settings instead.
 
-    goal: a span of Bus Watchdog and goal. mode: a span that ends with the settings; `modes` are their values, equally
-    many for each servo. A change to one of these settings reverses the motor, shifts every angle, or changes the
+    goal: a span of Bus Watchdog and goal. mode: a span that ends with the settings; `modes` are their values, the
+    same number for each servo. A change to one of these settings reverses the motor, shifts every angle, or changes the
     meaning of goals. interval: time between two cycles [s], 0 if unknown.
 
     Every cycle overwrites the goals of another master. A master that writes less often than this program is therefore
@@ -130,9 +130,9 @@ class ReadBack:
         self._missed: list[deque[int]] = [deque(maxlen=LOST_GOALS) for _ in ids]
         """Indices of the latest read-backs that found an older goal of this program, by servo."""
         self.watchdogs: list[tuple[int, int]] = []
-        """Index among the IDs and Bus Watchdog of each servo that answered the latest read-back, if it was of goals."""
+        """Index and Bus Watchdog of each servo that answered the latest read-back, if that was of goals."""
         self.overdue_at = math.inf
-        """When a read-back may delay a cycle, if nothing has been read back until then [s]."""
+        """Time from which a read-back may delay a cycle if nothing is read back before [s]."""
         self.doubts_until = -math.inf
         self.sighted: Overruled | None = None
         """The latest value read back that this program did not write; it is treated as recent until `doubts_until`."""
@@ -146,11 +146,11 @@ class ReadBack:
         self.longest = max(_FADES * self.longest, seconds)
 
     def postponed(self, now: float) -> None:
-        """Process that a cycle leaves no time for a read-back."""
+        """Note that a cycle leaves no time for a read-back."""
         self.overdue_at = min(self.overdue_at, now + OVERDUE_S)
 
     def may_repeat(self, now: float, takes: float) -> bool:
-        """Whether a lost read-back that takes `takes` [s] is repeated at once."""
+        """Whether to repeat a lost read-back, which takes `takes` [s], at once."""
         if takes >= self._longest_again or now <= self._repeated_at + TRY_AGAIN_S:
             return False
         self._repeated_at = now

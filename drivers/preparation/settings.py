@@ -31,10 +31,10 @@ PROTECTIVE = (
 restores them if another program has changed them meanwhile.
 
 Other writable EEPROM registers are not restored:
-- PWM Limit, Drive Mode, Homing Offset, Return Delay Time: a person may have wanted the change, and restoring it
-  unasked would change what angles and goals mean to them. It is reported, with the former value.
-- ID, Baud Rate, Protocol Type: after a change the servo no longer answers here, which the guard reports.
-- Startup Configuration: the SDK's tables lack it; the next start refuses a servo that arms itself.
+- PWM Limit, Drive Mode, Homing Offset, Return Delay Time: the user may have wanted the change, and restoring it
+  unasked would change what angles and goals mean. It is reported, with the former value.
+- ID, Baud Rate, Protocol Type: after a change, the servo no longer answers; the guard reports this.
+- Startup Configuration: the SDK's tables lack it; the next start refuses a servo that switches its torque on itself.
 - Moving Threshold, External Port Mode: they affect neither the motion nor the replies that this program uses.
 """
 

@@ -49,7 +49,7 @@ class TorqueOff:
     unwatched: joints, of either group, whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
     rebooted: confirmed joints whose servos had lost the watchdog that was armed before torque came on.
-    tripped: joints whose Bus Watchdog may have acted, which zeroes their goals; it has been cleared since.
+    tripped: joints whose Bus Watchdog may have tripped, which zeroes their goals; it has been cleared since.
     driven: joints in neither group, whose servos' torque is on because another program switches it on whenever it is
     cut.
     """
@@ -96,7 +96,7 @@ class TorqueOff:
         return " ".join((self._outcome(), *self._answers()))
 
     def _answers(self) -> Iterator[str]:
-        """Yield sentences on servos that were silent or rebooted and have answered since."""
+        """Yield sentences about servos that were silent or rebooted and have answered since."""
         for joint in self.confirmed:
             if joint in self.later:
                 yield f"{joint.title} did not answer at first, but answers again."

@@ -164,7 +164,7 @@ class TorqueSwitch:
             self._tell_watchdogs(seconds)
 
     def rearm_watchdogs(self) -> None:
-        """Set the armed Bus Watchdogs again, after another program has changed them. Nothing is read back."""
+        """Rearm the Bus Watchdogs after another program has changed them. Nothing is read back."""
         self._tell_watchdogs(self._watchdog)
 
     def _tell_watchdogs(self, seconds: float) -> None:

@@ -48,7 +48,7 @@ class Signs:
         return (*named, *(f"the position of joint {joint}" for joint, sign in enumerate(self.position, 1) if sign < 0))
 
     def said(self, joints: Sequence[str] = ()) -> str:
-        """The subject of a sentence on the reversed signs, such as "the signs of both torques".
+        """The subject of a sentence about the reversed signs, such as "the signs of both torques".
 
         joints: names of the joints, by default their numbers.
         """
@@ -133,8 +133,8 @@ class Absolute:
 def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = ()) -> Absolute | None:
     """Return evidence that joint 2's angle is absolute; None if that does not explain the recordings much better.
 
-    turned: angles [rad] that may have to be added to the difference between the angles, because they were measured from
-    other directions; quarter turns are always tried. The first that explains the recordings as well as any is chosen.
+    turned: angles [rad] to try adding to the difference, in case the two angles were measured from different
+    directions; quarter turns are always tried. The first that explains the recordings as well as any is chosen.
     """
     if recordings[0].joints != 2:
         return None
@@ -148,7 +148,7 @@ def suspect_absolute(recordings: Sequence[Recording], turned: Sequence[float] = 
 
 
 def suspect_absolute_unzeroed(recordings: Sequence[Recording]) -> Absolute | None:
-    """Return the same evidence for recordings whose zeros are unknown: those of the difference come from gravity."""
+    """Return the same evidence for recordings with unknown zeros: after the change, gravity determines them."""
     if recordings[0].joints != 2:
         return None
     apart = [_difference(each, 0.0) for each in recordings]

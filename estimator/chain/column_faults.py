@@ -48,14 +48,14 @@ TIMES = np.array([0.1, 0.2, 0.25, 1.0 / 3.0, 0.5, 0.7, 1.4, 2.0, 3.0, 4.0, 5.0, 
 @dataclass(frozen=True)
 class Reversed:
     """Reversed columns. residuals: relative RMS of the worst joint's torque residual with the change, and as given.
-    impossible: whether friction is negative as given, as if all torques or a first, vertical joint are reversed.
+    impossible: whether friction is negative as given, as when all torques or a vertical first joint are reversed.
     """
 
     residuals: tuple[float, float]
     signs: Signs
     impossible: bool
     instead: Signs | None = None
-    """A reversal of as few columns that explains the recordings as well."""
+    """Another reversal of as many columns that explains the recordings equally well."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Late:
 
     residuals: tuple[float, float]
     joint: int | None
-    """The joint, counted from 0; None if all torques are late, and the residuals are those of the worst joint."""
+    """The joint, counted from 0; None if all torques are late; the residuals are then those of the worst joint."""
     seconds: float
 
 
@@ -98,12 +98,12 @@ class _Solved:
         return float(self.relative.max())
 
     def distance(self, prior: Prior) -> float:
-        """Squared distance of the base parameters from the description, in its standard deviations."""
+        """Squared distance of the base parameters from the description, in standard deviations."""
         return float(np.sum(np.square((self.value[: prior.value.size] - prior.value) / prior.std)))
 
     @property
     def misfit(self) -> float:
-        """Logarithm of the likelihood, negative, with the torque of each joint in its own unit."""
+        """Negative log likelihood, up to a constant, with each joint's torque in its own unit."""
         return float(np.log(self.relative).sum())
 
 
@@ -119,7 +119,7 @@ class ColumnCheck:
 
     @classmethod
     def of(cls, recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> "ColumnCheck | None":
-        """Filter like the regression; None if the recordings are too short for that."""
+        """Filter as the regression does; None if the recordings are too short for that."""
         for cutoff in CUTOFFS:
             with suppress(RecordingError):
                 check = cls(recordings, model, prior, cutoff, LAG)
@@ -147,7 +147,7 @@ class ColumnCheck:
 
     @property
     def suspicious(self) -> bool:
-        """Whether inverse dynamics leaves so much of the torque that a mistake is worth looking for."""
+        """Whether inverse dynamics leaves so much torque unexplained that a mistake is worth looking for."""
         return self._given[1].worst > SUSPICIOUS or self._dissipates_too_little(self._given[1])
 
     def reversed_columns(self) -> Reversed | None:
@@ -220,7 +220,8 @@ class ColumnCheck:
     def contradictory_torques(self) -> tuple[float, ...] | None:
         """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better.
 
-        The links' prior is weak and friction absorbs much, so a small gain is evidence; the likelihood can then decide.
+        The links' prior is weak and friction absorbs much of an error, so a small gain is evidence; the likelihood can
+        decide then.
         """
         normal, given = self._given
         factors, best = np.ones(self.model.joints), given
@@ -237,7 +238,7 @@ class ColumnCheck:
         return tuple(factors.tolist())
 
     def wrong_times(self) -> WrongTimes | None:
-        """The factor of the times that explains the recordings much better, by gravity and the described geometry."""
+        """The time scale that explains the recordings much better, given gravity and the described geometry."""
         given = self._given[1]
         if not np.any(self.model.base.chain.gravity):
             return None
@@ -258,7 +259,7 @@ class ColumnCheck:
             return np.inf
 
     def _dissipates_too_little(self, found: _Solved) -> bool:
-        """Whether more friction terms are significantly negative than positive, or all of one joint are negative."""
+        """Whether more friction terms are significantly negative than positive, or all those of a joint are."""
         start, joints = self.model.base.count, self.model.joints
         over = (found.value / found.std)[start : start + 2 * joints].reshape(2, joints)
         negative = over < -SIGNIFICANT
@@ -285,7 +286,7 @@ class _Normal:
         return cls(squares, *_driven(columns, torque), rows)
 
     def driven_by(self, columns: Array, torque: Array) -> "_Normal":
-        """The equations with other torques; `columns` are those of `of`."""
+        """The equations with other torques; `columns`: as for `of`."""
         return _Normal(self.squares, *_driven(columns, torque), self.rows)
 
     def solved(self, factors: Array, prior: Prior) -> _Solved:
@@ -314,7 +315,7 @@ def _driven(columns: Array, torque: Array) -> tuple[Array, Array]:
 
 
 def _turned(joints: int) -> Iterator[tuple[int, ...]]:
-    """Yield the signs of the angles that are tried: as given, one joint's reversed, all reversed."""
+    """Yield the signs of the angles to try: as given, one joint's reversed, all reversed."""
     yield (1,) * joints
     for joint in range(joints):
         yield tuple(-1 if each == joint else 1 for each in range(joints))

@@ -106,7 +106,7 @@ def identify_chain(
 
     `prior` supplies what the data barely constrain (`ChainEstimate.from_prior`). `added`: see `fit_lines`; for a
     model with `added_mass`. test_zeros: whether to test the encoder zeros that `model` holds fixed
-    (`ChainEstimate.doubtful_zeros`), which takes a tenth longer. Raises ModelError if `model` and a period differ in
+    (`ChainEstimate.doubtful_zeros`), which takes 10 % longer. Raises ModelError if `model` and a period differ in
     their number of joints, ConvergenceError if no minimum is found.
     """
     given = (periods,) if isinstance(periods, SettledPeriod) else tuple(periods)

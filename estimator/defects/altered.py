@@ -273,7 +273,7 @@ class _Posed:
 
 
 def _with_every_friction(found: ShootingEstimate) -> ShootingEstimate:
-    """Return the estimate with all dry-friction terms, so that no defect imitates them; added ones have no effect."""
+    """Return the estimate with all dry-friction terms, so that no defect imitates them; new ones have no effect."""
     model = replace(found.model, friction=FRICTIONS[-1])
     values = {name: term_of(name).initial for name in model.names} | {
         f"load_{joint}": 0.0 for joint in range(1, model.joints + 1)

@@ -54,7 +54,7 @@ def memory(count: int) -> Array:
 
 
 def forget(past: Any) -> None:
-    """Discard the stored moments, since the motion since the previous sample is unknown."""
+    """Discard the stored moments because the motion since the previous sample is unknown."""
     past[_SLOTS + 1] = 0.0
 
 

@@ -235,7 +235,7 @@ def _gain(m: Any, i: int, row: Any) -> float:
 
 
 def _learn(m: Any, row: Any, gain: Any, lacking: float, spread: float, first: int) -> None:
-    """Update the parameters from `first` on; the uncertainty of those before it is taken into account (Schmidt)."""
+    """Update the parameters from `first` on, allowing for the uncertainty of the others (Schmidt-Kalman filter)."""
     for i in range(_COUNT):
         gain[i] = _gain(m, i, row)
     for i in range(_COUNT):
@@ -356,10 +356,10 @@ def _remember_acceleration(m: Any, j: int, row: Any, dt: float) -> None:
 
 
 def _accelerates(m: Any, j: int, slope: float) -> bool:
-    """Return whether recent accelerations stand out from the rounding of velocities.
+    """Return whether recent accelerations exceed the rounding of velocities.
 
-    If they do not, inertias are not learnt: errors of that size in the regressors would draw them towards zero, and
-    leave the estimate of everything else wrong and too certain.
+    Otherwise, inertias are not learnt: errors of that size in the regressors would bias them towards zero and make all
+    other estimates wrong and overconfident.
     """
     rounding = slope * _VELOCITY_STD
     return bool(m[_PENDING, _SHARPEST + j] >= (_SHOWN * rounding) ** 2)

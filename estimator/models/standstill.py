@@ -55,7 +55,7 @@ def is_suspect(rest: Any) -> bool:
 
 
 def forget(rest: Any) -> None:
-    """Discard the current standstill, since the motion since the previous sample is unknown."""
+    """Discard the current standstill because the motion since the previous sample is unknown."""
     rest[_SEEN] = rest[_RANGE] = rest[_UP] = rest[_DOWN] = rest[_LASTS] = 0.0
 
 

@@ -116,15 +116,15 @@ def _trust(left: float, held_out: Array | None, weakest: float, evidence: Segmen
 
 
 def _refused(left: float, held_out: Array | None, evidence: SegmentEvidence) -> tuple[str, ...]:
-    """Name the rule by which the verdict is no, and a remedy unless the recordings are already said to be at fault."""
+    """Name the rule that makes the verdict "no", and a remedy unless the recordings are already said to be at fault."""
     if evidence.faulty:
         return ()
     remedy = "" if evidence.spoiled else ": check the columns, their units, and whether anything touched the arm"
     if held_out is None:
-        rule = f"Without that check, a residual above {MUCH_LEFT:g} times the noise gives the verdict no"
+        rule = f'Without that check, a residual above {MUCH_LEFT:g} times the noise makes the verdict "no"'
         return (f"{rule}{remedy}.",) if left > MUCH_LEFT else ()
     wrong = not float(held_out.max()) <= USABLE_PREDICTION
-    return (f"An error above {percent(USABLE_PREDICTION)} gives the verdict no{remedy}.",) if wrong else ()
+    return (f'An error above {percent(USABLE_PREDICTION)} makes the verdict "no"{remedy}.',) if wrong else ()
 
 
 def _left(estimate: ShootingEstimate, evidence: SegmentEvidence, trust: Trust) -> str:

@@ -178,7 +178,7 @@ def _in_words(part: str) -> str:
 
 
 def _spoilt(validation: Validation, trust: Trust) -> str:
-    """Return a sentence on the parameters that the model error may bias, judged by their inflated standard errors."""
+    """Return a sentence about parameters that the model error may bias, judged by their inflated standard errors."""
     worst = {name: part for name, part in validation.relative_std.items() if part > WELL_KNOWN}
     if not worst and trust == "no":
         return "This error may bias all parameters, regardless of their standard errors."
@@ -199,7 +199,7 @@ def _spoilt(validation: Validation, trust: Trust) -> str:
 
 
 def _distorted(validation: Validation) -> tuple[str, ...]:
-    """Return sentences on the response on unexcited lines, and on the part of it that the model does not explain."""
+    """Return sentences about the response on unexcited lines, and on the part of it that the model does not explain."""
     levels = validation.levels.lines
     if levels.odd is None or levels.even is None:
         return (
@@ -309,7 +309,7 @@ def _weak(validation: Validation, torque_limit: str) -> tuple[str, ...]:
         return (f"The least certain parameter is {name}, known to within {percent(part)}.",)
     improvement = improvement_of(name, torque_limit)
     if not np.isfinite(part):
-        return (f"This motion provides no information on {name}. To identify it, use {improvement}.",)
+        return (f"This motion provides no information about {name}. To identify it, use {improvement}.",)
     if part > WEAK and not _is_weak(validation, name):
         share = 100 * validation.torque_std[name]
         return (

@@ -425,7 +425,7 @@ class EmulatedServo(Powered):
         by_goal = memory.get("Drive Mode") & _TORQUE_ON_BY_GOAL_UPDATE
         accepts = bool(self.model.operating_modes) and not by_goal and watchdog != WATCHDOG_TRIPPED
         self._goal_pwm_limit = memory.get("PWM Limit") if accepts and "Goal PWM" in memory else -1
-        """Largest Goal PWM on the fast path [ticks]; -1 if it takes the general one."""
+        """Largest Goal PWM on the fast path [ticks]; -1 if the general path is used."""
         # The fast path bypasses the controller, which computes the current where the supply limits it.
         self._takes_goal_current = accepts and not self._voltage_limited and self._current_limit >= 0
         if self.needs_ticks:

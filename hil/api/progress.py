@@ -47,7 +47,7 @@ def forgiving(listener: OnProgress) -> OnProgress:
     and is passed on.
     """
     if not callable(listener):
-        raise TypeError(f"on_progress must be a function of one Progress, not {listener!r}.")
+        raise TypeError(f"on_progress must be a function that takes one Progress, not {listener!r}.")
     owner, failed = threading.current_thread(), False
 
     def tell(progress: Progress) -> None:

@@ -57,7 +57,7 @@ def message(error: Exception) -> str:
 
 
 class Command(TyperCommand):
-    """A subcommand whose errors show the wrong value."""
+    """A subcommand whose error messages show the invalid value."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         try:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 def require_output() -> None:
-    """Exit if standard output is closed (`>&-`): the next file to be opened would take its place."""
+    """Exit if standard output is closed (`>&-`): the next file opened would take its place."""
     if sys.stdout is None:
         print("hil: standard output is closed. Redirect it, for example to /dev/null.", file=sys.stderr)
         sys.exit(1)

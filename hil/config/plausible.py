@@ -96,7 +96,7 @@ def _angles(key: str, values: Sequence[float], most: float = _MOST_TURN_RAD) -> 
         shown = ", ".join(f"{value:g}" for value in values)
         turns = max(abs(value) for value in values) / (2 * math.pi)
         hint = in_other_units(values, "rad", lambda value: abs(value) <= most)
-        said = f"that is up to {turns:.2g} turns; the most allowed is {most:.4g} rad"
+        said = f"that is up to {turns:.2g} turns; at most {most:.4g} rad is allowed"
         yield f"{key} = [{shown}] rad: {said}" + (f". {hint}" if hint else "")
 
 

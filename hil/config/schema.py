@@ -197,7 +197,7 @@ class Config(Table):
     stabiliser: StabiliserConfig | None = None
     clearance: ClearanceConfig = ClearanceConfig()
     known: KnownConfig | None = None
-    columns: Columns | None = Field(None, description="of recordings made with other tools; hil.config.csv_columns")
+    columns: Columns | None = Field(None, description="of recordings made with other tools; see hil.config.csv_columns")
     fake: FakeArm | None = None
 
     @model_validator(mode="before")

@@ -60,7 +60,7 @@ class Way(StrEnum):
     """How the arm is stopped.
 
     CUT: torque off. BRAKED: braked, then torque off. REVERSED: braking accelerates the joint because a sign is
-    reversed, so braking ends and torque is cut. SILENT: some or all servos receive nothing until their watchdogs act.
+    reversed, so braking ends and torque is cut. SILENT: some or all servos receive nothing until their watchdogs trip.
     SILENT_BRAKE: the same, from the moment at which braking begins.
     """
 
@@ -309,7 +309,7 @@ class _Stops:
         yield [(start.goal, self._none, _REACTION), (pushed, self._none, NOTICED_AFTER), self._off]
 
     def silent(self, start: _Start) -> Iterator[list[_Piece]]:
-        """Servos keep their goals until their watchdogs act: all of them, or one while the others are cut earlier."""
+        """Servos keep their goals until their watchdogs trip: all of them, or one while the others are cut earlier."""
         kept = (start.goal, self._none, self._heard_for)
         yield [kept, self._off]
         for silent in range(start.goal.size if start.goal.size > 1 else 0):

@@ -246,13 +246,13 @@ def _stops(config: Config, stopping: Stopping) -> list[str]:
     lines = []
     if max(stopped.max(), silent.max()) < _NOTHING_RAD:
         lines.append(
-            "Stopped at any moment, no joint overshoots its limits, not even if the program is killed or the cable "
+            "Whenever the arm is stopped, no joint overshoots its limits, even if the program is killed or the cable "
             "unplugged."
         )
     else:
         lines += [
-            f"Stopped at any moment, {joint.name} overshoots its limits by {_far(stopped[index])}; if the program is "
-            f"killed or the cable unplugged, by {_far(silent[index])}."
+            f"Whenever the arm is stopped, {joint.name} overshoots its limits by {_far(stopped[index])}; if the "
+            f"program is killed or the cable unplugged, by {_far(silent[index])}."
             for index, joint in enumerate(config.joints)
         ]
     lines += [

@@ -12,7 +12,7 @@ from hil.runs.run_folder import RunFolder
 
 
 def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
-    """Sentences on what remains of a stopped run; the last gives the next command.
+    """Sentences about what remains of a stopped run; the last gives the next command.
 
     command: the subcommand that was stopped. shown: the configuration's path as the user wrote it.
     """
@@ -31,7 +31,7 @@ def after_a_stop(run: RunFolder, command: str, shown: Path) -> list[str]:
 
 
 def after_a_failure(run: RunFolder, shown: Path) -> list[str]:
-    """Sentences on what remains after the guard or a failed servo stopped a run; the last gives the next command."""
+    """Sentences about what remains after the guard or a failed servo stopped a run; the last gives the next command."""
     if can_be_estimated(run.path):
         return ["The recording is kept and complete enough for an estimate.", next_step("estimate", run.path)]
     return [f"The recording up to that point is kept in {run.path}.", next_step("check", shown)]

@@ -1,4 +1,4 @@
-"""Sentences on the uncertainty that the torque constants add to a result, for the terminal and the report."""
+"""Sentences about the uncertainty that the torque constants add to a result, for the terminal and the report."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -119,7 +119,7 @@ def contradictions(
 def ratios_said(
     joints: Sequence[str], extra: Mapping[str, Quantity], source: Source, without: Sequence[str]
 ) -> tuple[str, ...]:
-    """A sentence on the ratios of the torques; () if the sentences in `without` give them."""
+    """A sentence about the ratios of the torques; () if the sentences in `without` give them."""
     ratios = [(joint, ratio) for joint, _, ratio in _ratios(joints, extra)]
     if not ratios or without:
         return ()
@@ -149,7 +149,7 @@ def _relative(first: str, ratios: Sequence[tuple[str, Quantity]], source: Source
 
 
 def by_voltage_said(joints: Sequence[JointConfig]) -> str:
-    """A sentence on what viscous friction includes for voltage-driven joints; empty for others."""
+    """A sentence about what viscous friction includes for voltage-driven joints; empty for others."""
     if all(joint.drive_mode is not Mode.PWM for joint in joints):
         return ""
     return "The viscous friction of voltage-driven joints includes the motor's back-EMF."

@@ -57,7 +57,7 @@ def back_emf(config: Config, fake: FakeArm, drives: Sequence[Drive]) -> dict[str
 
 @dataclass(frozen=True)
 class Truth:
-    """True values, scaled to the file's torque constants. note: a sentence on how they differ from the arm's own
+    """True values, scaled to the file's torque constants. note: a sentence about how they differ from the arm's own
     values; "" if they do not.
 
     A value that depends on the torques of several joints is left out if the constants of these joints are wrong by

@@ -101,8 +101,8 @@ class Deadlines:
         """Say what the servos' watchdogs did during the gap."""
         if seconds < self._watchdog:
             return ""
-        # Whether another program had disarmed them cannot be asked afterwards: cutting torque disarms them too.
-        return f" Watchdogs that were still armed had ended the current after {1e3 * self._watchdog:.0f} ms."
+        # Whether another program had disarmed them is not known afterwards: cutting torque disarms them too.
+        return f" Watchdogs that were still armed had cut the current after {1e3 * self._watchdog:.0f} ms."
 
 
 def _told(seconds: float) -> str:

@@ -229,8 +229,8 @@ class Guard:
         )
 
     def rests_at(self, positions: Sequence[float]) -> None:
-        """Set the joints' angles before torque was switched on [rad]; by default, those of the first sample are
-        used. From now on, `measure_noise` is called with each exchange until `noise_is_known`.
+        """Set the joints' angles from before torque was switched on [rad], by default those of the first sample.
+        From now on, `measure_noise` is called with each exchange until `noise_is_known`.
         """
         self._resting = positions
         self._noise.begin()
@@ -362,7 +362,7 @@ class Guard:
                 self._stop(index, *wrong)
 
     def watchdog_reads(self, index: int, ticks: int) -> None:
-        """Raise SafetyStop for a joint whose Bus Watchdog reads `ticks` [20 ms] if it is required and not as armed."""
+        """Raise SafetyStop for a joint whose Bus Watchdog reads `ticks` [20 ms] if one is required and not as armed."""
         if (wrong := self._status.look_at_watchdog(ticks)) is not None:
             self._stop(index, *wrong)
 

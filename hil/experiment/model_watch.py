@@ -35,7 +35,7 @@ WIDENED = 1.5
 _OF_TWO = tuple(name for name in NAMES if name.endswith("_2") or name == "coupling")
 _RELATIVE_STD = 0.1
 _FRICTIONS, _FRICTIONS_UNDESCRIBED = 8.0, 3.0
-"""Lower bounds on the torque from which the alarm thresholds follow, in multiples of the mean dry friction, with and
+"""Lower bounds on the torque from which alarm thresholds are derived, in multiples of the mean dry friction, with and
 without a description of the arm. They keep friction of up to twice the expected value from raising an alarm. Without a
 description, the friction of typical servos is assumed; the bound then matters only if the planned torque is barely
 larger than that friction.
@@ -54,7 +54,7 @@ friction and inertia cannot be several times as large as the planned torque, bec
 the excitation is slower than `_USUAL_HZ`, they can, in proportion: long, heavy arms are excited slowly.
 """
 _USUAL_HZ = 0.7
-"""Geometric mean of the lowest and the highest frequency from which the excitation is not called slow."""
+"""Geometric mean of the lowest and highest frequencies below which the excitation counts as slow."""
 _FLAT = 0.3
 """Standard deviation of gravity and tilt if the arm moves in a horizontal plane, in the units of `_INERTIA`."""
 _NEAR_LIMIT = 0.05

@@ -13,7 +13,7 @@ _FORGETS = 0.98
 
 
 def read_back(bus: ServoBus, guard: Guard, due: float) -> None:
-    """Check for goals of another program just before the exchange due at `due` [s]; report lost goals and changed
+    """Check for goals from another program just before the exchange due at `due` [s]; report lost goals and changed
     watchdogs to the guard.
     """
     bus.check_not_overruled(due)

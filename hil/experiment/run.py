@@ -45,7 +45,7 @@ _LAST_SAMPLES = 100
 
 _FIRST_S = 3.0
 _DESCRIBED = (
-    "Since this is the beginning of a motion, check first whether the configuration fits the arm: each joint's "
+    "Since the motion had just begun, check first whether the configuration fits the arm: each joint's "
     "direction, id, torque_constant and wiring."
 )
 """Advice for a stop within this time of the first goal [s], unless an earlier run has shown that the arm obeys."""
@@ -68,7 +68,7 @@ def run_experiment(
     plan: Plan | None = None,
     arms: Ensemble | ChainArms | None = None,
 ) -> str:
-    """Run the configured experiment and record it in `run`. Returns a sentence on the final torque state.
+    """Run the configured experiment and record it in `run`. Returns a sentence about the final torque state.
 
     Args:
         config: configuration of the arm.
@@ -204,7 +204,7 @@ def _moved_without_torque(config: Config, bus: ServoBus, recorder: Recorder) -> 
 def _try_again(bus: ServoBus, note: Note) -> None:
     """Keep cutting the torque of servos that did not answer, for as long as a servo takes to boot.
 
-    Their watchdogs have acted by now, if they were still armed, so packets can no longer delay them.
+    Their watchdogs, if still armed, have tripped by now, so packets can no longer delay them.
     """
     clock = bus.port.clock
     end = clock.now() + REBOOT_S
@@ -258,7 +258,7 @@ def _check_unchanged(bus: ServoBus) -> Settings:
 def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, modes_seen_ago: float) -> None:
     """Name settings that another program changed. They are read only once torque is off, because reading takes time.
 
-    A change that can explain a stop is named before it; all others, including any that may have come later, after it.
+    Changes that can explain a stop are named before its message; others, including any that may be later, after it.
     """
     if not isinstance(error, HilError | DriverError | KeyboardInterrupt) or isinstance(error, PortLost):
         return
@@ -274,7 +274,7 @@ def _explain_by_settings(bus: ServoBus, before: Settings, error: BaseException, 
 
 
 def doubt_description(error: BaseException, samples: NDArray[np.void]) -> None:
-    """Name mistakes in the description of an arm that a guard stopped at the very beginning of its first motion."""
+    """If the guard stopped the arm early in its first motion, name mistakes in the description as a possible cause."""
     stop = error if isinstance(error, SafetyStop) else error.__context__
     if not isinstance(stop, SafetyStop) or stop.overruled:
         return

@@ -63,7 +63,7 @@ class StatusCheck:
         self._missed = [0] * len(config.joints)
         self._has_one_servo = [len(joint.ids) == 1 for joint in config.joints]
         self.longest_gap = 0.0
-        """Longest time that this program has sent nothing [s]."""
+        """Longest time for which this program has sent nothing [s]."""
         self._goals: deque[Sequence[float]] = deque(maxlen=_REMEMBERED)
         self._cycles = 0
         # Per joint: goal in the latest status if it differs from that sent [A or V], the number of goals sent when they
@@ -175,9 +175,8 @@ class StatusCheck:
         return Cause.GOALS_LOST, f"does not accept goals: {held}, and it missed an earlier one too. {self.why_lost()}"
 
     def _late(self, joint: int, held: float, former: float, ago: int) -> int:
-        """How many cycles late a servo answers that holds a goal which it had been sent, but did not hold, when its
-        status last differed, `ago` cycles before; 0 if it need not be late. former: the goal that it held then [A or
-        V].
+        """How many cycles late a servo's replies are, as it holds a goal that it had been sent, but did not hold, when
+        its status last differed, `ago` cycles before; 0 if they need not be late. former: the goal held then [A or V].
         """
         half = self._half_tick[joint]
         for cycles, goals in enumerate(reversed(self._goals)):
@@ -187,7 +186,7 @@ class StatusCheck:
         return 0
 
     def why_lost(self) -> str:
-        """Return why goals are lost: what arrives when nothing should destroys them on the wire."""
+        """Return why goals are lost: bytes that arrive when none should destroy them on the wire."""
         refused = (
             "Goals are being lost in transit, the servo refuses them (check its cable and limits), or a device on the "
             "bus repeats its old replies."
@@ -252,7 +251,7 @@ class StatusCheck:
 
 
 def _unlike_armed(longer: int) -> str:
-    """What another timeout of the watchdog means; longer: by how much [20 ms], 0 if it is off."""
+    """What a changed watchdog timeout means; longer: by how much [20 ms], 0 if it is off."""
     if not longer:
         return "is no longer protected"
     return f"stops by itself {'later' if longer > 0 else 'earlier'} than intended"

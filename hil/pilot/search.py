@@ -328,7 +328,7 @@ class Search:
 
     def _refuse_velocity_limit(self, fast: NDArray[np.bool_], held: NDArray[np.bool_]) -> NoReturn:
         """Raise ExperimentError because of the velocity limit. fast: joints that exceeded it. held: joints that did not
-        move even with all their torque.
+        move even at full torque.
         """
         said = "; ".join(
             f"{joint.name}: velocity_limit = {joint.velocity_limit:g} rad/s, {MOVED_STEPS} encoder steps are "

@@ -99,7 +99,7 @@ def convert(table: Table, columns: Columns) -> Converted:
 
 
 def _steps(found: Sequence[float | None], position: Values) -> Values:
-    """The encoder steps (joints,); a joint that moves too little to show its own is assumed to have another's."""
+    """The encoder steps (joints,); one that a joint moves too little to show is assumed to equal another joint's."""
     known = max((each for each in found if each is not None), default=SMALLEST_STEP)
     swing = np.nanmax(position, axis=1, initial=-np.inf) - np.nanmin(position, axis=1, initial=np.inf)
     other = np.where(swing < LEAST_MOTION * known, known, SMALLEST_STEP)

@@ -62,7 +62,7 @@ def guessed(table: Table, columns: Columns) -> Columns:
 
 
 def said(columns: Columns, table: Table) -> str:
-    """Sentences on how the columns were interpreted, and which were not used."""
+    """Sentences about how the columns were interpreted, and which were not used."""
     drive = columns.drive or "torque"
     time = _described("time", [columns.time], columns, table) if columns.time else f"{columns.rate:g} samples a second"
     position = _described("position", columns.position or [], columns, table)
@@ -186,7 +186,7 @@ def _quoted(name: str) -> str:
 
 
 def _kind(name: str, words: str) -> str:
-    """The kind of a column by its name: "other" if it is known to be none that is needed, "unknown" if nobody knows."""
+    """The kind of a column by its name: "other" if it is certainly not needed, "unknown" if that is not clear."""
     if _TIME.fullmatch(_last(name)):
         return "time"
     found = next((kind for kind, pattern in _KINDS.items() if pattern.search(words)), "unknown")
@@ -196,7 +196,7 @@ def _kind(name: str, words: str) -> str:
 
 
 def _first_group(kinds: Mapping[str, str], wanted: str) -> list[str]:
-    """The first columns of a kind that differ only in the joint's number; none if they are too many."""
+    """The first columns of a kind that differ only in the joint's number; none if there are too many."""
     groups: dict[str, list[str]] = defaultdict(list)
     for name, kind in kinds.items():
         if kind == wanted:

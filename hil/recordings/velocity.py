@@ -60,7 +60,7 @@ def contradict(found: Sequence[Rate]) -> bool:
 
 
 def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
-    """Sentences on velocities that contradict the positions."""
+    """Sentences about velocities that contradict the positions."""
     factors = _factors(found)
     wrong = [joint for joint, factor in enumerate(factors, 1) if abs(math.log(factor)) > APART]
     if not wrong:
@@ -70,8 +70,8 @@ def doubts(found: Sequence[Rate]) -> tuple[str, ...]:
         return (
             f"The velocity columns are {factor:.3g} times the rates at which the positions change: the times, or "
             f"both velocities, have a wrong scale. If times are {factor:.3g} times too long, inertias are "
-            f"{factor**2:.3g} times too large: check the unit of time and the sample rate. If only the unit of the "
-            "velocities is another one, leave these columns out: nothing else uses them.",
+            f"{factor**2:.3g} times too large: check the unit of time and the sample rate. If only the "
+            "velocities have another unit, leave these columns out: nothing else uses them.",
         )
     return tuple(
         f"Column {found[joint - 1].column!r} is {factors[joint - 1]:.3g} times the rate at which the position of joint "
@@ -88,7 +88,7 @@ def _factors(found: Sequence[Rate]) -> list[float]:
 
 
 def notes(found: Sequence[Rate]) -> tuple[str, ...]:
-    """Sentences on velocities that are not simultaneous with the positions."""
+    """Sentences about velocities that are not simultaneous with the positions."""
     return tuple(
         f"Column {rate.column!r} is {1e3 * abs(rate.late):.2g} ms {'behind' if rate.late > 0.0 else 'ahead of'} the "
         "position; velocities are not used."

@@ -44,7 +44,7 @@ def lateness_histogram(samples: NDArray[np.void]) -> dict[str, list[float]]:
 
 
 def lost_samples(samples: NDArray[np.void], names: Sequence[str]) -> str:
-    """One sentence on the fraction of samples without a reply, by joint; "" if it is at most LOST_SHARE for each."""
+    """One sentence about the fraction of samples without a reply, by joint; "" if it is at most LOST_SHARE for each."""
     if not len(samples):
         return ""
     sent = samples["time_after_read"] > samples["time_before_write"]

@@ -15,7 +15,7 @@ __all__ = ["EXPLAINED", "WRITTEN", "Settings", "changed_settings", "may_be_later
 
 _MODE, _DELAY = "Operating Mode", "Return Delay Time"
 _GOAL_PWM = "Goal PWM"
-"""In current mode, a limit of the voltage. A tripped watchdog leaves 0, which then says nothing."""
+"""Limits the voltage in current mode. A tripped watchdog sets it to 0, which is then no evidence."""
 
 _BESIDE = frozenset({*PROTECTIVE, STATUS_LEVEL}) - {SECONDARY_ID}
 """Settings that are always named, although they explain no stop, except for a Status Return Level of 0."""

@@ -13,7 +13,7 @@ _SECONDS = 1.0
 
 
 def quiet_stream(config: Config) -> tuple[str, ...]:
-    """Return lines of text on the servos' limits and the timing of exchanges. Raises DriverError."""
+    """Return lines of text about the servos' limits and the timing of exchanges. Raises DriverError."""
     fakes.register_for(config.url)
     with servo_session(config) as bus:
         return (*_limits(config, bus), _timing(config, bus))

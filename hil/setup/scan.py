@@ -109,7 +109,7 @@ def _with_more(behind_s: float, watch: Watch) -> Watch:
 
 
 def _listening_s(port: Port, baud: int) -> float:
-    """Listening time at one baud rate [s] if nobody answers."""
+    """Listening time at one baud rate [s] if no servo answers."""
     return _PATIENCE_S + port.latency + _STATUS_BYTES * 10 / baud
 
 

@@ -140,7 +140,7 @@ def test_files_that_hold_no_model_are_refused_with_their_name(identified: Path, 
         load_model(tmp_path / "nowhere")
     urdf = tmp_path / "arm.urdf"
     urdf.write_text("<robot/>", encoding="utf-8")
-    with pytest.raises(ResultError, match=r"arm\.urdf is not a model file of hil\. Give a run folder"):
+    with pytest.raises(ResultError, match=r"arm\.urdf is not a hil model file\. Give a run folder"):
         load_model(urdf)
 
 

@@ -77,7 +77,7 @@ class Difference:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Warnings: those in `other_joints`, and a sentence on each model that should not be trusted without
+        """Warnings: those in `other_joints`, and a sentence about each model that should not be trusted without
         reservation.
         """
         untrusted = tuple(

@@ -38,11 +38,11 @@ _SIGMAS = 3.0
 
 _QUANTILE, _OF_NORMAL = 0.25, 0.3186
 """Noise is judged by this quantile of its magnitude, because goals that are altered now and then must not count as
-noise; the second value is that of a normal distribution with a standard deviation of 1.
+noise; the second value is that of the standard normal distribution.
 """
 
 _FEWEST_AT_REST = 30
-"""Number of consecutive readings at one goal from which they show their noise."""
+"""Minimum number of consecutive readings at one goal from which their noise is measured."""
 
 _SMALL, _LEAST = 0.5, 0.1
 """Highest and lowest goals that cannot be clipped but are large enough to judge, relative to the largest measured
@@ -68,7 +68,7 @@ def current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindin
 
 
 def _findings(config: Config, samples: NDArray[np.void], judged: NDArray[np.bool_]) -> CurrentFindings:
-    """Like `current_findings`, but for the judged samples; the others only show how noisy the readings are."""
+    """Like `current_findings`, but only for the judged samples; the others only help to measure the noise."""
     lower = "current_limit" if config.experiment.pilot else "peak_torque"
     warnings, names = [], []
     for name, every_goal, every in _currents(config, samples):
@@ -99,11 +99,11 @@ def _currents(config: Config, samples: NDArray[np.void]) -> list[tuple[str, Arra
 
 
 def _noise(goal: Array, measured: Array) -> float:
-    """Standard deviation of a current reading, from the recording itself: its scatter at goals that stay the same, or,
-    if that is larger, the deviation from its goals or the second difference of that, whichever is smaller.
+    """Standard deviation of a current reading, from the recording itself: its scatter at constant goals or, if larger,
+    its deviation from the goals or the second difference of that, whichever is smaller.
 
-    Differences are smaller under a smooth deviation, plain values if goals are altered often. The current may lag
-    behind the goal by a few samples: the lag that leaves the least is the right one.
+    Differences are smaller if the deviation is smooth, plain values if goals are often altered. The current may lag
+    the goal by a few samples: the lag that leaves the smallest deviation is used.
     """
     count = len(goal) - _RECENT
     if count < _RECENT:

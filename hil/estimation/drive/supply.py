@@ -92,7 +92,7 @@ def torque_factor(config: Config, sag: Sag | None, samples: NDArray[np.void]) ->
 
 
 def supply_notes(config: Config, sag: Sag | None) -> tuple[str, ...]:
-    """Sentences on supply sag for the verdict; empty without sag."""
+    """Sentences about supply sag for the verdict; empty without sag."""
     if sag is None:
         return ()
     found = f"The supply sags: its voltage falls by up to {sag.worst:.2g} V ({100 * sag.share:.2g} %) under load."

@@ -1,4 +1,4 @@
-"""Check whether several recordings show the same arm, lest a change of load be mistaken for a missing model term."""
+"""Check whether several recordings show the same arm, so that a change of load is not mistaken for a missing term."""
 
 from collections.abc import Sequence
 

@@ -20,7 +20,7 @@ CHANGES = ("step", "linear", "decay")  # courses of defects within a recording
 class Fitted:
     """Fits of recordings. names: names of the recordings. predicted: simulated positions of each (joints, samples)
     [rad]. plain: estimate of a model without terms that could imitate a defect. estimate: estimate of the chosen model.
-    gravity: gravity in the arm's plane [m/s^2]. repeats: whether each recording is the mean of periods that are alike.
+    gravity: gravity in the arm's plane [m/s^2]. repeats: whether each recording is the mean of similar periods.
     """
 
     recordings: Sequence[Recording]
@@ -33,13 +33,13 @@ class Fitted:
 
 
 def causes(fitted: Fitted) -> tuple[str, ...]:
-    """Sentences on the cause: a defect of whole recordings, recordings that disagree, a local defect, a clipped torque
-    or a clock that drifts. If none is found, they say where the residual is large.
+    """Sentences about the cause: a defect of whole recordings, recordings that disagree, a local defect, a clipped
+    torque or a clock that drifts. If none is found, they say where the residual is large.
     """
     recordings, names, estimate = fitted.recordings, fitted.names, fitted.estimate
     defect = likely_defect(recordings, fitted.plain, estimate, fitted.gravity > 0.0)
     if fitted.repeats and defect is not None and defect.hypothesis.course.kind in CHANGES:
-        defect = None  # what changes while the arm moves makes no two periods alike
+        defect = None  # a change while the arm moves would make periods differ
     said = () if defect is None else (defect_said(defect, names),)
     if defect is not None and is_certain(defect) and not is_other_arm(defect):
         return said
@@ -54,7 +54,7 @@ def causes(fitted: Fitted) -> tuple[str, ...]:
 
 
 def are_known(fitted: Fitted, found: tuple[str, ...]) -> bool:
-    """Whether `found`, the sentences of `causes`, name a cause and not only where the residual is large."""
+    """Whether `found`, from `causes`, names a cause and not only where the residual is large."""
     where = fitted.recordings, fitted.names, fitted.predicted, fitted.estimate.segment_length
     return bool(found) and found != local_residual(*where)
 

@@ -155,9 +155,9 @@ def _identified(recordings: Sequence[Recording], model: ChainModel, prior: Prior
 
 
 def _held_out(recordings: Sequence[Recording], model: ChainModel, prior: Prior) -> Array | None:
-    """Return the relative torque error on the last part, with parameters from the rest.
+    """Return the relative torque error on the last part, with parameters fitted to the rest.
 
-    None if a part is too short, or stands still.
+    None if a part is too short or the arm stands still in it.
     """
     try:
         first = [_part(each, 0.0, FITTED_SHARE) for each in recordings]
@@ -202,7 +202,7 @@ def _verdict(
 ) -> Verdict:
     """The verdict, with reasons.
 
-    contradictory: on torques that contradict each other in the regression. late: on torques logged late.
+    contradictory, late: sentences about torques that contradict each other in the regression, or are logged late.
     """
     names = found.model.base.names
     weakest = names[int(np.argmax(found.std[: len(names)] / prior.std))]
@@ -267,7 +267,7 @@ def _verdict(
 
 
 def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: bool) -> tuple[str, tuple[str, ...]]:
-    """The trust that the prediction of the last part allows ("" for any), and why."""
+    """The best verdict that the prediction of the last part allows ("" for any), and why."""
     if foretold is None:
         return "with care", (
             "The recordings are too short, or end too long after the motion, to check the prediction on a part that "
@@ -280,13 +280,13 @@ def _judged_prediction(foretold: Array | None, arm: ArmDescription, explained: b
     unexplained = "" if explained else " together with an unexplained part of the motion"
     return "no", (
         said,
-        f"An error above {100 * wrong:.0f} %{unexplained} gives the verdict no: check which column belongs to which "
+        f'An error above {100 * wrong:.0f} %{unexplained} makes the verdict "no": check which column belongs to which '
         "joint, their units and signs, whether the load changed, and the description of the arm.",
     )
 
 
 def _foretold_said(error: float, joint: str) -> str:
-    """Describe the prediction of the last part. error: of the torque, relative to its RMS; joint: the worst one."""
+    """Describe the prediction of the last part. error: relative to the RMS torque. joint: the worst one."""
     part = f"the torque on the last {100 * (1 - FITTED_SHARE):.0f} % of each recording"
     if error > 1.0:
         return (

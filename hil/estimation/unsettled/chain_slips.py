@@ -38,7 +38,7 @@ def refuse_chain_slips(check: ColumnCheck | None, joints: Sequence[str], source:
 
 
 def late_torque(check: ColumnCheck | None, joints: Sequence[str], fitted: bool) -> tuple[str, ...]:
-    """A sentence on a torque that is logged late or early. fitted: whether the fit contains a delay common to all."""
+    """A sentence about a torque logged late or early. fitted: whether the fit contains a delay common to all."""
     late = None if check is None else check.late_torque()
     if late is None or (late.joint is None and fitted):
         return ()
@@ -46,12 +46,12 @@ def late_torque(check: ColumnCheck | None, joints: Sequence[str], fitted: bool) 
     direction = "late" if late.seconds > 0.0 else "early"
     return (
         f"{whose} to be logged about {1e3 * abs(late.seconds):.0f} ms too {direction}: shifted by that time, "
-        f"{unexplained(*late.residuals)}. Shift the column in the file; a filter that delays it has the same effect.",
+        f"{unexplained(*late.residuals)}. Shift the column in the file; a filter can also cause such a delay.",
     )
 
 
 def torques_apart(check: ColumnCheck | None, joints: Sequence[str]) -> tuple[str, ...]:
-    """Sentences on torque columns whose factors differ by more than the spread of torque constants allows."""
+    """Sentences about torque columns whose factors differ by more than the spread of torque constants allows."""
     factors = None if check is None else check.contradictory_torques()
     known = {f"{RATIO}_{number}": Quantity(each, ROUGHLY * each, "1") for number, each in enumerate(factors or (), 1)}
     return contradictions(joints, known, {}, "column")

@@ -65,7 +65,7 @@ class Given:
     torque_scale_std: relative standard deviation of the ratio of the torque constants, by parameter. zeros: whether a
     configuration defines the encoder zeros. names: names of the recordings. jumps: a sentence for each joint of a
     recording whose position jumped. torque_source: where the torques come from. origin: the angles [rad] at which the
-    position columns are 0, by default 0. repeats: whether each recording is the mean of periods that are alike.
+    position columns are 0, by default 0. repeats: whether each recording is the mean of similar periods.
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
@@ -149,7 +149,7 @@ def estimate_any(
 def _judged(
     fitted: Fitted, given: Given, why: tuple[str, ...], held_out: NDArray[np.float64] | None, found: Doubts
 ) -> Verdict:
-    """The verdict. why: sentences on defects of the recordings."""
+    """The verdict. why: sentences about defects of the recordings."""
     recordings, estimate = fitted.recordings, fitted.estimate
     conflicts_found, joints = conflicts_in(estimate, given), joint_names(recordings[0].joints)
     ratios = ratios_of(estimate.names, estimate.value, estimate.std)

@@ -36,7 +36,7 @@ MOST_RECORDINGS = 200
 
 @dataclass(frozen=True)
 class _Read:
-    """All recordings of one arm. notes: sentences on what was guessed, corrected or averaged. doubts: contradictions
+    """All recordings of one arm. notes: sentences about what was guessed, corrected or averaged. doubts: contradictions
     among the columns. unusable: whether these are so large that a model is useless.
     """
 

@@ -88,7 +88,7 @@ def refuse_stuck(recordings: Sequence[Recording], source: str, segment: float) -
 
 
 def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequence[float] | None) -> None:
-    """Raise CsvError if the angle of joint 2 is absolute, with the zero that then applies if it is another one."""
+    """Raise CsvError if the angle of joint 2 is absolute, with the zero that then applies if it differs."""
     joints = recordings[0].joints
     free = suspect_absolute_unzeroed(recordings) if zero is None else None
     zero = zero or (0.0,) * joints
@@ -107,7 +107,7 @@ def _refuse_absolute(recordings: Sequence[Recording], source: str, zero: Sequenc
 
 
 def reversal_said(signs: Signs, joints: Sequence[str] = ()) -> str:
-    """Say which signs are reversed, up to what changing them gains. joints: their names, by default their numbers."""
+    """Say which signs are reversed; the caller appends the gain from a change. joints: names, by default numbers."""
     if signs.are_several:
         return f"{signs.said(joints)} are reversed: with these signs changed"
     return f"{signs.said(joints)} is reversed: with the sign changed"

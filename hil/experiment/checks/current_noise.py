@@ -1,7 +1,7 @@
 """Noise of the current readings, measured while the arm rests, and what it means for the check of the current.
 
 The thresholds of `following` assume no more noise than usual. A noisier sensor gets wider ones, so that a healthy motor
-is not stopped; the user is told which lost torque can then no longer be found quickly.
+is not stopped; the user is told the goal below which lost torque is then not detected quickly.
 """
 
 from collections import deque
@@ -23,7 +23,7 @@ FEWEST_READINGS, MOST_READINGS = 8, 256
 """Number of readings from which noise is first measured, and number of the latest ones that are kept."""
 
 _UNCERTAIN = 1.9
-"""How much too small noise measured from n readings may be, relative to the real noise, times the square root of n."""
+"""By how much noise measured from n readings may be too small, relative to the true noise, times sqrt(n)."""
 
 _MAD_TO_SIGMA = 1.4826
 """Ratio of standard deviation to median absolute deviation of a normal distribution."""
@@ -36,7 +36,7 @@ class CurrentNoise:
     """Standard deviation of the joints' current readings, measured at goals that hardly change.
 
     Every reading is compared with its goal. The median absolute deviation ignores single wrong replies, and a current
-    that stays at another value than its goal is no noise.
+    that constantly differs from its goal does not count as noise.
     """
 
     def __init__(self, joints: Sequence[JointConfig]) -> None:
@@ -74,7 +74,7 @@ class CurrentNoise:
 
 @dataclass(frozen=True)
 class Noisy:
-    """A joint whose current reading is noisier than usual; `said` says so, and what it means.
+    """A joint whose current reading is noisier than usual; `said` says so, and what this means.
 
     refused: why the joint cannot be monitored, and what to do; "" if it can.
     """
@@ -109,7 +109,7 @@ class NoiseAllowance:
             self._allow(noise)
 
     def begin(self) -> None:
-        """Accept any reading until some have shown their noise."""
+        """Accept any reading until the noise has been measured."""
         self._records["following"]["allowed"] = inf
 
     def add(self, state: State) -> None:
@@ -136,8 +136,8 @@ class NoiseAllowance:
         seen = following.seen_above(self._records[index]["following"], self._interval)
         unit = self._joints[index].drive_mode.goal_unit
         return (
-            f"its current reading is noisy: {noise:.2g} {unit} RMS at a constant goal; lost torque cannot be seen "
-            f"within 0.1 s at goals below {seen:.2g} {unit}"
+            f"its current reading is noisy: {noise:.2g} {unit} RMS at a constant goal; lost torque cannot be "
+            f"detected within 0.1 s at goals below {seen:.2g} {unit}"
         )
 
 
@@ -147,6 +147,6 @@ def _refused(joint: JointConfig, noise: float) -> str:
         return ""
     return (
         f"At most {MOST_NOISE * limit:.2g} {joint.drive_mode.goal_unit} RMS is accepted, {100 * MOST_NOISE:.0f} % of "
-        f"{name} ({limit:g}). Check its supply and its cable, or raise {name} if the joint bears more; replace the "
+        f"{name} ({limit:g}). Check its supply and its cable, or raise {name} if the joint tolerates more; replace the "
         "servo if this happens again."
     )

@@ -14,18 +14,18 @@ per sample. The step is bounded so that no single reply decides, and the sum is 
 current is any value between the last two goals, because a reply may be measured before or after the motor follows the
 latest goal, and may be off by a scale error of `GAIN_ERROR`.
 
-Successive errors may be related, so each sample is weighted by the time that it represents. Chance must not decide in
-one of thousands of looks either: the unweighted sum must reach h = `LEAST_RATIO` too, which that of a healthy motor
-does with a probability of at most exp(-h) from any one look on.
+Successive errors may be correlated, so each sample is weighted by the time that it represents. Nor must chance decide
+in one of thousands of checks: the unweighted sum must also reach h = `LEAST_RATIO`, which a healthy motor's does with a
+probability of at most exp(-h) after any given check.
 
 While a joint stands still, its readings may also freeze at the commanded current, and the goal may take seconds to get
 far from it. But a motor's current follows its goal: if all three readings stay exactly the same although the goals
-that they may answer to (those of the last `ANSWERS_S`) have become others, they are frozen. A constant error of the
-sensor cancels in this comparison.
+that they may reflect (those of the last `ANSWERS_S`) have changed, they are frozen. A constant sensor error cancels in
+this comparison.
 
 A current sensor may be noisier than assumed. Its noise is measured at constant goals, while the arm rests before the
 start (`current_noise`), and is a lower bound of sigma: a noisy reading then means that lost torque is found later, not
-that a healthy motor is stopped. So that this does not blind the check, a joint with far too much noise is refused.
+that a healthy motor is stopped. A joint so noisy that the check would be useless is refused.
 
 The check runs for each joint in each exchange, as part of a compiled loop (`joint_checks`). The state that it keeps for
 a joint is a record of the type `MEMORY`.
@@ -74,7 +74,7 @@ _SOON_S = 0.1
 """Time within which lost torque should be found [s]."""
 
 ANSWERS_S, _BLOCKS = 0.03, 3
-"""A reading may answer to any goal of this time [s], which is divided into so many blocks."""
+"""A reading may reflect any goal of the last `ANSWERS_S` [s], which are divided into `_BLOCKS` blocks."""
 
 _BLOCK_S = 0.99 * ANSWERS_S / _BLOCKS  # at 100 Hz, a sample is a block despite rounding errors
 
@@ -87,7 +87,7 @@ GOALS = np.dtype(
 most: largest change of the goal under which all readings may stay the same [A or V]. carried, same_for: current, and
 how long all readings have been the same [s]. age: age of the latest block [s]. low, high: smallest and largest goal in
 each block, the latest first. lowest, highest: the smallest upper and the largest lower end of the range of goals that
-one of these readings may answer to.
+one of these readings may reflect.
 """
 
 MEMORY = np.dtype(
@@ -117,7 +117,7 @@ def begin(memory: Any, goals: Any, joint: JointConfig, planned: float, follow_sh
 
 
 def usual_sigma(joint: JointConfig, planned: float) -> float:
-    """Return the standard deviation of current errors that is assumed of any sensor [A or V]."""
+    """Return the standard deviation of current errors assumed for any sensor [A or V]."""
     return max(SIGMA_SHARE * planned, SIGMA_TICKS * abs(joint.joint.drive_unit(12.0)))
 
 
@@ -135,7 +135,7 @@ def allow_noise(memory: Any, goals: Any, joint: JointConfig, planned: float, fol
 
 
 def seen_above(memory: Any, interval: float) -> float:
-    """Return the smallest goal [A or V] at which lost torque is found in a tenth of a second.
+    """Return the smallest goal [A or V] at which lost torque is detected within 0.1 s.
 
     interval: time between two exchanges [s].
     """
@@ -176,7 +176,7 @@ def look(memory: Any, goal: float, carried: float, seconds: float) -> float:
 
 
 def is_frozen(goals: Any, goal: float, carried: float, seconds: float, stands: bool) -> bool:
-    """Process a reply; return whether all readings have stayed the same although the goals have become others.
+    """Process a reply; return whether all readings have stayed the same although the goals have changed.
 
     goal, carried, seconds: as for `look`. stands: whether position and velocity are exactly those of the last reply,
     and no reply was missed in between.

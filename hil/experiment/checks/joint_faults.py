@@ -24,14 +24,14 @@ _LACKS_S, _EXPLAINED = 0.1, 0.5
 """The supply explains missing torque if, within the last `_LACKS_S` [s], it caused at least this fraction of it."""
 
 _FEWEST = 4
-"""Number of readings from which a current that does not follow its goal is explained by how it differs."""
+"""Minimum number of readings from which to explain how a current differs from its goal."""
 
 Fault = tuple[Cause, str]
 """The cause and a sentence without its subject, the joint."""
 
 
 class JointFaults:
-    """Explains a fault by the joints' records (`joint_checks.JOINT`) and their recent motion, status and supply.
+    """Explains a fault from the joints' records (`joint_checks.JOINT`) and their recent motion, status and supply.
 
     lower_torque: advice to lower the torque, with a leading space; "" if the torque is not the user's choice.
     """
@@ -67,7 +67,7 @@ class JointFaults:
         if model is None or not self._records[index]["is_followed"] or self._status.other_goal(index) is not None:
             return None
         for before, state in pairwise(recent):
-            # What was sent with one sample acts until the next.
+            # What is sent with one sample acts until the next.
             goal, carried, velocity = before.goal_current[index], state.current[index], state.velocity[index]
             explained = self._constants[index] * (goal - carried) * copysign(1.0, lacking)
             if (
@@ -191,7 +191,7 @@ class JointFaults:
             return (
                 f"Its goals are being altered in transit or by another program, its current sensor is wrong, or {weak}"
             )
-        return f"Its torque is off, it was rebooted, its watchdog acted, its current sensor is wrong, or {weak}"
+        return f"Its torque is off, it was rebooted, its watchdog tripped, its current sensor is wrong, or {weak}"
 
     def _disagree(self, index: int, state: State) -> Fault:
         return (
@@ -218,7 +218,7 @@ def _is_stuck(readings: Sequence[tuple[float, float]], least: float) -> bool:
 
 
 def _is_shifted(readings: Sequence[tuple[float, float]], least: float) -> bool:
-    """Whether a current follows its goal, which has changed by more than `least`, but at a distance."""
+    """Whether a current follows its goal, which has changed by more than `least`, but with an offset."""
     if len(readings) < _FEWEST:
         return False
     goals = [goal for goal, _ in readings]

@@ -39,7 +39,7 @@ MOST_PATHS = 4
 """Number of paths home, including the first, that an arm may be pushed off before it is given up."""
 
 LYING_RAD = 0.06
-"""If every joint is within this angle of the rest pose [rad], the arm counts as lying in it."""
+"""If every joint is within this angle of the rest pose [rad], the arm counts as resting in it."""
 
 RUNS_AWAY = 0.25
 """Excess of a joint's velocity over the velocity of its path to the rest pose, relative to the velocity limit. A joint

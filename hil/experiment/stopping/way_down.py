@@ -102,7 +102,7 @@ class WayDown:
             return
         since = 0.0 if stopped.sent_at is None else self._clock.now() - stopped.sent_at
         if self._bus.is_watched and since >= self._config.safety.watchdog + TRIP_S:
-            self._told(error, "The arm could not be lowered: the servos' watchdogs had already acted, so it fell.")
+            self._told(error, "The arm could not be lowered: the servos' watchdogs had already tripped, so it fell.")
             return
         self._note(f"lowering the arm after: {error}")
         if isinstance(error, SafetyStop) and error.cause is Cause.WATCHDOG:

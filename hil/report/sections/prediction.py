@@ -23,7 +23,7 @@ def prediction(data: RunData) -> Section | None:
             said = f"held-out motion; prediction error is {error} of the motion's RMS, encoder noise included"
             pictures.append(_position(data.held_out, joint, name, "held out", said))
     words = (
-        "The first pictures show the settled period that the model was fitted to. A residual that looks like noise "
+        "The first figures show the settled period that the model was fitted to. A residual that looks like noise "
         "of one step is encoder rounding; a smooth residual comes from an effect that the model lacks.",
     )
     return Section("prediction", "Measured and predicted motion", words, pictures=tuple(pictures))

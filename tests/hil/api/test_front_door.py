@@ -245,7 +245,10 @@ def test_what_names_no_configuration_is_a_type_error_that_says_what_does(nothing
     [
         (lambda run: hil.estimate(None), "recording must be a run folder"),
         (lambda run: hil.estimate([None]), "recording must be a run folder"),
-        (lambda run: hil.estimate("run", on_progress=5), "on_progress must be a function of one Progress, not 5"),
+        (
+            lambda run: hil.estimate("run", on_progress=5),
+            "on_progress must be a function that takes one Progress, not 5",
+        ),
         (lambda run: hil.check("fake_two_link", on_progress=5), "on_progress must be a function"),
         (lambda run: hil.identify("fake_two_link", on_progress=5), "on_progress must be a function"),
         (lambda run: hil.dry_run("fake_two_link", on_progress=5), "on_progress must be a function"),

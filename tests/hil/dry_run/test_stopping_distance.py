@@ -124,9 +124,12 @@ def test_a_plan_that_passes_a_limit_is_stopped_there() -> None:
     [
         (
             0.001,
-            "Stopped at any moment, no joint overshoots its limits, not even if the program is killed or the cable ",
+            "Whenever the arm is stopped, no joint overshoots its limits, even if the program is killed or the cable ",
         ),
-        (0.2, "Stopped at any moment, shoulder overshoots its limits by up to 0.20 rad; if the program is killed or "),
+        (
+            0.2,
+            "Whenever the arm is stopped, shoulder overshoots its limits by up to 0.20 rad; if the program is killed ",
+        ),
     ],
 )
 def test_an_overshoot_is_said_joint_by_joint(planned: float, first: str) -> None:

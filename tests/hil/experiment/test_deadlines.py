@@ -36,7 +36,7 @@ def test_deadlines_missed_in_a_row_count_by_their_number_and_by_the_time_since_t
         deadlines.missed()  # 20 intervals of 2.5 ms are the 50 ms allowed
     said = said_by(deadlines.missed)
     assert "21 deadlines in a row were missed, 52 ms without a command; safety.late_time = 0.05 s allows 50 ms" in said
-    assert "watchdogs act" not in said
+    assert "atchdog" not in said
     deadlines = Deadlines(arm())
     deadlines.missed(0.0499)
     assert "20 deadlines in a row were missed, 51 ms without" in said_by(lambda: deadlines.missed(0.051))
@@ -53,7 +53,7 @@ def test_a_sample_on_time_begins_the_row_anew(arm: Arm) -> None:
 def test_what_the_watchdogs_did_during_a_gap(arm: Arm) -> None:
     deadlines = Deadlines(arm())
     deadlines.check_gap(0.0799)
-    acted = "Watchdogs that were still armed had ended the current after 80 ms."
+    acted = "Watchdogs that were still armed had cut the current after 80 ms."
     said = said_by(lambda: deadlines.check_gap(0.08))
     assert "This program stalled: 80 ms passed between two commands" in said and said.endswith(acted)
     assert "1.5 s passed" in said_by(lambda: deadlines.check_gap(1.5))

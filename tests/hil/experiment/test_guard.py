@@ -435,7 +435,9 @@ def test_a_noisy_current_reading_is_named_and_refused_only_if_it_hides_lost_torq
     assert at_rest(Guard(arm()), 0.001) == []
     guard = Guard(arm(), (0.05, 0.05))
     (said,) = at_rest(guard, 0.05)
-    assert re.search(r"ID 2.*is noisy: 0\.0[45]\d* A RMS .* cannot be seen within 0\.1 s at goals below 0\.1\d A", said)
+    assert re.search(
+        r"ID 2.*is noisy: 0\.0[45]\d* A RMS .* cannot be detected within 0\.1 s at goals below 0\.1\d A", said
+    )
     later = Guard(arm(), (0.05, 0.05), noise=guard.current_noise)
     for each in (guard, later):
         for number in range(40):

@@ -220,7 +220,7 @@ def test_an_arm_dropped_by_its_watchdogs_is_not_said_to_be_lowered(
     error, samples = stalled(monkeypatch, tmp_path, 1.0)
     assert not (samples["phase"] == Phase.LOWERING).any()
     notes = " ".join(error.__notes__)
-    assert "watchdogs had already acted, so it fell" in notes and "deadlines in a row" not in notes
+    assert "watchdogs had already tripped, so it fell" in notes and "deadlines in a row" not in notes
 
 
 def test_an_arm_is_lowered_after_a_stall_that_its_watchdogs_bore(

@@ -144,7 +144,7 @@ def test_an_arm_whose_watchdogs_have_acted_cannot_be_lowered(
     made.bus.is_watched = is_watched
     made.bus.clock.wait_until(0.05 + since)
     (told,) = made.lower()
-    assert ("was lowered" in told) is is_lowered and ("had already acted" in told) is not is_lowered
+    assert ("was lowered" in told) is is_lowered and ("had already tripped" in told) is not is_lowered
     assert len(made.bus.times("sample")) == (3 if is_lowered else 0)
 
 
