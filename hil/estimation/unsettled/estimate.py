@@ -83,9 +83,11 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
     only_planar(config, "an estimate from all samples")
     samples = load_samples(run.samples_path, len(config.joints))
     constants = np.array([joint.torque_per_goal for joint in config.joints])
+    written: NDArray[np.float64] = samples["time_before_write"]
+    goals: NDArray[np.float64] = samples["goal_current"]
     recording = Recording(
-        samples["time_before_write"] - samples["time_before_write"][:1],
-        (samples["goal_current"] * constants).T,
+        written - written[:1],
+        (goals * constants).T,
         samples["position"].T.copy(),
         np.array(facts.position_step),
         between="held",
