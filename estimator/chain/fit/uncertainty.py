@@ -48,8 +48,7 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
 def neglected_covariance(problem: ChainProblem, x: Array) -> Array:
     """Return the covariance (parameters, parameters) [SI] due to effects neglected in the model of a lagging back-EMF.
 
-    Each biases the inertia of its joint (`hil.estimator.simulation.back_emf.neglected_inertia`), independently of the
-    others.
+    See `hil.estimator.simulation.back_emf.neglected_inertia`; the joints' errors are independent.
     """
     base, parameters = problem.model.base, problem.parameters(x)
     total = np.zeros((problem.count, problem.count))
