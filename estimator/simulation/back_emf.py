@@ -6,21 +6,27 @@ with a lagging voltage and a brake b without lag, is
 
     1 / (lag J s^2 + J s + b) = 1 / ((lag' s + 1) ((J - b lag') s + b)),    lag' (J - b lag') = lag J
 
-which is exact for a joint of inertia J: the joint moves like one with an inertia smaller by b lag', under a command
-with the lag lag'. The simulation uses this form: `Physics.of` subtracts back_emf viscous (lag + delay) from the joint's
-own inertia, 5 to 10 % of it on an XL430. The estimated lag is lag', slightly larger than that of the winding. The
-effect of friction on the motor's current is delayed by lag' - lag (see `neglected`).
+which is exact for a joint of inertia J: it moves like one with an inertia smaller by b lag'. `Physics.of` subtracts
+back_emf viscous (lag + delay) from the joint's own inertia, 5 to 10 % of it on an XL430. The estimated lag is lag',
+slightly larger than that of the winding.
+
+If the voltage is later than the back-EMF by d, because a goal waits for the servo's control loop, the estimated inertia
+is too large by b d, whatever the lag.
 
 Ripple, saturation and load-dependent friction act on the motor's torque, which is the torque of the voltage minus the
 torque of the back-EMF (`hil.estimator.simulation.arm`).
 """
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 
 from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import CONSTANTS, GENERATED, LEAST_INERTIA, OWN_INERTIA, VISCOUS, Physics
+
+UNKNOWN_DELAY = 5e-4
+"""Standard deviation of d, for a control loop of 1 ms [s]."""
 
 _LATE: dict[str, tuple[int, ...]] = {"lag": (0, 1), "delay": (0, 1), "lag_difference_2": (1,)}
 """For each parameter, the joints whose torque it delays."""
@@ -67,25 +73,31 @@ def by_names(physics: Physics, names: tuple[str, ...], derivative: Array) -> Arr
     return full
 
 
-def neglected(physics: Physics) -> dict[str, float]:
-    """Return the standard deviations of the joints' own inertias due to effects that this model neglects [kg m^2].
+def neglected_inertia(brake: float, lost: float, inertia: float, delay: float) -> float:
+    """Return the standard deviation of a joint's inertia due to effects that this model neglects [kg m^2].
 
-    The effect of friction on the motor's current is delayed by lag' - lag, which is of second order in b lag' / J:
-    negligible on most arms, but 5 % of the inertia of an XL430 with hardly any load. Keys are the names of the
-    inertias.
+    The effect of friction on the motor's current is late by lag' - lag: negligible on most arms, but 5 % of the inertia
+    of an XL430 with hardly any load. The voltage's delay d is 1 to 2 %.
+
+    brake: b [N m s/rad]. lost: b lag' [kg m^2]. delay: pure delay [s], perhaps of the voltage alone.
     """
+    return math.hypot(lost**2 / inertia, brake * max(UNKNOWN_DELAY, 0.5 * delay))
+
+
+def neglected(physics: Physics) -> dict[str, float]:
+    """Return `neglected_inertia` of each voltage-driven joint [kg m^2]; keys are the names of the inertias."""
     found = {}
     for joint in _generating(physics):
-        place = OWN_INERTIA[joint]
-        lost = float(physics.vector[GENERATED + joint] * physics.late[joint])
-        found[CONSTANTS[place]] = lost**2 / (float(physics.vector[place]) + lost)
+        place, brake = OWN_INERTIA[joint], float(physics.vector[GENERATED + joint])
+        lost = brake * float(physics.late[joint])
+        inertia = float(physics.vector[place]) + lost
+        found[CONSTANTS[place]] = neglected_inertia(brake, lost, inertia, physics.delay)
     return found
 
 
 def limited(parameters: Mapping[str, float]) -> tuple[str, ...]:
     """Return the names of the back-EMFs that would cancel more of their joint's inertia than the simulation allows
-    (`LEAST_INERTIA`). The simulated reduction is then smaller than the parameters imply, which biases the estimated
-    inertia.
+    (`LEAST_INERTIA`). The simulated reduction is then too small, which biases the estimated inertia.
     """
     physics = Physics.of(parameters)
     found = []

@@ -40,7 +40,7 @@ SHAPES = {
     "stribeck_velocity": (0.15, 0.7),
     "load": (0.03, 1.5),
     "lag": (1e-3, 1.0),
-    "lag_ratio": (1.0, 0.6),
+    "lag_ratio": (1.0, 1.0),
     "back_emf": (0.92, 0.08),
 }
 """Priors on the shape of friction and on drives: typical value [in its unit] and standard deviation of its logarithm.

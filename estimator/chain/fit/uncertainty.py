@@ -22,6 +22,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.chain.fit.objective import ChainProblem
 from hil.estimator.chain.fit.resolved_widths import free_inertias
 from hil.estimator.chain.model.late_torque import lost_inertia, rotor
+from hil.estimator.simulation.back_emf import neglected_inertia
 
 MOST_SAMPLES = 1 << 13  # of a period: enough to estimate a noise level to within a tenth
 SUPPOSED = 10.0  # degrees of freedom assigned to white noise, and to the common level in that of each joint
@@ -47,9 +48,7 @@ def coloured_covariance(problem: ChainProblem, x: Array, normal: Array) -> Array
 def neglected_covariance(problem: ChainProblem, x: Array) -> Array:
     """Return the covariance (parameters, parameters) [SI] due to effects neglected in the model of a lagging back-EMF.
 
-    The effect of friction on the motor's current is delayed by the difference between the fitted lag and the winding's.
-    This biases a joint's inertia by the square of its apparent loss of inertia, divided by the inertia
-    (`hil.estimator.simulation.back_emf.neglected`).
+    See `hil.estimator.simulation.back_emf.neglected_inertia`; the joints' errors are independent.
     """
     base, parameters = problem.model.base, problem.parameters(x)
     total = np.zeros((problem.count, problem.count))
@@ -57,7 +56,9 @@ def neglected_covariance(problem: ChainProblem, x: Array) -> Array:
     if lost:
         inertia = free_inertias(problem, parameters)
         for joint, each in lost.items():
-            wrong = each**2 / inertia[joint] * rotor(base, joint)
+            brake = parameters[f"back_emf_{joint + 1}"] * parameters[f"viscous_{joint + 1}"]
+            std = neglected_inertia(brake, each, float(inertia[joint]), parameters.get("delay", 0.0))
+            wrong = std * rotor(base, joint)
             total[: base.count, : base.count] += np.outer(wrong, wrong)
     return total
 

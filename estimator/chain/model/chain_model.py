@@ -95,7 +95,8 @@ class ChainModel:
     def description(self) -> str:
         """Text that names the friction model, the options and the drive model."""
         words = {"zeros": self.zeros, "torque scales": self.torque_scale, "base tilt": self.base_tilt}
-        words |= {"added mass": self.added_mass, "lags": self.lags, "back-EMF": bool(self.by_voltage)}
+        words |= {"added mass": self.added_mass, "lags": self.lags and self.drive != "delay"}
+        words["back-EMF"] = bool(self.by_voltage)
         return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))
 
     @property

@@ -2,9 +2,8 @@
 
 The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
 product of back-EMF and lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due
-to back-EMF. The lag of a winding makes a joint lighter by at most half of its inertia, where the poles of the
-equivalent motor coincide. Far from the minimum of a fit, parameters may imply a greater loss, which is then limited to
-this value.
+to back-EMF. A winding's lag makes a joint lighter by at most half of its inertia, where the poles of the equivalent
+motor coincide. A greater loss, far from the minimum of a fit, is limited to this value.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,13 +40,11 @@ def lag_slopes(parameters: Mapping[str, float], joints: int) -> Array:
 
 
 def as_moving(base: BaseParameters, parameters: Mapping[str, float]) -> dict[str, float]:
-    """Return the parameters of the equivalent arm, which has lighter rotors and a back-EMF that does not lag."""
+    """Return the parameters of the equivalent arm: lighter rotors and a back-EMF that does not lag."""
     moving = dict(parameters)
-    generating = _generating(base.chain.joints, parameters)
-    possible = _possible(base, parameters, generating)
-    for joint, share, viscous, late in generating:
+    for joint, lost in lost_inertia(base, parameters).items():
         for name, factor in zip(base.names, rotor(base, joint), strict=True):
-            moving[name] -= possible * share * viscous * late * factor
+            moving[name] -= lost * factor
     return moving
 
 
@@ -61,9 +58,8 @@ def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[
 def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -> tuple[str, ...]:
     """Return the names of the lagging back-EMFs that would cancel more inertia than the simulation allows.
 
-    The loss that is simulated is then smaller than the parameters imply, which biases the estimated inertias. A
-    back-EMF is named only if its loss exceeds the standard error of a base parameter. std: standard errors of the base
-    parameters; those of other parameters may follow.
+    The simulated loss is then too small, which biases the estimated inertias. A back-EMF is named only if its loss
+    exceeds the standard error of a base parameter. std: standard errors; those of the base parameters come first.
     """
     generating = _generating(base.chain.joints, parameters)
     most, parts = _most_lost(base, parameters, generating)
@@ -114,8 +110,7 @@ def losses(base: BaseParameters, parameters: Mapping[str, float], names: tuple[s
 
 def complete(lost: Losses, derivative: Array) -> None:
     """Convert derivatives of positions (samples, joints, parameters) in place: from those with respect to the
-    parameters of the equivalent arm (`as_moving`) to those with respect to the parameters of the actual arm. lost: the
-    result of `losses`.
+    parameters of the equivalent arm (`as_moving`) to those of the actual arm. lost: the result of `losses`.
     """
     for rotor_, changes in lost:
         by_rotor = derivative[:, :, : rotor_.size] @ rotor_

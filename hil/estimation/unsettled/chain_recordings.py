@@ -70,8 +70,10 @@ def estimate_chain_recordings(
     base = BaseParameters.of(Chain(*arm.geometry, gravity), tilts=config.model.base_tilt)
     prior = Prior.of(base, arm.parameters)
     wanted = config.model
+    # One delay for all would leave differences between the joints' lags unexplained.
+    drive = wanted.drive if "model" in config.model_fields_set or base.chain.joints == 1 else "delay_lag"
     model = ChainModel(
-        *(base, wanted.fixed_friction, wanted.drive, wanted.zeros, wanted.torque_scale and base.chain.joints > 1),
+        *(base, wanted.fixed_friction, drive, wanted.zeros, wanted.torque_scale and base.chain.joints > 1),
         base_tilt=wanted.base_tilt,
         lags=base.chain.joints > 1,
         by_voltage=tuple(range(1, base.chain.joints + 1)) if config.columns.drive in {"voltage", "pwm"} else (),

@@ -21,6 +21,7 @@ from hil.estimator.chain.model.dynamics import mass_matrix
 from hil.estimator.chain.model.late_torque import MOST_LOST, as_moving, complete, lags_of, limited, losses, lost_inertia
 from hil.estimator.chain.simulation.sensitivity import Simulation
 from hil.estimator.data.settled_period import SettledPeriod
+from hil.estimator.simulation.back_emf import UNKNOWN_DELAY
 
 LAGS = (0.6e-3, 1.4e-3, 0.8e-3, 1.2e-3)
 
@@ -175,6 +176,10 @@ def test_standard_errors_include_what_a_late_back_emf_neglects(setup: bench.Setu
         for q in period.position.T[::100]
     )
     found = std(parameters)
-    assert found["armature_4"] == pytest.approx(lost**2 / inertia, rel=1e-3)
+    unequally_late = 0.9 * 0.2 * UNKNOWN_DELAY
+    assert found["armature_4"] == pytest.approx(np.hypot(lost**2 / inertia, unequally_late), rel=1e-3)
     assert sum(found.values()) == found["armature_4"]
-    assert sum(std(parameters | {"lag": 0.0}).values()) == 0.0
+    assert std(parameters | {"lag": 0.0})["armature_4"] == pytest.approx(unequally_late)
+    half = 0.9 * 0.2 * 2e-3  # of a pure delay, which may delay the back-EMF or not
+    assert std(parameters | {"lag": 0.0, "delay": 4e-3})["armature_4"] >= half
+    assert sum(std(parameters | {"viscous_4": 0.0}).values()) == 0.0, "no back-EMF"

@@ -13,8 +13,10 @@ import pytest
 import hil as api
 from benchmarks import chain as bench
 from hil.errors import ConfigError, CsvError
+from hil.estimation.unsettled import chain_recordings
 from hil.estimation.unsettled.chain_recordings import _verdict
 from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.errors import ConvergenceError
 from tests.support.command_line import hil
 
 SAMPLES = 2600  # of a period of 4000
@@ -70,6 +72,31 @@ def test_commanded_torque_gives_the_likelihood(setup: bench.Setup, capsys: pytes
     assert hil("estimate", "commanded", "--json") == 0  # again, from what the folder keeps
     again = json.loads(capsys.readouterr().out)
     assert again["parameters"]["viscous_1"]["value"] == pytest.approx(found.parameters["viscous_1"].value)
+
+
+@pytest.mark.parametrize(
+    ("given", "drive"),
+    [("", "delay_lag"), ('[model]\ndrive = "delay"\n', "delay"), ('[model]\nfriction = "stribeck"\n', "lag")],
+)
+def test_joints_have_lags_of_their_own_unless_the_file_says_otherwise(
+    setup: bench.Setup, monkeypatch: pytest.MonkeyPatch, given: str, drive: str
+) -> None:
+    """One delay for all joints left lags of 1 to 2 ms unexplained, and made torques several times less accurate."""
+    file = Path(described(setup, "held"))
+    file.write_text(file.read_text(encoding="utf-8").partition("[model]")[0] + given, encoding="utf-8")
+    models: list[ChainModel] = []
+
+    def give_up(recordings: object, model: ChainModel, *_: object) -> None:
+        models.append(model)
+        raise ConvergenceError("far enough")
+
+    monkeypatch.setattr(chain_recordings, "_identified", give_up)
+    monkeypatch.setattr(chain_recordings.ColumnCheck, "of", lambda *_: None)
+    with pytest.raises(ConvergenceError, match="far enough"):
+        api.estimate("arm.csv", config="arm.toml", out="given_up")
+    (model,) = models
+    assert model.drive == drive
+    assert ("lag_ratio_4" in model.names) is (drive != "delay") is ("lags" in model.description)
 
 
 def fitted(setup: bench.Setup, residual_over_noise: np.ndarray, systematic: float) -> tuple[Any, Any]:
