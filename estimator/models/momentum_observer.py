@@ -20,8 +20,8 @@ alarm; otherwise a joint that is held for a long time would widen the range unti
 stands still, its noise is lower, since most of the noise only arises in motion.
 
 While a joint's angle stays within its gear's play for `_STAYS_S`, the velocity that it reports does not show in which
-direction friction acts: the motor may stick while the link floats from one side of the play to the other. Friction in
-either direction then raises no alarm.
+direction friction acts: the motor may stick while the link floats from one side of the play to the other. What
+friction in either direction may hold then brings no alarm nearer.
 
 What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which the
 gear's presliding softens every reversal, dry friction looks viscous but still holds the joint once it has stopped.
@@ -62,7 +62,7 @@ FLOOR_SHARE = 0.25
 _COUNT = len(NAMES)
 _STANDING = 0.05  # rad/s below which dry friction may hold a joint
 _PLAY_RAD = 0.006  # play of a gear (a data sheet says 0.0044) and encoder noise
-_STAYS_S = 0.02  # time within this play after which the direction of friction counts as unknown
+_STAYS_S = 0.03  # time within this play after which the direction of friction counts as unknown
 _STATIC = 1.5  # ratio of static to Coulomb friction
 _CERTAIN = 2.0  # standard deviations within which a torque that friction has held is known
 _INERTIAS = 4  # number of inertial parameters, the first ones
@@ -447,8 +447,8 @@ def _observe_loop(
         single[_LESSON] = 0.0
     alarm = -1
     for j in range(int(k[0])):
-        q, v, torque = (q1, v1, t1) if j == 0 else (q2, v2, t2)
-        _filter(m, j, momentum, rest, torque, fallen, slope, row)
+        q, v = (q1, v1) if j == 0 else (q2, v2)
+        _filter(m, j, momentum, rest, t1 if j == 0 else t2, fallen, slope, row)
         if not is_warm:
             continue
         _remember_speed(m, j, v, dt)
@@ -457,13 +457,13 @@ def _observe_loop(
         single[_LACKING + j] = lacking
         stands = min(max(single[_STANDS + j], 0.0), 1.0)
         static, rounding = _static_friction(m, rests[j], j), _of_rounding(m, j, slope, math.cos(q2))
-        holds = stands * static
         quiet = 1.0 - (1.0 - _STANDING_NOISE) * stands
         noise, floor = quiet * quiet * single[_NOISE + j], _floor(m, k, j)
         spread = left_open + rounding + noise
-        beyond = max(abs(lacking) - holds, 0.0)
-        alarming = min(beyond, _beyond_either(m, j, row, lacking, static)) if _stays(m, j, q, v, dt) else beyond
-        if _alarms(single, j, alarming / max(TIMES * math.sqrt(spread), quiet * floor), dt):
+        beyond = max(abs(lacking) - stands * static, 0.0)
+        most = max(TIMES * math.sqrt(spread), quiet * floor)
+        is_clear = not _stays(m, j, q, v, dt) or _beyond_either(m, j, row, lacking, static) > most
+        if _alarms(single, j, beyond / most, dt if is_clear else 0.0):
             alarm = j
         distance = _look_at_rest(rests[j], q, stands, single[_TORQUE + j], row, m[_THETA])
         held = abs(lacking) - _CERTAIN * math.sqrt(left_open)
@@ -478,7 +478,7 @@ def _observe_loop(
         if lesson and beyond <= TIMES * math.sqrt(spread) and not _is_suspect(rests[j]):
             taught_by = _LESSONS * (spread - left_open) + _STANDING_LESSONS * (1.0 - quiet) * rounding
             first = 0 if _accelerates(m, j, slope) else _INERTIAS
-            _learn(m, row, m[_GAIN], lacking, left_open + taught_by + holds * holds, first)
+            _learn(m, row, m[_GAIN], lacking, left_open + taught_by + (stands * static) ** 2, first)
             _keep_dissipative(m)
     return alarm
 
