@@ -126,6 +126,15 @@ class Servo:
 
     def _write_and_read_back(self, register: str, value: int, attempts: int | None, *, despite_error: bool) -> None:
         attempts = _ATTEMPTS if attempts is None else attempts
+        for left in reversed(range(attempts if despite_error else 1)):
+            try:
+                self._write_and_compare(register, value, attempts, despite_error=despite_error)
+                break
+            except ServoRefused:
+                if not left:
+                    raise
+
+    def _write_and_compare(self, register: str, value: int, attempts: int, *, despite_error: bool) -> None:
         refused: ServoRefused | None = None
         try:
             # The status packet may be lost or switched off (Status Return Level 1); what counts is the register's
@@ -173,8 +182,8 @@ class Servo:
             self._sdk.heard = -1
             value, result, error = action()
             others.add(self._sdk.heard)
-            if result == COMM_SUCCESS:
-                break
+            if result == COMM_SUCCESS and not (is_read and error & ~ALERT):
+                break  # a read that is refused is tried again: nothing depends on how often a register is read
             late = late or result == COMM_RX_TIMEOUT
             if left == 1 and result != COMM_RX_TIMEOUT and is_read:
                 # A busy computer delivers replies late and in pieces, which are then discarded before the last attempt.

@@ -9,6 +9,8 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from hil.description.regular_file import not_a_file
+
 
 class TomlFileError(ValueError):
     """A file that cannot be read or is not TOML; the text is the whole message and names the file."""
@@ -26,6 +28,8 @@ def shortened(path: str) -> str:
 
 def read_toml_text(path: Path) -> str:
     """The text of a file, without a byte order mark. Raises TomlFileError."""
+    if said := not_a_file(path):
+        raise TomlFileError(f"{path} cannot be read: {said}.")
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

@@ -110,11 +110,16 @@ def attainable(servo: Servo, settings: Mapping[str, int]) -> dict[str, int]:
     return cut
 
 
+AS_BEFORE = "all other settings are as before."
+"""End of the message of an error that left only some registers in doubt."""
+
+
 def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, int]]:
     """Restore the registers that differ from `settings`; return their old and new values by name.
 
     Goals are restored as far as the servo's limits allow (`attainable`). Each register is read back. Raises
-    WrongSetting if torque is on. Raises the errors of `Servo.write` only after all other registers have been tried.
+    WrongSetting if torque is on. Raises the errors of `Servo.write` only after all other registers have been tried; the
+    message then names the registers in doubt.
     """
     if servo.read_despite_error("Torque Enable"):
         raise WrongSetting(f"{servo.title}: its settings cannot be restored while its torque is on.")
@@ -122,7 +127,7 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
         servo.write_despite_error("Bus Watchdog", 0)  # goals are read-only while it is tripped
     settings = attainable(servo, settings)
     written: dict[str, tuple[int, int]] = {}
-    failures: list[DriverError] = []
+    failures: dict[str, DriverError] = {}
     for name in (*EEPROM, *RAM, "Bus Watchdog"):
         if name not in settings or name not in servo.table:
             continue
@@ -132,21 +137,24 @@ def put_back(servo: Servo, settings: Mapping[str, int]) -> dict[str, tuple[int, 
                 servo.write_despite_error(name, settings[name])
                 written[name] = present, settings[name]
         except DriverError as error:
-            failures.append(error)
+            failures[name] = error
     if failures:
-        raise failures[0]
+        failed = next(iter(failures.values()))
+        if len(failures) < len(RAM):  # otherwise the servo is hardly there
+            failed.args = (f"{failed} Only {', '.join(failures)} may differ; {AS_BEFORE}",)
+        raise failed
     return written
 
 
 def unlike(servo: Servo, settings: Mapping[str, int]) -> tuple[str, int, int] | None:
-    """Return the name of a register that determines how a servo moves (EEPROM or a goal) and differs from `settings`,
-    with its value and the one in `settings`; None if there is no such register.
+    """Return the name of a register that determines how a servo moves (EEPROM, a goal or the Bus Watchdog) and differs
+    from `settings`, with its value and the one in `settings`; None if there is no such register.
 
     Registers are read in the reverse order of `put_back`, so that replies to earlier requests do not match again.
     Raises the same errors as `Servo.read`.
     """
     wanted = attainable(servo, settings)
-    for name in reversed((*EEPROM, *_BOUNDS)):
+    for name in reversed((*EEPROM, *_BOUNDS, "Bus Watchdog")):
         if name in wanted and name in servo.table and (now := servo.read_despite_error(name)) != wanted[name]:
             return name, now, wanted[name]
     return None

@@ -26,7 +26,7 @@ from hil.drivers.packet import BROADCAST_ID, Instruction, encode
 from hil.drivers.port import Port
 from hil.drivers.preparation.settings import WATCHDOG_TRIPPED
 from hil.drivers.servo import Servo
-from hil.drivers.servo_model import WATCHDOG_UNIT
+from hil.drivers.servo_model import WATCHDOG_UNIT, Mode
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -48,7 +48,8 @@ class TorqueOff:
     unconfirmed: the other joints, each with the reason.
     unwatched: joints, of either group, whose servos have no Bus Watchdog.
     later: confirmed joints whose servos did not answer at first.
-    rebooted: confirmed joints whose servos had lost the watchdog that was armed before torque came on.
+    rebooted: confirmed joints whose servos were reset, and so lost the watchdog that was armed before torque came on.
+    disarmed: confirmed joints whose servos lost only this watchdog: another program switched it off.
     tripped: joints whose Bus Watchdog may have tripped, which zeroes their goals; it has been cleared since.
     driven: joints in neither group, whose servos' torque is on because another program switches it on whenever it is
     cut.
@@ -57,8 +58,9 @@ class TorqueOff:
     confirmed: tuple[Joint, ...]
     unconfirmed: tuple[tuple[Joint, str], ...]
     unwatched: frozenset[Joint] = frozenset()
-    later: frozenset[Joint] = frozenset()
     rebooted: frozenset[Joint] = frozenset()
+    disarmed: frozenset[Joint] = frozenset()
+    later: frozenset[Joint] = frozenset()
     tripped: frozenset[Joint] = frozenset()
     driven: tuple[Joint, ...] = ()
 
@@ -81,8 +83,11 @@ class TorqueOff:
             driven=tuple(on),
         )
 
-    def with_later(self, joint: Joint, *, rebooted: bool) -> "TorqueOff":
-        """Return the report after an unconfirmed joint's servo has answered again and been read back as off."""
+    def with_later(self, joint: Joint, *, rebooted: bool | None) -> "TorqueOff":
+        """Return the report after an unconfirmed joint's servo has answered again and been read back as off.
+
+        rebooted: result of `was_rebooted`.
+        """
         return replace(
             self,
             confirmed=(*self.confirmed, joint),
@@ -90,6 +95,7 @@ class TorqueOff:
             later=self.later | {joint},
             tripped=self.tripped | {joint},
             rebooted=self.rebooted | ({joint} if rebooted else set()),
+            disarmed=self.disarmed | ({joint} if rebooted is False else set()),
         )
 
     def __str__(self) -> str:
@@ -104,6 +110,11 @@ class TorqueOff:
                 yield (
                     f"{joint.title} was rebooted: its Bus Watchdog is no longer armed. Check its supply and its "
                     "connector; a brief voltage dip is enough to reboot it."
+                )
+            if joint in self.disarmed:
+                yield (
+                    f"{joint.title}: another program has switched off its Bus Watchdog; it was not rebooted, since it "
+                    "still holds its goal. End that program."
                 )
 
     def _reasons(self) -> Iterator[tuple[str, list[Joint]]]:
@@ -245,15 +256,15 @@ def disarm_watchdogs(servos: Mapping[Joint, Servo], interrupts: list[BaseExcepti
     return frozenset(tripped)
 
 
-def cut_again(servo: Servo, *, armed: bool) -> bool:
-    """Cut the torque of a servo that did not answer before; return whether it was rebooted.
+def cut_again(servo: Servo, *, armed: bool) -> bool | None:
+    """Cut the torque of a servo that did not answer before; return whether it was rebooted, as `was_rebooted` does.
 
     armed: whether its Bus Watchdog was armed before torque was switched on; if so, the watchdog is switched off. Raises
     the same errors as `Servo.write`.
     """
     if servo.read_despite_error("Torque Enable"):
         servo.write_despite_error("Torque Enable", 0)
-    rebooted = armed and was_rebooted(servo)
+    rebooted = was_rebooted(servo) if armed else None
     if armed:
         servo.write_despite_error("Bus Watchdog", 0)
     return rebooted
@@ -277,14 +288,17 @@ def has_torque(servo: Servo) -> bool | None:
     return bool(first) if is_its_own and servo.read_despite_error("Torque Enable") == first else None
 
 
-def was_rebooted(servo: Servo) -> bool:
-    """Whether a servo's watchdog has been disarmed, as by a reboot; False if the servo does not answer.
+def was_rebooted(servo: Servo) -> bool | None:
+    """Whether a servo whose watchdog is no longer armed was rebooted; None if it is armed, or nothing is known.
 
-    A late reply to an earlier request could be mistaken for the answer, so another register is read before and after.
+    A reboot also resets the goal to its limit; a program that only writes to the watchdog leaves the goal as it is. A
+    late reply to an earlier request could be mistaken for the answer, so another register is read before and after.
     """
     with suppress(DriverError):
-        return servo.read("ID") == servo.id and servo.read("Bus Watchdog") == 0 and servo.read("ID") == servo.id
-    return False
+        if servo.read("ID") == servo.id and servo.read("Bus Watchdog") == 0 and servo.read("ID") == servo.id:
+            what = "Current" if servo.read("Operating Mode") == Mode.CURRENT else "PWM"
+            return servo.read(f"Goal {what}") == servo.read(f"{what} Limit")
+    return None
 
 
 def _confirm(servo: Servo, interrupts: list[BaseException], *, at_once: bool) -> Exception | None:

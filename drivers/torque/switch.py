@@ -145,12 +145,13 @@ class TorqueSwitch:
             silent = self._silent()
             confirmed, unconfirmed = cut_torque(self.port, self._servos, silent, self._watchdog, interrupts)
             fell_silent = {joint: self._servos[joint] for joint in confirmed if joint in silent & self._armed}
-            rebooted = frozenset(joint for joint, servo in fell_silent.items() if was_rebooted(servo))
+            reset = {joint: was_rebooted(servo) for joint, servo in fell_silent.items()}
             watched = {joint: self._servos[joint] for joint in confirmed if joint not in self._without_watchdog}
             tripped = disarm_watchdogs(watched, interrupts)
             self._armed.difference_update(watched)
             unwatched = frozenset(self._without_watchdog)
-            self.torque_off_report = TorqueOff(confirmed, unconfirmed, unwatched, rebooted=rebooted, tripped=tripped)
+            rebooted, disarmed = (frozenset(joint for joint in reset if reset[joint] is each) for each in (True, False))
+            self.torque_off_report = TorqueOff(confirmed, unconfirmed, unwatched, rebooted, disarmed, tripped=tripped)
         if interrupts:
             raise interrupts[0]
         return self.torque_off_report

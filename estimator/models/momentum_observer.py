@@ -19,6 +19,10 @@ widen the admissible range. A deviation that may become an alarm enters that est
 alarm; otherwise a joint that is held for a long time would widen the range until nothing exceeded it. While a joint
 stands still, its noise is lower, since most of the noise only arises in motion.
 
+While a joint's angle stays within its gear's play for `_STAYS_S`, the velocity that it reports does not show in which
+direction friction acts: the motor may stick while the link floats from one side of the play to the other. What
+friction in either direction may hold then brings no alarm nearer.
+
 What friction can hold includes the viscous friction at the speeds of the usual motion: in a small motion, in which the
 gear's presliding softens every reversal, dry friction looks viscous but still holds the joint once it has stopped.
 
@@ -57,6 +61,8 @@ FLOOR_SHARE = 0.25
 
 _COUNT = len(NAMES)
 _STANDING = 0.05  # rad/s below which dry friction may hold a joint
+_PLAY_RAD = 0.006  # play of a gear (a data sheet says 0.0044) and encoder noise
+_STAYS_S = 0.03  # time within this play after which the direction of friction counts as unknown
 _STATIC = 1.5  # ratio of static to Coulomb friction
 _CERTAIN = 2.0  # standard deviations within which a torque that friction has held is known
 _INERTIAS = 4  # number of inertial parameters, the first ones
@@ -88,8 +94,8 @@ _OF_REST, _ROW, _GAIN = _OF_MOMENTUM + 2, _OF_MOMENTUM + 4, _OF_MOMENTUM + 5
 # possible alarm, residual torque; then the time since the last parameter update and since the start.
 _TORQUE, _NOISE, _STANDS, _HELD, _SAMPLES, _LACKING, _LESSON, _AGE = 0, 2, 4, 6, 8, 10, 12, 13
 # Last row, per joint: contribution of a possible alarm to the noise estimate, and its duration; mean square velocity;
-# square of the largest recent acceleration.
-_TAUGHT, _TEACHES, _SQUARED, _SHARPEST = 0, 2, 4, 6
+# square of the largest recent acceleration; an angle, and for how long the joint has stayed near it.
+_TAUGHT, _TEACHES, _SQUARED, _SHARPEST, _ANGLE, _STAYS = 0, 2, 4, 6, 8, 10
 # The constants: joints, interval, floors; from 4 drifts; then two minimum noises, the highest floors and their
 # friction; whether the arm is hardly known.
 _HIGHEST = 4 + _COUNT + 2
@@ -200,7 +206,7 @@ def _begin_anew(m: Any, momentum: Any, rest: Any, t1: float, t2: float) -> None:
         single[_TORQUE + j] = t1 if j == 0 else t2
         single[_STANDS + j] = 1.0
         single[_HELD + j] = single[_SAMPLES + j] = 0.0
-        m[_PENDING, _TAUGHT + j] = m[_PENDING, _TEACHES + j] = 0.0
+        m[_PENDING, _TAUGHT + j] = m[_PENDING, _TEACHES + j] = m[_PENDING, _STAYS + j] = 0.0
     single[_LESSON] = single[_AGE] = 0.0
 
 
@@ -343,6 +349,20 @@ def _teach_noise(m: Any, j: int, taught: float, dt: float, pending: bool) -> Non
     for_later[_TAUGHT + j] = for_later[_TEACHES + j] = 0.0
 
 
+def _stays(m: Any, j: int, angle: float, velocity: float, dt: float) -> bool:
+    """Process a sample; return whether the joint moves, but has stayed within its gear's play for some time."""
+    if abs(angle - m[_PENDING, _ANGLE + j]) > _PLAY_RAD:
+        m[_PENDING, _ANGLE + j], m[_PENDING, _STAYS + j] = angle, 0.0
+        return False
+    m[_PENDING, _STAYS + j] += dt
+    return bool(m[_PENDING, _STAYS + j] >= _STAYS_S and velocity != 0.0)
+
+
+def _beyond_either(m: Any, j: int, row: Any, lacking: float, static: float) -> float:
+    """Return how far a residual torque exceeds the static friction if that may act in either direction [N m]."""
+    return float(max(abs(lacking + row[8 + j] * m[_THETA, 8 + j]) - static, 0.0))
+
+
 def _remember_speed(m: Any, j: int, velocity: float, dt: float) -> None:
     """Update the mean square of the joint's velocity."""
     m[_PENDING, _SQUARED + j] += min(dt / _USUAL_S, 1.0) * (velocity * velocity - m[_PENDING, _SQUARED + j])
@@ -427,37 +447,38 @@ def _observe_loop(
         single[_LESSON] = 0.0
     alarm = -1
     for j in range(int(k[0])):
+        q, v = (q1, v1) if j == 0 else (q2, v2)
         _filter(m, j, momentum, rest, t1 if j == 0 else t2, fallen, slope, row)
         if not is_warm:
             continue
-        _remember_speed(m, j, v1 if j == 0 else v2, dt)
+        _remember_speed(m, j, v, dt)
         _remember_acceleration(m, j, row, dt)
         lacking, left_open = _lacks(m, j, row)
         single[_LACKING + j] = lacking
         stands = min(max(single[_STANDS + j], 0.0), 1.0)
         static, rounding = _static_friction(m, rests[j], j), _of_rounding(m, j, slope, math.cos(q2))
-        holds = stands * static
         quiet = 1.0 - (1.0 - _STANDING_NOISE) * stands
         noise, floor = quiet * quiet * single[_NOISE + j], _floor(m, k, j)
         spread = left_open + rounding + noise
-        beyond = max(abs(lacking) - holds, 0.0)
-        is_beyond = beyond > TIMES * math.sqrt(spread)
-        if _alarms(single, j, beyond / max(TIMES * math.sqrt(spread), quiet * floor), dt):
+        beyond = max(abs(lacking) - stands * static, 0.0)
+        most = max(TIMES * math.sqrt(spread), quiet * floor)
+        is_clear = not _stays(m, j, q, v, dt) or _beyond_either(m, j, row, lacking, static) > most
+        if _alarms(single, j, beyond / most, dt if is_clear else 0.0):
             alarm = j
-        distance = _look_at_rest(rests[j], q1 if j == 0 else q2, stands, single[_TORQUE + j], row, m[_THETA])
+        distance = _look_at_rest(rests[j], q, stands, single[_TORQUE + j], row, m[_THETA])
         held = abs(lacking) - _CERTAIN * math.sqrt(left_open)
         if _is_blocked(m, rests[j], j, distance, row, held, quiet * floor, noise, rounding, dt):
             alarm = j
         if k[_HARDLY_KNOWN] > 0.0:
-            mean = _look_back(m, past, k, j, row, v1 if j == 0 else v2, stands, static, rounding, dt)
+            mean = _look_back(m, past, k, j, row, v, stands, static, rounding, dt)
             if mean != 0.0:
                 single[_LACKING + j], alarm = mean, j
         taught = min(beyond * beyond - left_open - rounding, _CLIPPED * single[_NOISE + j])
         _teach_noise(m, j, max(taught, k[4 + _COUNT + j]), dt * (1.0 - stands), single[_SAMPLES + j] > 0.0)
-        if lesson and not is_beyond and not _is_suspect(rests[j]):
+        if lesson and beyond <= TIMES * math.sqrt(spread) and not _is_suspect(rests[j]):
             taught_by = _LESSONS * (spread - left_open) + _STANDING_LESSONS * (1.0 - quiet) * rounding
             first = 0 if _accelerates(m, j, slope) else _INERTIAS
-            _learn(m, row, m[_GAIN], lacking, left_open + taught_by + holds * holds, first)
+            _learn(m, row, m[_GAIN], lacking, left_open + taught_by + (stands * static) ** 2, first)
             _keep_dissipative(m)
     return alarm
 
@@ -473,6 +494,8 @@ _add, _store, _forget_past = earlier_model.add, earlier_model.store, earlier_mod
 _keep, _unexplained = earlier_model.keep, earlier_model.unexplained
 _static_friction, _is_blocked = map(_inner, (_static_friction, _is_blocked))
 _second_moment, _of_rounding = map(_inner, (_second_moment, _of_rounding))
-_alarms, _teach_noise, _floor, _remember_speed = map(_inner, (_alarms, _teach_noise, _floor, _remember_speed))
-_remember_acceleration, _accelerates, _look_back = map(_inner, (_remember_acceleration, _accelerates, _look_back))
+_alarms, _teach_noise, _floor = map(_inner, (_alarms, _teach_noise, _floor))
+_stays, _beyond_either = map(_inner, (_stays, _beyond_either))
+_remember_speed, _remember_acceleration = map(_inner, (_remember_speed, _remember_acceleration))
+_accelerates, _look_back = map(_inner, (_accelerates, _look_back))
 observe: Callable[..., int] = compiled(_observe_loop, _nrt=False)

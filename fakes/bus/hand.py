@@ -19,6 +19,7 @@ from typing import Annotated, Self
 from pydantic import Field, ValidationError, model_validator
 
 from hil.fakes.bus.joints import Joints
+from hil.fakes.plants.arm import PI
 from hil.fakes.plants.errors import PlantError
 from hil.fakes.plants.plant import CanBeHeld, Plant
 from hil.toml_errors import Described, describe
@@ -35,7 +36,7 @@ class Move(Described):
     servo: Annotated[int, Field(ge=0, le=252, description="bus ID of one of the joint's servos")]
     to: Annotated[
         float | None,
-        Field(ge=-4 * math.pi, le=4 * math.pi, allow_inf_nan=False, description="joint angle at the end [rad]"),
+        Field(ge=-4 * PI, le=4 * PI, allow_inf_nan=False, description="joint angle at the end [rad]"),
     ] = None
     ticks: Annotated[int | None, Field(description="Present Position at the end, instead of `to`")] = None
     at: Annotated[float, Field(ge=0, le=86400, allow_inf_nan=False, description="delay before the start [s]")] = 0.0

@@ -11,7 +11,10 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
-Angle = Annotated[float, Field(ge=-4 * math.pi, le=4 * math.pi, allow_inf_nan=False)]
+PI = 3.1425
+"""Pi, rounded up: a bound must admit an angle that was rounded, such as 1.5708, 6.284 or 12.57 [rad]."""
+
+Angle = Annotated[float, Field(ge=-4 * PI, le=4 * PI, allow_inf_nan=False)]
 
 
 class Link(Described):
@@ -124,7 +127,7 @@ class Arm(Described):
     """A planar arm of one or two joints; joint 1 is measured from the horizontal, joint 2 from link 1."""
 
     gravity: NotNegative = Field(9.81, le=30, description="acceleration of gravity; 0 for a horizontal arm [m/s^2]")
-    tilt: Annotated[float, Field(ge=-math.pi / 2, le=math.pi / 2)] = Field(
+    tilt: Annotated[float, Field(ge=-PI / 2, le=PI / 2)] = Field(
         0.0, description="inclination of the arm's plane from the vertical; pi/2 is horizontal [rad]"
     )
     start: tuple[Angle, ...] = Field(strict=False, description="joint angles at time 0 [rad]")

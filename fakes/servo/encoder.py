@@ -10,11 +10,12 @@ from typing import Annotated
 
 from pydantic import Field
 
+from hil.fakes.plants.arm import PI
 from hil.fakes.servo.registers import TICKS_PER_TURN
 from hil.toml_errors import Described
 
 Ticks = Annotated[float, Field(ge=0, le=TICKS_PER_TURN / 4)]
-Phase = Annotated[float, Field(ge=-math.tau, le=math.tau)]
+Phase = Annotated[float, Field(ge=-2 * PI, le=2 * PI)]
 
 _TURN_PER_TICK = math.tau / TICKS_PER_TURN
 

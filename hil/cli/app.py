@@ -16,7 +16,7 @@ import typer
 from hil import __version__
 from hil.cli import bus, data, dry_run, experiment, fake_command, init, results, runs, schema, study
 from hil.cli.errors import Command, exit_code, message, stop_behind
-from hil.cli.output import readable_output, require_output
+from hil.cli.output import bounded_output, readable_output, require_output
 from hil.cli.stopped import same_again
 from hil.cli.verbosity import with_verbosity
 from hil.errors import StopRequested
@@ -116,6 +116,13 @@ def main() -> NoReturn:
     """Run the command line; turn an expected error into a message on standard error and an exit code."""
     _one_blas_thread()
     require_output()
+    with bounded_output():
+        _run()
+    sys.exit(0)
+
+
+def _run() -> None:
+    """Run the command; exit with a code other than 0 if it fails."""
     try:
         with _code_as_asked(), readable_output():
             _built()()
@@ -131,4 +138,3 @@ def main() -> NoReturn:
         except OSError:  # the terminal is closed: nobody reads this, and Python would fail again when it ends
             os._exit(code)
         sys.exit(code)
-    sys.exit(0)

@@ -1,10 +1,23 @@
-"""Handle a closed pipe or a full disk on standard output. Results are saved first."""
+"""Handle a closed pipe, a full disk or a stopped terminal on standard output. Results are saved first."""
 
 import errno
+import io
 import os
+import select
+import signal
+import stat
 import sys
+import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import Any
+
+PATIENCE_S = 3.0
+"""Time after a signal in which a terminal or pipe must take some output [s]; the rest is then discarded."""
+
+_PIECE, _POLL_S = 256, 0.1
+"""Number of bytes written at once, so that no write blocks for long, and the interval between two looks [s]."""
 
 
 def require_output() -> None:
@@ -30,6 +43,97 @@ def readable_output() -> Iterator[None]:
         said = "hil: cannot write to standard output: no space left. Finished results are in their folder."
         print(said, file=sys.stderr)
         sys.exit(1)
+
+
+@contextmanager
+def bounded_output() -> Iterator[None]:
+    """Let the program end after a signal although its terminal is stopped (Ctrl-S) or nobody reads its output.
+
+    Until a signal arrives, output waits for as long as it takes. Only terminals and pipes are treated so, in a main
+    thread: the files of a run folder are complete, and closed, without them.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heard, told = os.pipe()
+    os.set_blocking(told, False)
+    former = signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+    streams = sys.stdout, sys.stderr
+    patience = _Patience(heard)
+    try:
+        sys.stdout, sys.stderr = (_bounded(stream, patience) for stream in streams)
+        yield
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError, AttributeError):
+                stream.flush()
+        sys.stdout, sys.stderr = streams
+        signal.set_wakeup_fd(former)
+        os.close(heard)
+        os.close(told)
+
+
+def _bounded(stream: Any, patience: "_Patience") -> Any:
+    """Return a stream to the same terminal or pipe that gives up as `patience` says; any other stream as it is."""
+    try:
+        number = stream.fileno()
+        mode = os.fstat(number).st_mode
+    except (AttributeError, OSError, ValueError):
+        return stream
+    if not (stat.S_ISFIFO(mode) or os.isatty(number)):
+        return stream
+    stream.flush()
+    raw = io.BufferedWriter(_Bounded(number, patience))
+    return io.TextIOWrapper(raw, stream.encoding, stream.errors, line_buffering=stream.line_buffering)
+
+
+class _Patience:
+    """How long output waits for its reader: without bound until a signal arrives, `PATIENCE_S` from then on.
+
+    heard: file descriptor from which a byte can be read once a signal has arrived.
+    """
+
+    def __init__(self, heard: int) -> None:
+        self._heard = heard
+        self._since: float | None = None
+        """Since when nothing could be written after a signal [s]."""
+
+    def is_over(self) -> bool:
+        """Whether output that cannot be written now is discarded."""
+        if self._since is None and select.select([self._heard], [], [], 0.0)[0]:
+            self._since = time.monotonic()
+        return self._since is not None and time.monotonic() - self._since >= PATIENCE_S
+
+    def made_progress(self) -> None:
+        """Begin to wait anew."""
+        if self._since is not None:
+            self._since = time.monotonic()
+
+
+class _Bounded(io.RawIOBase):
+    """Writes to a terminal or pipe in pieces that do not block, and discards what `patience` does not let wait."""
+
+    def __init__(self, number: int, patience: _Patience) -> None:
+        super().__init__()
+        self._number = number
+        self._patience = patience
+
+    def fileno(self) -> int:
+        return self._number
+
+    def isatty(self) -> bool:
+        return os.isatty(self._number)
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        while not self._patience.is_over():
+            if select.select([], [self._number], [], _POLL_S)[1]:
+                written = os.write(self._number, data[:_PIECE])
+                self._patience.made_progress()
+                return written
+        return len(data)
 
 
 def _drop_output() -> None:

@@ -7,6 +7,7 @@ from pydantic import Field, PositiveFloat, model_validator
 
 from hil.config.table import Angle, Range, Table
 from hil.estimator.models.terms import OPTIONS, Drive, Friction
+from hil.fakes.plants.arm import PI
 from hil.unit_hints import in_other_units
 
 DRIFT = 5.0
@@ -100,7 +101,7 @@ class PathConfig(Table):
     """`[joint_path]`: the path that excites a spatial arm. The upper end of experiment.band limits its frequency."""
 
     centre: list[Angle] = Field(description="rad per joint: centre of the path")
-    swing: list[Annotated[float, Field(gt=0, le=4 * math.pi)]] = Field(
+    swing: list[Annotated[float, Field(gt=0, le=4 * PI)]] = Field(
         description="rad per joint: amplitude around the centre"
     )
     speed: list[Annotated[float, Field(gt=0, le=100)]] = Field(description="rad/s per joint: maximum speed")

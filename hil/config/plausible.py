@@ -9,13 +9,14 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from hil.drivers.servo_model import Mode, servo_model, with_article
+from hil.fakes.plants.arm import PI
 from hil.unit_hints import in_other_units
 
 if TYPE_CHECKING:
     from hil.config.joint import JointConfig
     from hil.config.schema import Config
 
-_MOST_TURN_RAD = 4 * math.pi
+_MOST_TURN_RAD = 4 * PI
 _LONGEST_M = 3.0
 _SHORTEST_M = 2e-3
 _LEAST_TIME_SQUARED = 0.1  # s^2/rad
@@ -43,7 +44,7 @@ def implausible(config: "Config") -> Iterator[str]:
     for joint in config.joints:
         yield from _joint(joint)
     yield from _angles("arm.rest_pose", config.arm.rest_pose)
-    yield from _angles("arm.rest_tolerance", [config.arm.rest_tolerance], most=math.pi)
+    yield from _angles("arm.rest_tolerance", [config.arm.rest_tolerance], most=PI)
     if config.arm.link_lengths is not None:
         for joint, length in zip(config.joints, config.arm.link_lengths, strict=True):
             yield from _length(f"arm.link_lengths of joint {joint.name!r}", length)

@@ -1,10 +1,10 @@
 """The base class and field types shared by all tables of the TOML file."""
 
-import math
 from typing import Annotated, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
+from hil.fakes.plants.arm import PI
 from hil.toml_errors import UNSAID
 
 
@@ -21,10 +21,10 @@ OneOrList = Annotated[
     Discriminator(lambda value: f"{UNSAID}list" if isinstance(value, list) else f"{UNSAID}one"),
 ]
 """A single value or a list; validation errors refer to the form that was given."""
-Angle = Annotated[float, Field(ge=-4 * math.pi, le=4 * math.pi)]
+Angle = Annotated[float, Field(ge=-4 * PI, le=4 * PI)]
 """An angle of a joint [rad]: up to two turns, so that values in degrees are detected."""
 
-Turned = Annotated[float, Field(ge=-2 * math.pi, le=2 * math.pi)]
+Turned = Annotated[float, Field(ge=-2 * PI, le=2 * PI)]
 """A mounting angle [rad], such as that of the base or of an obstacle."""
 
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hil.description.arm import ArmDescription
 from hil.description.mjcf import read_mjcf
+from hil.description.regular_file import not_a_file
 from hil.description.urdf import read_urdf
 
 _MJCF = re.compile(r"<mujoco[\s>]")
@@ -20,6 +21,8 @@ def read_arm(path: Path, joints: Sequence[str] | None = None) -> ArmDescription:
 
 def is_mjcf(path: Path) -> bool:
     """Whether the file is MJCF; False if it cannot be read."""
+    if not_a_file(path):
+        return False
     try:
         return _MJCF.search(path.read_text(encoding="utf-8")) is not None
     except (OSError, UnicodeDecodeError):

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hil.description.arm import ArmDescription, ArmFileError, ArmJoint, Array, Body, check_size
+from hil.description.regular_file import not_a_file
 
 MOST_LENGTH = 3.0  # m from joint to joint; a larger value suggests millimetres
 MOST_MASS = 100.0  # kg per link; a larger value suggests grams
@@ -81,6 +82,8 @@ def read_urdf(path: Path, joints: Sequence[str] | None = None) -> ArmDescription
 
 def parse_urdf(path: Path) -> ET.Element:
     """Parse the file and return its root element, keeping comments. Raises ArmFileError."""
+    if said := not_a_file(path):
+        raise ArmFileError(f"{path} cannot be read: {said}")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

@@ -7,7 +7,7 @@ needs too, only the planned torque is known: the first motion then trains the mo
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from typing import Any, NoReturn
 
@@ -23,6 +23,7 @@ from hil.estimator.arrays import Array
 from hil.estimator.compiled import compiled, inner, only_version
 from hil.estimator.models.momentum_observer import NAMES, MomentumObserver, observe
 from hil.estimator.models.parameters import CONSTANTS
+from hil.estimator.models.standstill import WITHIN_RAD
 from hil.experiment.checks.apart import causes_of_standstill
 from hil.experiment.checks.consistency import check_standstill
 
@@ -322,19 +323,16 @@ class ModelWatch:
         lacking = self._observer.lacking[joint]
         name, velocity = self._names[joint], state.velocity[joint]
         check_standstill(name, reversed(self._recent), joint, _STILL_RAD_S)
-        if abs(velocity) < _STILL_RAD_S:
-            since, constant = state.time_before_write - _WINDOW_S, self._constants[joint]
+        stands_for = standing_for(reversed(self._recent), joint)
+        if abs(velocity) < _STILL_RAD_S and stands_for > 0.0:
+            since, constant = state.time_before_write - min(stands_for, _WINDOW_S), self._constants[joint]
             # What was sent with one sample acts until the next.
             recent = [
                 constant * before.goal_current[joint]
                 for before, at in pairwise(self._recent)
-                if at.time_before_write >= since
+                if at.time_before_write > since
             ]
-            low, high = min(recent), max(recent)
-            said = (
-                f"{name} is not moving, with {low:+.3f} to {high:+.3f} N m commanded in the last {_WINDOW_S:g} s: any "
-                f"arm consistent with the prior and the data so far would be moving. {self._blocked_by[joint]}"
-            )
+            said = not_moving(name, recent, min(stands_for, _WINDOW_S)) + self._blocked_by[joint]
         else:
             self._explain(joint, lacking, self._recent)
             said = (
@@ -351,6 +349,28 @@ class ModelWatch:
         if abs(angle - limit) > _NEAR_LIMIT * (high - low):
             return ""
         return f" It is at {angle:.2f} rad, close to its limit of {limit:g} rad: it may have met a hard stop there."
+
+
+def standing_for(states: Iterable[State], joint: int) -> float:
+    """Return for how long a joint has hardly moved [s], judging by its angle.
+
+    states: the latest states, the most recent first.
+    """
+    last = first = next(iterator := iter(states))
+    for state in iterator:
+        if abs(state.position[joint] - last.position[joint]) > WITHIN_RAD:
+            break
+        first = state
+    return last.time_before_write - first.time_before_write
+
+
+def not_moving(name: str, torques: Sequence[float], seconds: float) -> str:
+    """Say that a joint stood still for `seconds` [s] under `torques` [N m], which should have moved it."""
+    low, high = min(torques), max(torques)
+    return (
+        f"{name} is not moving, with {low:+.3f} to {high:+.3f} N m commanded in the last {seconds:.2g} s: any arm "
+        "consistent with the prior and the data so far would be moving. "
+    )
 
 
 def known_arm(config: Config, largest: Array, arms: Ensemble | None) -> tuple[dict[str, float], Array]:

@@ -1,6 +1,7 @@
 """CSV files as written by other programs: any delimiter, decimal commas, byte order mark, comments, a line of units."""
 
 import csv
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from hil.recordings.units import unit_of
 from hil.runs.file_size import MOST_CSV_BYTES
 
 _REMARKS = ("#", "%", "//")
+
+_LARGEST = 1e30
+"""Largest absolute value that is read as a number. Time stamps in nanoseconds, the largest values, are about 1e18."""
 
 
 def read_csv_table(path: Path) -> Table:
@@ -117,7 +121,7 @@ def _is_number(field: str) -> bool:
         float(field.replace(",", "."))
     except ValueError:
         return not field
-    return True
+    return "_" not in field
 
 
 def _are_units(fields: list[str]) -> bool:
@@ -128,10 +132,11 @@ def _are_units(fields: list[str]) -> bool:
 
 
 def _numbers(fields: list[str], decimal_comma: bool) -> Values:
-    try:
-        return np.array(fields, dtype=np.float64)
-    except ValueError:
-        pass
+    # Python reads 1_000 as a number; whoever wrote it may have meant something else. Larger values are not measured.
+    with suppress(ValueError):
+        if "_" not in "".join(fields):
+            values = np.array(fields, dtype=np.float64)
+            return np.where(np.abs(values) > _LARGEST, np.inf, values)
     # Only columns that are used must be numeric: text, such as a comment, is not an error and is stored as infinity.
     return np.array([_number(field, decimal_comma) for field in fields])
 
@@ -142,10 +147,9 @@ def _number(field: str, decimal_comma: bool) -> float:
         return np.nan
     if decimal_comma and text.count(",") == 1:
         text = text.replace(".", "").replace(",", ".") if text.count(".") == 1 else text.replace(",", ".")
-    try:
-        return float(text)
-    except ValueError:
-        pass
+    with suppress(ValueError):
+        if "_" not in text:
+            return float(text) if abs(float(text)) <= _LARGEST else np.inf
     try:
         return datetime.fromisoformat(text).timestamp()
     except ValueError:

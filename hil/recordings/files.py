@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from hil.description.regular_file import not_a_file
 from hil.errors import CsvError
 from hil.recordings.csv_file import read_csv_table
 from hil.recordings.mcap_file import is_bag, read_bag, read_mcap
@@ -27,6 +28,8 @@ def read_tables(path: Path) -> list[Table]:
         raise CsvError(f"{path} cannot be read: No such file or directory.")
     if path.is_dir():
         return read_dataset(path) if is_dataset(path) else read_bag(path)
+    if said := not_a_file(path):
+        raise CsvError(f"{path} cannot be read: {said}.")
     kind = path.suffix.lower()
     if kind in TEXTS:
         return [read_csv_table(path)]

@@ -102,7 +102,7 @@ def changed_settings(before: Settings, after: Settings, cause: Cause | None = No
     if not any(_may_explain(each[1], cause, after[each]) for each in differing):
         return ""
     changed = [
-        f"{joint}: {register} is {_told(register, after[joint, register])} and was {_told(register, value)}"
+        f"{joint}: {register} from {_told(register, value)} to {_told(register, after[joint, register])}"
         for (joint, register), value in differing.items()
         if register in _BESIDE or _may_explain(register, cause, after[joint, register])
     ]

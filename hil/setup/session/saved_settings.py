@@ -1,6 +1,6 @@
 """The settings of an arm's servos: saved before the first write, restored, and verified once all are restored."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from hil.drivers.bus import ServoBus
@@ -12,6 +12,9 @@ from hil.errors import RunFolderError
 from hil.setup.session import settings_file
 from hil.setup.session.killed_run import Left, left_behind, what_is_left
 from hil.setup.session.settings_file import Kept
+
+_REST_S = 0.05
+"""Time between finding that settings differ and restoring them again [s]."""
 
 _MOST_CHECKS = 3
 """Maximum number of times that the settings of all servos are read again after being restored."""
@@ -36,6 +39,8 @@ class SavedSettings:
     """
     reduced: dict[Joint, dict[str, int]] = field(default_factory=dict)
     """Goals restored only as far as a lowered limit allows, with the restored values."""
+    undone: dict[tuple[Joint, str], tuple[int, int]] = field(default_factory=dict)
+    """Registers that held another program's value: that value, and the restored one."""
     _refused: set[Joint] = field(default_factory=set)
     """Servos whose Current Limit another program has left too low for this run; the file keeps its former value."""
 
@@ -88,12 +93,20 @@ class SavedSettings:
                 self.bus.confirm_later(joint)
                 servo, settings = self.bus.drives[joint], self.wanted[joint]
                 self._check_model(servo)
-                put_back(servo, settings)
+                written = put_back(servo, settings)
+                self._note_foreign(joint, written)
                 possible = attainable(servo, settings)
                 self.reduced[joint] = {name: value for name, value in possible.items() if value != settings[name]}
             except DriverError as error:
                 failed[joint] = error
         return failed
+
+    def _note_foreign(self, joint: Joint, written: Mapping[str, tuple[int, int]]) -> None:
+        """Remember the registers that held neither this session's value nor the restored one."""
+        ours = self.kept[joint].changed
+        for name, (found, restored) in written.items():
+            if name in ours and found != ours[name]:
+                self.undone[joint, name] = found, restored
 
     def verify(self, failed: dict[Joint, DriverError]) -> None:
         """Read the settings of all servos again once the last one has been restored, and restore those that differ.
@@ -109,6 +122,8 @@ class SavedSettings:
             }
             if not differing:
                 return
+            clock = self.bus.port.clock
+            clock.wait_until(clock.now() + _REST_S)  # another program that writes now and then, or late replies
             failed |= self.put_back(differing) if attempt < _MOST_CHECKS - 1 else differing
 
     def forget(self, restored: Iterable[Joint]) -> None:

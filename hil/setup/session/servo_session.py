@@ -152,6 +152,12 @@ class ServoSession:
         while self._cut_again(failed):
             saved.verify(failed)
             left = unrestored(saved, failed, self.settings, self._delays, is_ours=self._is_ours)
+        if told := [
+            f"{joint}: {name} was {found} and is {restored} again"
+            for (joint, name), (found, restored) in saved.undone.items()
+            if joint not in failed
+        ]:
+            self._say(f"What another program had changed has been restored ({'; '.join(told)}).")
         saved.forget(joint for joint in saved.kept if joint not in failed)
         return [*self._switched_on_by_another(), *left]
 

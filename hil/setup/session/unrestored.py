@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hil.drivers.errors import DriverError
 from hil.drivers.joint import Joint
+from hil.drivers.preparation.settings import AS_BEFORE
 from hil.drivers.torque.off import and_list, by_reason
 from hil.setup.changed_settings import Settings
 from hil.setup.session.killed_run import recover
@@ -36,11 +37,17 @@ def unrestored(
         *_lowered_limits(saved, before, failed),
         *_changed_meaning(saved, before, failed),
         *(
-            f"The settings of {and_list(map(str, joints))} could not be restored. {why} {_NEXT} "
+            f"{_outcome(and_list(map(str, joints)), why)} {why} {_NEXT} "
             f"{_where([saved.kept[joint].path for joint in joints])}."
             for why, joints in by_reason((joint, str(error)) for joint, error in failed.items()).items()
         ),
     ]
+
+
+def _outcome(servos: str, why: str) -> str:
+    if AS_BEFORE in why:
+        return f"Not all settings of {servos} are known to be restored."
+    return f"The settings of {servos} could not be restored."
 
 
 def _not_reached(saved: SavedSettings, *, is_ours: bool) -> Iterator[str]:

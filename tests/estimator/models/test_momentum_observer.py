@@ -114,3 +114,23 @@ def slow_heavy_joint_is_stopped(seed: int) -> bool:
 
 def test_a_healthy_joint_that_moves_slowly_and_weighs_much_is_never_stopped() -> None:
     assert not any(slow_heavy_joint_is_stopped(seed) for seed in range(12))
+
+
+@pytest.mark.parametrize(("friction", "is_blocked"), [(0.1, False), (0.02, True)])
+def test_a_link_that_floats_in_the_play_of_its_gear_does_not_show_in_which_direction_friction_acts(
+    friction: float, is_blocked: bool
+) -> None:
+    """The motor sticks under a rising torque while the link drifts against it by less than the play, at 0.07 rad/s."""
+    mean = {"inertia_1": INERTIA, "viscous_1": VISCOUS, "coulomb_1": friction}
+    covariance = np.diag([(0.1 * mean.get(name, 0.0)) ** 2 for name in NAMES])
+    observer = MomentumObserver(mean, covariance, np.array([PEAK]), INTERVAL)
+    for index in range(round(1.0 / INTERVAL)):  # it slides at a constant velocity
+        assert observer.observe((0.5 * index * INTERVAL,), (0.5,), (VISCOUS * 0.5 + friction,), INTERVAL) < 0
+    found = -1
+    for index in range(round(0.3 / INTERVAL)):  # it comes to rest, stays, and drifts back and forth within 4 mrad
+        stays, drifts = index * INTERVAL < 0.1, index * INTERVAL - 0.1
+        velocity = 0.0 if stays else 0.072 * (-1.0 if drifts % 0.1 < 0.05 else 1.0)
+        angle = 0.5 if stays else 0.5 - 0.072 * (0.05 - abs(drifts % 0.1 - 0.05))
+        torque = 0.0 if stays else min(0.13, 0.13 * drifts / 0.05)
+        found = max(found, observer.observe((angle,), (velocity,), (torque,), INTERVAL))
+    assert (found == 0) == is_blocked

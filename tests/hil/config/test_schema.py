@@ -6,6 +6,8 @@ import pytest
 
 from hil.config.schema import load_config, parse_config
 from hil.errors import ConfigError
+from hil.fakes.bus.hand import parse_move
+from hil.fakes.servo.encoder import Encoder
 from tests.support.paths import CONFIGS
 
 REALISTIC = (CONFIGS / "fake_two_link.toml").read_text(encoding="utf-8")
@@ -134,3 +136,15 @@ def test_a_misspelt_bundled_name_is_guessed() -> None:
         load_config(Path("fake_two_lnk"))
     with pytest.raises(ConfigError, match="Bundled configurations: fake_horizontal, "):
         load_config(Path("no_such_arm_at_all"))
+
+
+def test_an_angle_that_was_rounded_is_within_its_bounds() -> None:
+    """Pi and its multiples, written with four digits, are larger than they are."""
+    text = (CONFIGS / "fake_two_link.toml").read_text(encoding="utf-8")
+    flat = text.replace("[fake.arm]\n", "[fake.arm]\ntilt = 1.5708\n", 1).replace(
+        "[arm]\n", "[arm]\nrest_tolerance = 3.1416\n"
+    )
+    assert parse_config(flat, Path("arm.toml")).fake is not None
+    with pytest.raises(ConfigError, match=r"tilt = 1\.58: must be at most 1\.571"):
+        parse_config(flat.replace("1.5708", "1.58"), Path("arm.toml"))
+    assert Encoder(once_phase=6.2832).once_phase > 6.28 and parse_move("2:to=12.567").to == 12.567

@@ -148,7 +148,7 @@ def test_settings_that_another_program_changed_are_the_cause_that_is_named(
     happens = once(lambda: rewritten(ports, register, value))
     stop, _ = run_until_stopped(arm(), tmp_path / "run", happens, plan)
     assert str(stop).startswith("Another program changed the settings of a servo during the run (joint 'elbow'")
-    assert f"{register} is {value} and was 0" in str(stop) and "Symptom: " in str(stop)
+    assert f"{register} from 0 to {value}" in str(stop) and "Symptom: " in str(stop)
     assert stop.overruled
     assert_stopped(ports[0])
 
@@ -177,7 +177,7 @@ def test_a_limit_that_another_program_lowered_is_the_cause_that_is_named(
 
     stop, _ = run_until_stopped(arm(), tmp_path / "run", once(lower), plan)
     assert str(stop).startswith("Another program changed the settings of a servo during the run (joint 'elbow'")
-    assert f"{register} is {value} and was " in str(stop) and stop.overruled
+    assert re.search(rf"{register} from \d+ to {value}\b", str(stop)) and stop.overruled
     changed = f"PWM Limit was changed during this command from 885 to {value}"
     unrestored = [line for line in stop.__notes__ if changed in line]
     assert len(unrestored) == (register == "PWM Limit")
@@ -206,7 +206,7 @@ def test_a_lowered_limit_that_stops_nothing_is_named_at_the_end_of_the_run(
             run_experiment(config, run, config.path, lower, plan)
         said = str(stop.value)
     assert "'elbow'" in said and str(value) in said
-    assert f"{register} is {value} and was " in (run.path / "events.jsonl").read_text(encoding="utf-8")
+    assert re.search(rf"{register} from \d+ to {value}\b", (run.path / "events.jsonl").read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_mistakes_in_the_description_are_named_only_at_the_beginning(
 
 @pytest.mark.parametrize("stopped", [False, True])
 def test_a_protection_that_another_program_switched_off_is_named_and_restored(
-    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, stopped: bool
+    arm: Arm, tmp_path: Path, ports: list[Any], plan: Plan, stopped: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def cycle() -> None:
         ports[0].bus.servos[2].memory.set("Shutdown", 0)
@@ -250,13 +250,16 @@ def test_a_protection_that_another_program_switched_off_is_named_and_restored(
         assert stop.cause is Cause.VELOCITY and "Shutdown" not in str(stop)
     else:
         said = run_experiment(config, RunFolder.create(folder, config), config.path, once(cycle), plan)
-    assert "Another program changed" in said and "Shutdown is 0 and was 52" in said
-    assert "Temperature Limit is 100 and was 80" in said
+    assert "Another program changed" in said and "Shutdown from 52 to 0" in said
+    assert "Temperature Limit from 80 to 100" in said
     before = {"Status Return Level": 2, "Velocity Limit": 200, "Max Position Limit": 4095, "Secondary(Shadow) ID": 255}
-    assert all(f"{name} is {value} and was {before[name]}" in said for name, value in changed.items())
+    assert all(f"{name} from {before[name]} to {value}" in said for name, value in changed.items())
     assert {name: ports[0].bus.servos[1].value(name) for name in before} == before
     assert ports[0].bus.servos[2].value("Shutdown") == 52
     assert ports[0].bus.servos[1].value("Temperature Limit") == 80
+    restored = capsys.readouterr().err
+    assert "joint 'elbow' (ID 2, XM430-W350): Shutdown was 0 and is 52 again" in restored
+    assert "Temperature Limit was 100 and is 80 again" in restored and "Current Limit" not in restored
 
 
 def test_a_servo_that_was_told_to_answer_pings_only_is_named_and_confirmed_off(
@@ -264,7 +267,7 @@ def test_a_servo_that_was_told_to_answer_pings_only_is_named_and_confirmed_off(
 ) -> None:
     mute = once(lambda: ports[0].bus.servos[1].write(68, b"\0"))
     stop, _ = run_until_stopped(arm(), tmp_path / "run", mute, plan)
-    assert stop.cause is Cause.MISSING and "Status Return Level is 0 and was 2). Symptom:" in str(stop)
+    assert stop.cause is Cause.MISSING and "Status Return Level from 2 to 0). Symptom:" in str(stop)
     assert "Torque is off on both servos" in " ".join(stop.__notes__)
     assert ports[0].bus.servos[1].value("Status Return Level") == 2
 
@@ -307,7 +310,7 @@ def test_a_return_delay_that_another_program_raised_is_named_before_late_replies
 
     config = arm(("rate = 400.0", "rate = 800.0"))
     stop, _ = run_until_stopped(config, tmp_path / "run", once(slow_down), make_plan(config).first_segment())
-    assert re.match(r"Another program changed .*'elbow'.*Return Delay Time is 508 us and was 0 us\)\. Sym", str(stop))
+    assert re.match(r"Another program changed .*'elbow'.*Return Delay Time from 0 us to 508 us\)\. Sym", str(stop))
     assert "Operating Mode" not in str(stop) and stop.cause in (Cause.LATE, Cause.MISSING)
     assert_stopped(ports[0])
 
@@ -320,7 +323,7 @@ def test_settings_changed_before_torque_comes_on_are_refused(
 
     monkeypatch.setattr(run, "_write_facts", shift)
     config = arm()
-    with pytest.raises(WrongSetting, match=r"'elbow'.*Homing Offset is 30 and was 0\)\. Torque has not been switched"):
+    with pytest.raises(WrongSetting, match=r"'elbow'.*Homing Offset from 0 to 30\)\. Torque has not been switched"):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
     assert_stopped(ports[0])
 
@@ -330,7 +333,7 @@ def test_an_offset_changed_before_the_pose_is_checked_is_named_not_its_effect(
 ) -> None:
     monkeypatch.setattr(run, "_check_rate", lambda *_: ports[0].bus.servos[2].memory.set("Homing Offset", 60))
     config = arm()
-    with pytest.raises(WrongSetting, match=r"'elbow'.*Homing Offset is 60 and was 0\)\. Torque has not been switched"):
+    with pytest.raises(WrongSetting, match=r"'elbow'.*Homing Offset from 0 to 60\)\. Torque has not been switched"):
         run_experiment(config, RunFolder.create(tmp_path / "run", config), config.path, lambda _: None, plan)
     assert_stopped(ports[0])
 

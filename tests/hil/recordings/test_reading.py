@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,10 @@ import pytest
 
 from hil.arm_model import ArmModel, JointFacts
 from hil.config.csv_columns import Columns
-from hil.errors import CsvError
+from hil.config.schema import load_config
+from hil.description.arm import ArmFileError
+from hil.description.files import read_arm
+from hil.errors import ConfigError, CsvError
 from hil.estimation.unsettled.slips import refuse_slips
 from hil.estimator.data.recording import Recording
 from hil.recordings.convert import Converted, convert
@@ -153,6 +157,31 @@ def test_rows_that_can_be_put_right_are_and_it_is_said(
 def test_rows_that_cannot_are_named(change: Callable[[list[str]], list[str]], said: str) -> None:
     with pytest.raises(CsvError, match=said):
         spoilt(change)
+
+
+@pytest.mark.parametrize("number", ["1_000", "1e300", "-1e300"])
+def test_what_python_alone_takes_for_a_number_and_what_nobody_measures_are_named(number: str) -> None:
+    path = write("odd.csv")
+    lines = path.read_text().splitlines()
+    lines[9] = ",".join([*lines[9].split(",")[:-1], number])
+    path.write_text("\n".join(lines))
+    with pytest.raises(CsvError, match=rf"line 10: column '.*' is '{number}'; it must be a finite number"):
+        read(path)
+
+
+@pytest.mark.parametrize("what", ["fifo", "device"])
+def test_a_pipe_or_device_is_refused_before_it_is_opened(tmp_path: Path, what: str) -> None:
+    path = tmp_path / "rec.csv"
+    if what == "fifo":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    with pytest.raises(CsvError, match="pipe or a device"):
+        read_tables(path)
+    with pytest.raises(ConfigError, match="pipe or a device"):
+        load_config(path)
+    with pytest.raises(ArmFileError, match="pipe or a device"):
+        read_arm(path)
 
 
 def test_parquet_and_a_lerobot_dataset() -> None:

@@ -4,7 +4,7 @@ import json
 import re
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -253,6 +253,50 @@ def test_a_servo_that_rebooted_is_named_with_those_that_were_fine(
         assert "'elbow' (ID 2, XM430-W350) answered afterwards and joint 'shoulder' (ID 1, XM430-W350) did not" in cause
         assert "adapter" not in cause, "the fault is not in what all servos share"
     assert bench.changed() == []
+
+
+def test_a_watchdog_that_another_program_switched_off_is_no_reboot(arm: Arm, tmp_path: Path, bench: Bench) -> None:
+    def switch_off(port: Any) -> None:
+        port.bus.faults.add(Fault(kind="silent_servo", servo=2, at=2.0, duration=0.3))
+        servo, trip = port.bus.servos[2], port.bus.servos[2].trip_watchdog
+        servo.trip_watchdog = lambda: (trip(), servo.memory.set("Bus Watchdog", 0))
+
+    bench.prepare = switch_off
+    with pytest.raises(SafetyStop) as stop:
+        play(arm(SHORT), tmp_path / "run")
+    said = "\n".join(stop.value.__notes__)
+    assert "another program has switched off its Bus Watchdog" in said and "was rebooted" not in said
+
+
+def test_a_servo_that_refuses_one_request_in_twenty_is_restored_and_nothing_else_is_said(
+    arm: Arm, tmp_path: Path, bench: Bench
+) -> None:
+    """Without a second attempt, half of all runs ended with settings that were said to be unrestored."""
+    config = arm(SHORT)
+    with servo_session(config):
+        bench.port.bus.faults.add(Fault(kind="status_error", servo=1, at=0.0, amount=4, probability=0.05))
+    assert bench.changed() == []
+
+
+@pytest.mark.parametrize(("times", "is_left"), [(1, False), (10**6, True)])
+def test_a_watchdog_that_another_program_sets_after_it_was_restored_is_restored_again_or_named(
+    arm: Arm, bench: Bench, times: int, is_left: bool
+) -> None:
+    def meddle(data: bytes) -> Any:
+        written = write(data)
+        if restored[0] and left[0] > 0:
+            left[0] -= 1
+            bench.servos[2].memory.set("Bus Watchdog", 127)
+        restored[0] = restored[0] or data[7:10] == b"\x03\x62\x00"
+        return written
+
+    restored, left = [False], [times]
+    config = arm(SHORT)
+    said = pytest.raises(HilError, match=r"'elbow'.*Bus Watchdog .*reads back as 127") if is_left else nullcontext()
+    with said, servo_session(config):
+        bench.servos[2].memory.set("Bus Watchdog", 50)
+        write, bench.port.write = bench.port.write, meddle
+    assert bench.changed() == (["Bus Watchdog of 2: 0 -> 127"] if is_left else [])
 
 
 def drive_again(bench: Bench, after: int, times: int) -> list[int]:
