@@ -348,6 +348,17 @@ class ServoBus(TorqueSwitch):
         return None
 
     @property
+    def torque_lost(self) -> int | None:
+        """Index of a joint whose Torque Enable was last read back as 0; None if there is none."""
+        place = self.prepared.torque_off
+        return None if place is None else self._of[place]
+
+    def read_torque(self) -> int | None:
+        """Read Torque Enable of all servos now, as it is before torque is cut; return as `torque_lost`."""
+        self.prepared.read_torque()
+        return self.torque_lost
+
+    @property
     def goals_lost(self) -> tuple[int, str] | None:
         """Index of a joint that has missed many of the latest goals, and text with the value read back; else None."""
         if (lost := self.prepared.lost) is None:
