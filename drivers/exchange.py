@@ -180,6 +180,11 @@ class Exchange:
         return self._port.wire_time(len(self._plans[0].read.request))
 
     @property
+    def usual_wire_s(self) -> float:
+        """Wire time of most exchanges [s]."""
+        return self._usual.wire_s
+
+    @property
     def longest(self) -> float:
         """Wire time of the longest exchange [s], without adapter and computer: a lower bound on the cycle time."""
         return self._port.wire_time(max(self._bytes(plan.read) for plan in self._plans[: self._kinds]))
@@ -268,19 +273,22 @@ class Exchange:
             back.look(self._ask_back(back.read, now, self._usual.reply_time.timeout), self._sent, now)
         return self.torque_off
 
-    def read_back_every(self, off_wire: float) -> float:
-        """Expected time between two read-backs of a goal [s]; 0 if most cycles leave time for one.
+    def read_back_every(self, off_wire: float) -> tuple[float, float]:
+        """Expected time between two read-backs of a goal [s], 0 if most cycles leave time for one; and the shortest
+        cycle that does [s].
 
         off_wire: what an exchange takes in addition to its time on the wire [s].
         """
         back = self._read_back
         if back is None or not self._interval:
-            return 0.0
-        left = self._interval - self._usual.wire_s - 2.0 * off_wire
-        delay = self._wire_s[back.reads[GOALS]] - left
-        if self._wire_s[back.shortest] <= left or delay <= 0.0:
-            return 0.0
-        return 2.0 * pause_after(delay) if delay <= self._overtime else math.inf
+            return 0.0, 0.0
+        fixed = self._usual.wire_s + 2.0 * off_wire
+        goals = self._wire_s[back.reads[GOALS]]
+        shortest = fixed + min(goals, self._wire_s[back.shortest])
+        if shortest <= self._interval:
+            return 0.0, shortest
+        delay = fixed + goals - self._interval
+        return 2.0 * pause_after(delay) if delay <= self._overtime else math.inf, shortest
 
     @property
     def lost(self) -> Overruled | None:

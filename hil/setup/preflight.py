@@ -465,6 +465,8 @@ def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:
     level = Level.STOP if report.fix else Level.WARNING if report.delayed else Level.OK
     found = f"{config.experiment.rate:g} Hz wanted, {report.found}"
     yield Finding(level, "bus", "rate", found, report.fix or report.delayed)
+    if report.seldom:
+        yield Finding(Level.WARNING, "bus", "monitoring", "goals and torque are read back seldom", report.seldom)
 
 
 def _port(config: Config) -> str:
