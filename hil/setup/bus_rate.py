@@ -73,15 +73,13 @@ class RateReport:
     """Measurements of all exchange modes.
 
     found: what the configured mode can sustain, as text. fix: what to change; empty if the rate is sustainable.
-    delayed: why some exchanges took longer than a sample period, and what to do about it; empty if none did. seldom:
-    as `seldom_read_back` returns it.
+    delayed: why some exchanges took longer than a sample period, and what to do about it; empty if none did.
     """
 
     modes: tuple[ExchangeMode, ...]
     found: str
     fix: str
     delayed: str = ""
-    seldom: str = ""
 
 
 def check_rate(bus: ServoBus, wanted: float) -> RateReport:
@@ -93,12 +91,15 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
         modes = [_faster(*pair) for pair in zip(modes, measure_modes(bus), strict=True)]
     used = _configured(bus, modes)
     found, fix = f"{used.rate:.0f} Hz possible with {used.name}", _fix(used, modes, wanted)
-    if fix:
-        return RateReport(tuple(modes), found, fix)
+    return RateReport(tuple(modes), found, fix, "" if fix else _delayed(used, wanted))
+
+
+def seldom_as_measured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> str:
+    """As `seldom_read_back`, for the configured exchange mode as it was measured. Raises DriverError."""
+    used = _configured(bus, modes)
     exchange = bus.make_exchange(fast=used.fast, one_write=used.one_write)
     bus.add_read_back(exchange)
-    seldom = seldom_read_back(bus, exchange, max(0.0, used.median_s - exchange.usual_wire_s))
-    return RateReport(tuple(modes), found, fix, _delayed(used, wanted), seldom)
+    return seldom_read_back(bus, exchange, max(0.0, used.median_s - exchange.usual_wire_s))
 
 
 def seldom_read_back(bus: ServoBus, exchange: Exchange, off_wire: float) -> str:
@@ -114,8 +115,8 @@ def seldom_read_back(bus: ServoBus, exchange: Exchange, off_wire: float) -> str:
     return (
         f"At {1 / bus.config.interval:g} Hz and {bus.port.baud} baud, cycles leave no time to read back what the "
         f"servos hold: their goals are read back {often}, so another program that writes goals, or a servo that has "
-        f"lost its torque, may be noticed late or never. There is time at {floor(1 / shortest)} Hz, or at a higher baud "
-        "rate."
+        f"lost its torque, may be noticed late or never. There is time at {floor(1 / shortest)} Hz or less, or at a "
+        "higher baud rate."
     )
 
 
