@@ -334,6 +334,9 @@ class Exchange:
         end = due + self._overtime if now + takes > due and now >= back.overdue_at else due
         if now + takes > end or self._late_possible:
             back.postponed(now)
+            if back.kind != GOALS and not self._late_possible and now + self._takes(back.shortest, back) <= due:
+                back.kind = GOALS  # which take less time; what is due remains due
+                return self._held(back, due)
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
             left_less_time = self._latest_plan is not self._usual
             self.read_back_at = now if self._late_possible or left_less_time else now + TRY_AGAIN_S

@@ -16,8 +16,8 @@ __all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack", "pause_after"]
 GOALS, MODES, TORQUE = range(3)
 """What is read back, as indices of `ReadBack.reads`."""
 
-_OTHERS_S = 0.025
-"""Mean time between two read-backs of the modes, or of Torque Enable [s]; in between, the goals are read back.
+_OTHERS_S = {MODES: 0.025, TORQUE: 0.1}
+"""Mean time between two read-backs of the modes, and of Torque Enable [s]; in between, the goals are read back.
 
 The actual time is random. Otherwise, a program that overwrites goals periodically might always do so just when the
 modes are read.
@@ -53,9 +53,9 @@ share `_AGAIN_SHARE` of one. In longer ones, read-backs are rarely destroyed, an
 """
 
 OVERDUE_S, OVERTIME_SHARE = 0.075, 0.8
-"""If nothing was read back for `OVERDUE_S` [s] because cycles leave no time for it, a read-back may delay the next cycle
-by up to this fraction of a cycle: otherwise a disarmed watchdog or lost torque would never be seen. Every fourth one is
-of Torque Enable.
+"""If nothing was read back for `OVERDUE_S` [s] because cycles leave no time for it, a read-back may delay the next
+cycle by up to this fraction of a cycle: otherwise a disarmed watchdog or lost torque would never be seen. Every fourth
+one is of Torque Enable.
 """
 
 _DELAYED_SHARE, _DELAYED_SHARE_IN_DOUBT = 0.01, 0.1
@@ -141,7 +141,8 @@ class ReadBack:
         self._due = {MODES: -math.inf} | ({TORQUE: -math.inf} if watches_torque else {})
         """When the registers other than goals are due [s]."""
         self._goals_since = 0
-        self._draw = Random(1)
+        self._was_of_goals = False
+        self._draws = {kind: Random(kind) for kind in (GOALS, MODES, TORQUE)}
         self._goals_sighted: list[_Sightings] = [deque() for _ in ids]
         self._modes_sighted: list[_Sightings] = [deque() for _ in ids]
         self._never_written = [ForeignValues() for _ in ids]
@@ -195,8 +196,10 @@ class ReadBack:
 
         alone: whether only one servo was read, which counts as its share of a read-back of all.
         """
+        if delay == 0.0 and self._was_of_goals and now >= min(self._due.values()):
+            return  # what is due did not fit
         share = _DELAYED_SHARE_IN_DOUBT if now < self.doubts_until else _DELAYED_SHARE
-        pause = pause_after(delay, share) * (1.0 - 0.5 * self._draw.random() * (delay > 0.0))
+        pause = pause_after(delay, share) * (1.0 - 0.5 * self._draws[GOALS].random() * (delay > 0.0))
         due = self.overdue_at + pause / len(self._goals) if alone else math.inf
         self.overdue_at = min(due, now + pause)
 
@@ -228,11 +231,15 @@ class ReadBack:
         is_nearly_sure = False
         intact = [_intact(answer) for answer in servos]
         self.place = (self.place + 1) % len(servos) if alone else 0
+        self._was_of_goals = self.kind == GOALS
         # Answers about goals begin with ERR and Bus Watchdog, those about torque with ERR and Torque Enable.
         told = [(at, each[1]) for at, each in enumerate(intact) if each is not None]
         self.watchdogs = told if self.kind == GOALS else []
         if self.kind == TORQUE:
-            self.torque_off = next((at for at, is_on in told if not is_on), None)
+            # An alert, which explains it, is found in the next cycle.
+            self.torque_off = next(
+                (at for at, is_on in told if not is_on and not (servos[at] or (0,))[0] & ALERT), None
+            )
         foreign = self._foreign(intact, sent, collided=collided)
         if of_modes and not foreign and None not in intact:
             self.modes_seen_at = now
@@ -262,7 +269,10 @@ class ReadBack:
         if self.kind == GOALS:
             self._goals_since += 1
         else:
-            self._due[self.kind], self._goals_since = now + _OTHERS_S * (0.5 + self._draw.random()), 0
+            self._due[self.kind], self._goals_since = (
+                now + _OTHERS_S[self.kind] * (0.5 + self._draws[self.kind].random()),
+                0,
+            )
         other = min(self._due, key=self._due.__getitem__)
         enough = _GOALS_PER_OTHER_IN_DOUBT if now < self.doubts_until else 1
         self.kind = other if now >= self._due[other] and self._goals_since >= enough else GOALS

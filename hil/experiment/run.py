@@ -100,7 +100,7 @@ def run_experiment(
         _check_pose(config, bus)
         if config.is_chain and not is_given:
             config, plan = _from_where_it_lies(config, plan, bus, run, note)
-        if seldom := seldom_read_back(bus, bus.prepared, bus.port.latency):
+        if seldom := seldom_read_back(bus, bus.prepared, bus.port.off_wire):
             note(seldom)
         _write_facts(config, run, plan, bus, shown_path, seldom)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
