@@ -218,10 +218,14 @@ class ServoBus(TorqueSwitch):
         nothing = [0] * len(self._drives)
         if fast and all(None in exchange.cycle(nothing).servos for _ in range(_PROBES)):
             exchange = self.make_exchange(fast=False, one_write=one_write)
+        self.add_read_back(exchange)
+        self._exchange = exchange
+
+    def add_read_back(self, exchange: Exchange) -> None:
+        """Make an exchange with these servos read back their goals, Torque Enable and settings, as these are now."""
         modes = [drive.mode for drive in self._drives]
         settings = [[servo.read(name) for name in SETTINGS] for servo in self._servos.values()]
         exchange.add_read_back(*read_back_spans(modes, [servo.table for servo in self._servos.values()]), settings)
-        self._exchange = exchange
 
     def knows_fast_sync_read(self) -> bool:
         """Return whether every servo's firmware supports Fast Sync Read."""
@@ -346,6 +350,17 @@ class ServoBus(TorqueSwitch):
             if ticks not in expected and self._drives[place] in self._armed:
                 return self._of[place], ticks
         return None
+
+    @property
+    def torque_lost(self) -> int | None:
+        """Index of a joint whose Torque Enable was last read back as 0; None if there is none."""
+        place = self.prepared.torque_off
+        return None if place is None else self._of[place]
+
+    def read_torque(self) -> int | None:
+        """Read Torque Enable of all servos now, as it is before torque is cut; return as `torque_lost`."""
+        self.prepared.read_torque()
+        return self.torque_lost
 
     @property
     def goals_lost(self) -> tuple[int, str] | None:

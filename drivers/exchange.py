@@ -24,7 +24,16 @@ from fastcrc import crc16
 
 from hil.drivers.control_table import Register
 from hil.drivers.others.heard import Heard
-from hil.drivers.others.read_back import OVERTIME_SHARE, REMEMBERED, TRY_AGAIN_S, Overruled, ReadBack
+from hil.drivers.others.read_back import (
+    GOALS,
+    OVERTIME_SHARE,
+    REMEMBERED,
+    TORQUE,
+    TRY_AGAIN_S,
+    Overruled,
+    ReadBack,
+    pause_after,
+)
 from hil.drivers.packet import BROADCAST_ID, HEADER, Instruction
 from hil.drivers.port import Port, ReplyTime
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
@@ -43,6 +52,9 @@ AFTER_LOSS = 5
 """Number of reads of different lengths that are used in turn after a lost reply. A reply that arrives fewer than this
 many cycles late is recognised by its length.
 """
+
+_LATE_SHARE = 0.25
+"""Fraction of the time by which a read-back may delay a cycle for which every read-back may be late."""
 
 _LONGEST_REPLY = 1024
 _DOUBTS = 3
@@ -150,8 +162,10 @@ class Exchange:
         self._usual = self._latest_plan = self._plans[0]
         self._read_back: ReadBack | None = None
         self._interval = interval
-        self._overtime = OVERTIME_SHARE * interval if status is None else 0.0
-        """How long an overdue read-back may delay the next cycle [s]: 0 if a status read shows the same."""
+        shown = () if status is None else one_each(status, len(self.ids))[0].registers
+        self._shows_torque = "Torque Enable" in shown
+        self._overtime = 0.0 if self._shows_torque else OVERTIME_SHARE * interval
+        """By how much a read-back may delay the next cycle [s]: not at all if a status shows the same."""
         self.awaited_until = -math.inf
         """Reply deadline of the latest repeated read-back, which may delay the next cycle [s on the port's clock]."""
         self.read_back_at = math.inf
@@ -164,6 +178,11 @@ class Exchange:
         With two writes, the adapter may add a pause, which is not included.
         """
         return self._port.wire_time(len(self._plans[0].read.request))
+
+    @property
+    def usual_wire_s(self) -> float:
+        """Wire time of most exchanges [s]."""
+        return self._usual.wire_s
 
     @property
     def longest(self) -> float:
@@ -200,15 +219,25 @@ class Exchange:
         self._usual_left = self._turns.plan()
 
     def add_read_back(
-        self, goal: Span | Sequence[Span], mode: Span | Sequence[Span], modes: Sequence[Sequence[int]]
+        self,
+        goal: Span | Sequence[Span],
+        mode: Span | Sequence[Span],
+        torque: Span | Sequence[Span],
+        modes: Sequence[Sequence[int]],
     ) -> None:
         """Prepare the read-backs made by `overruled` (see `ReadBack`).
 
-        goal: spans of Bus Watchdog and goal. mode: spans that end with the settings, whose values are `modes`.
+        goal: spans of Bus Watchdog and goal. mode: spans that end with the settings, whose values are `modes`. torque:
+        spans that begin with Torque Enable.
         """
-        back = self._read_back = ReadBack(self.ids, goal, mode, modes, interval=self._interval, fast=self.fast)
-        self._wire_s |= {read: self._port.wire_time(self._bytes(read)) for read in back.reads}
-        self.heard.expect(back.reads)
+        back = self._read_back = ReadBack(
+            *(self.ids, goal, mode, modes, torque),
+            watches_torque=not self._shows_torque,
+            interval=self._interval,
+            fast=self.fast,
+        )
+        self._wire_s |= {read: self._port.wire_time(len(read.request) + read.reply_size) for read in back.every}
+        self.heard.expect(back.every)
         self.read_back_at = -math.inf
 
     @property
@@ -232,12 +261,42 @@ class Exchange:
         return () if self._read_back is None else self._read_back.watchdogs
 
     @property
+    def torque_off(self) -> int | None:
+        """Index of a servo whose Torque Enable was last read back as 0; None if there is none."""
+        return None if self._read_back is None else self._read_back.torque_off
+
+    def read_torque(self) -> int | None:
+        """Read Torque Enable of all servos now, outside a cycle; return as `torque_off`. Raises PortLost."""
+        back = self._read_back
+        if back is not None and not self._late_possible:
+            back.kind, now = TORQUE, self._now()
+            back.look(self._ask_back(back.read, now, self._usual.reply_time.timeout), self._sent, now)
+        return self.torque_off
+
+    def read_back_every(self, off_wire: float) -> tuple[float, float]:
+        """Expected time between two read-backs of a goal [s], 0 if most cycles leave time for one; and the shortest
+        cycle that does [s].
+
+        off_wire: what an exchange takes in addition to its time on the wire [s].
+        """
+        back = self._read_back
+        if back is None or not self._interval:
+            return 0.0, 0.0
+        fixed = self._usual.wire_s + 2.0 * off_wire
+        goals = self._wire_s[back.reads[GOALS]]
+        shortest = fixed + min(goals, self._wire_s[back.shortest])
+        if shortest <= self._interval:
+            return 0.0, shortest
+        delay = fixed + goals - self._interval
+        return 2.0 * pause_after(delay) if delay <= self._overtime else math.inf, shortest
+
+    @property
     def lost(self) -> Overruled | None:
         """A servo that has missed many of the latest goals, according to read-backs; else None."""
         return self._read_back.lost if self._read_back is not None else None
 
     def overruled(self, due: float) -> Overruled | None:
-        """Read back goals or settings if there is time before the next cycle, due at `due` [s].
+        """Read back goals, settings or Torque Enable if there is time before the next cycle, due at `due` [s].
 
         The next cycle overwrites another master's goals before its own replies are sampled, so only what the servos
         hold right before a cycle shows who commands them. Missing replies are ignored here; the next cycle detects
@@ -248,13 +307,12 @@ class Exchange:
         back = self._read_back
         if back is None or not self._sent:
             return None
-        if back.is_of_modes:
-            goals, modes = back.reads
+        if back.kind != GOALS:
             # Only goals are overwritten by the next cycle. If there is time for them as well, they are read last.
-            before_goals = due - self._takes(goals, back) - HOST_S
-            if self._now() + self._takes(modes, back) <= before_goals:
+            before_goals = due - self._takes(back.reads[GOALS], back) - HOST_S
+            if self._now() + self._takes(back.read, back) <= before_goals:
                 found = self._held(back, before_goals)
-                if found is not None or back.is_of_modes:
+                if found is not None or back.kind != GOALS:
                     return found
         return self._held(back, due)
 
@@ -264,26 +322,34 @@ class Exchange:
         return self._wire_s[read] + max(off_wire, back.longest)
 
     def _held(self, back: ReadBack, due: float) -> Overruled | None:
-        """Read back once if that can end by `due` [s], or slightly later if a read-back is overdue."""
+        """Read back once if this is possible before `due` [s], or slightly later if it is overdue.
+
+        If there is no time for all servos, one is read.
+        """
         port, now, read = self._port, self._now(), back.read
         takes = self._takes(read, back)
-        latest = due
-        if now + takes > due and now >= back.overdue_at:
-            latest += self._overtime
-        if now + takes > latest or self._late_possible:
+        alone = now + takes > due >= now + self._takes(back.alone, back)
+        if alone:
+            read, takes = back.alone, self._takes(back.alone, back)
+        end = due + self._overtime if now + takes > due and now >= back.overdue_at else due
+        if now + takes > end or self._late_possible:
             back.postponed(now)
+            if back.kind != GOALS and not self._late_possible and now + self._takes(back.shortest, back) <= due:
+                back.kind = GOALS  # which take less time; what is due remains due
+                return self._held(back, due)
             back.took(0.0)  # one long read-back, while this computer was busy, must not prevent all later ones
             left_less_time = self._latest_plan is not self._usual
             self.read_back_at = now if self._late_possible or left_less_time else now + TRY_AGAIN_S
             return None
         port.clock.wait_until(due - takes - HOST_S)
         before = self._now()
-        if before + takes > latest:  # woken up late
+        if before + takes > end:  # woken up late
             self.read_back_at = before + TRY_AGAIN_S
             return None
-        servos = self._ask_back(read, before, latest - before)
+        # Where there is hardly enough time, a reply that comes a little late is not lost.
+        servos = self._ask_back(read, before, max(end - before, takes + _LATE_SHARE * self._overtime))
         now = self._now()
-        if latest > due:
+        if now > due:
             self.awaited_until = now
         # Where nothing at all arrived, the reply may be late, and another one would be mistaken for it.
         if None in servos and self.heard.latest and back.may_repeat(now, takes):
@@ -297,7 +363,10 @@ class Exchange:
                 self.read_back_at = now + TRY_AGAIN_S  # a late reply costs the next cycle time
         else:
             back.took(min(now - before, 2.0 * takes) - self._wire_s[read])
-        found = back.look(servos, self._sent, now, collided=self._latest_plan.is_after_loss)
+        if alone:
+            servos = [servos[0] if at == back.place else None for at in range(len(self.ids))]
+        found = back.look(servos, self._sent, now, collided=self._latest_plan.is_after_loss, alone=alone)
+        back.delayed(now, max(0.0, now - due), alone=alone)
         if back.is_unexpected:
             self.read_status_next()  # it distinguishes lost goals from another master's
         return found

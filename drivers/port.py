@@ -132,6 +132,8 @@ class Port:
         self.url = url
         self.baud = baud
         self.latency = adapter_latency(url)
+        self.off_wire = 0.0
+        """What the fastest of a few requests took in addition to its time on the wire [s]; 0 if not measured."""
         self.latency_measured = False
         """Whether `latency` was measured, because replies arrive later than expected from this kind of adapter."""
         self.echoes = False

@@ -134,16 +134,17 @@ rebooting the servo.
 """
 
 
-def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans]:
-    """Return the span of registers that ends with the goal, and the one that ends with SETTINGS.
+def read_back_spans(mode: Mode | Sequence[Mode], tables: Sequence[ControlTable]) -> tuple[Spans, Spans, Spans]:
+    """Return the span of registers that ends with the goal, the one that ends with SETTINGS, and the one that begins
+    with Torque Enable.
 
-    They begin at an earlier address than necessary, so that the answers differ in length from those to other programs'
+    They cover more addresses than necessary, so that the answers differ in length from those to other programs'
     usual requests.
     """
     modes = (mode,) * len(tables) if isinstance(mode, Mode) else tuple(mode)
     goals = [_status_names(own)[:2] for own in modes]
     goal = Span.of(tables, goals[0]) if len(set(modes)) == 1 else Span.each(tables, goals)
-    return goal, Span.of(tables, ("ID", "Baud Rate", "Return Delay Time", *SETTINGS))
+    return goal, Span.of(tables, ("ID", "Baud Rate", "Return Delay Time", *SETTINGS)), Span.of(tables, _DRIVEN)
 
 
 class Converter:

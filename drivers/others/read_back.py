@@ -1,9 +1,9 @@
-"""Read-backs of goals, operating modes and settings: what a servo holds right before a cycle shows who commands it."""
+"""Read-backs of goals, settings and Torque Enable: what a servo holds right before a cycle shows who commands it."""
 
 import math
 from collections import deque
 from collections.abc import Sequence
-from itertools import islice
+from itertools import chain, islice
 from random import Random
 from typing import NamedTuple
 
@@ -11,17 +11,20 @@ from hil.drivers.others.foreign_values import ForeignValues
 from hil.drivers.packet import ALERT
 from hil.drivers.sync_read import Answer, FastSyncRead, GroupRead, Span, SyncRead, one_each
 
-__all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack"]
+__all__ = ["REMEMBERED", "TRY_AGAIN_S", "Overruled", "ReadBack", "pause_after"]
 
-_MODES_S = 0.025
-"""Mean time between two read-backs of the modes [s]; in between, the goals are read back.
+GOALS, MODES, TORQUE = range(3)
+"""What is read back, as indices of `ReadBack.reads`."""
+
+_OTHERS_S = {MODES: 0.025, TORQUE: 0.1}
+"""Mean time between two read-backs of the modes, and of Torque Enable [s]; in between, the goals are read back.
 
 The actual time is random. Otherwise, a program that overwrites goals periodically might always do so just when the
 modes are read.
 """
 
-_GOALS_PER_MODE_IN_DOUBT = 4
-"""Minimum number of goal read-backs between two mode read-backs while a foreign value is suspected."""
+_GOALS_PER_OTHER_IN_DOUBT = 4
+"""Minimum number of goal read-backs between two others while a foreign value is suspected."""
 
 _RECENT = 4
 """Number of recent goals that a servo may still hold if writes are lost; the status detects longer losses."""
@@ -49,9 +52,15 @@ _SHORT_CYCLE_S = 0.005
 share `_AGAIN_SHARE` of one. In longer ones, read-backs are rarely destroyed, and a delay leaves joints unobserved.
 """
 
-OVERDUE_S, OVERTIME_SHARE = 0.15, 0.8
-"""If nothing was read back for `OVERDUE_S` [s] because cycles leave no time for that or a status read, a read-back
-may delay the next cycle by up to this fraction of a cycle: otherwise, a disarmed watchdog would never be seen.
+OVERDUE_S, OVERTIME_SHARE = 0.075, 0.8
+"""If nothing was read back for `OVERDUE_S` [s] because cycles leave no time for it, a read-back may delay the next
+cycle by up to this fraction of a cycle: otherwise a disarmed watchdog or lost torque would never be seen. Every fourth
+one is of Torque Enable.
+"""
+
+_DELAYED_SHARE, _DELAYED_SHARE_IN_DOUBT = 0.01, 0.1
+"""Fraction of the time by which overdue read-backs may delay cycles; the second while a foreign value is suspected.
+Where they delay a cycle only a little, they are thus made more often than every `OVERDUE_S`.
 """
 
 LOST_GOALS, LOST_OF = 3, 6
@@ -79,12 +88,20 @@ class Overruled(NamedTuple):
     written: int
 
 
+def pause_after(delay: float, share: float = _DELAYED_SHARE) -> float:
+    """Longest time until the next overdue read-back after one that delayed a cycle by `delay` [s]."""
+    return min(OVERDUE_S, delay / share) if delay > 0.0 else OVERDUE_S
+
+
 class ReadBack:
-    """Reads back the goals that the servos hold right before a cycle, and occasionally their settings instead.
+    """Reads back the goals that the servos hold right before a cycle, and occasionally other registers instead.
 
     goal: a span of Bus Watchdog and goal. mode: a span that ends with the settings; `modes` are their values, the
     same number for each servo. A change to one of these settings reverses the motor, shifts every angle, or changes the
-    meaning of goals. interval: time between two cycles [s], 0 if unknown.
+    meaning of goals. torque: a span that begins with Torque Enable. watches_torque: whether it is read back regularly,
+    since no status shows it. interval: time between two cycles [s], 0 if unknown.
+
+    If a cycle leaves no time to read all servos, one of them is read (`alone`), in turn.
 
     Every cycle overwrites the goals of another master. A master that writes less often than this program is therefore
     detected only if the goals are read before every cycle.
@@ -96,12 +113,16 @@ class ReadBack:
         goal: Span | Sequence[Span],
         mode: Span | Sequence[Span],
         modes: Sequence[Sequence[int]],
+        torque: Span | Sequence[Span],
         *,
+        watches_torque: bool = False,
         interval: float = 0.0,
         fast: bool,
     ) -> None:
         kind = FastSyncRead if fast else SyncRead
-        self.reads: tuple[GroupRead, GroupRead] = kind(ids, goal), kind(ids, mode)
+        spans = goal, mode, torque
+        self.reads: tuple[GroupRead, ...] = tuple(kind(ids, span) for span in spans)
+        self._alone = [list(map(_of_one, ids, one_each(span, len(ids)))) for span in spans]
         self.longest = 0.0
         """Duration of the longest recent read-back, without its wire time [s]; it decays from one read-back to the
         next.
@@ -111,13 +132,17 @@ class ReadBack:
         self._goals = [own.registers[-1] for own in one_each(goal, len(ids))]
         self._modes = tuple(map(tuple, modes))
         self._settings = one_each(mode, len(ids))[0].registers[-len(self._modes[0]) :]
-        self.is_of_modes = True
-        """Whether the next read-back is of the operating modes and other settings, instead of the goals."""
+        self.kind = MODES
+        """What is read back next."""
+        self.place = 0
+        """Index of the servo whose turn it is if only one is read."""
         self.modes_seen_at = -math.inf
         """Time of the latest read-back in which every servo had the expected settings [s]."""
-        self._modes_due = -math.inf
+        self._due = {MODES: -math.inf} | ({TORQUE: -math.inf} if watches_torque else {})
+        """When the registers other than goals are due [s]."""
         self._goals_since = 0
-        self._draw = Random(1)
+        self._was_of_goals = False
+        self._draws = {kind: Random(kind) for kind in (GOALS, MODES, TORQUE)}
         self._goals_sighted: list[_Sightings] = [deque() for _ in ids]
         self._modes_sighted: list[_Sightings] = [deque() for _ in ids]
         self._never_written = [ForeignValues() for _ in ids]
@@ -126,11 +151,13 @@ class ReadBack:
         """Whether the latest read-back found anything other than the latest goals or the expected settings."""
         self.lost: Overruled | None = None
         """A servo that has missed `LOST_GOALS` of `LOST_OF` goals, with the older goal that it holds."""
-        self._looks = 0  # read-backs of goals so far
+        self._looks = [0] * len(self._goals)  # read-backs of each servo's goal so far
         self._missed: list[deque[int]] = [deque(maxlen=LOST_GOALS) for _ in ids]
         """Indices of the latest read-backs that found an older goal of this program, by servo."""
         self.watchdogs: list[tuple[int, int]] = []
         """Index and Bus Watchdog of each servo that answered the latest read-back, if that was of goals."""
+        self.torque_off: int | None = None
+        """Index of a servo whose Torque Enable read 0 when it was last read back; None if there is none."""
         self.overdue_at = math.inf
         """Time from which a read-back may delay a cycle if nothing is read back before [s]."""
         self.doubts_until = -math.inf
@@ -139,8 +166,23 @@ class ReadBack:
 
     @property
     def read(self) -> GroupRead:
-        """The next group read to send: goals or operating modes."""
-        return self.reads[self.is_of_modes]
+        """The next group read to send."""
+        return self.reads[self.kind]
+
+    @property
+    def alone(self) -> GroupRead:
+        """The read to send instead if there is only time for one servo."""
+        return self._alone[self.kind][self.place]
+
+    @property
+    def shortest(self) -> GroupRead:
+        """The read of one servo's goal."""
+        return self._alone[GOALS][0]
+
+    @property
+    def every(self) -> list[GroupRead]:
+        """All reads that may be sent."""
+        return [*self.reads, *chain.from_iterable(self._alone)]
 
     def took(self, seconds: float) -> None:
         self.longest = max(_FADES * self.longest, seconds)
@@ -148,6 +190,18 @@ class ReadBack:
     def postponed(self, now: float) -> None:
         """Note that a cycle leaves no time for a read-back."""
         self.overdue_at = min(self.overdue_at, now + OVERDUE_S)
+
+    def delayed(self, now: float, delay: float, *, alone: bool) -> None:
+        """Process that a read-back has delayed the next cycle by `delay` [s]; 0 if it has not.
+
+        alone: whether only one servo was read, which counts as its share of a read-back of all.
+        """
+        if delay == 0.0 and self._was_of_goals and now >= min(self._due.values()):
+            return  # what is due did not fit
+        share = _DELAYED_SHARE_IN_DOUBT if now < self.doubts_until else _DELAYED_SHARE
+        pause = pause_after(delay, share) * (1.0 - 0.5 * self._draws[GOALS].random() * (delay > 0.0))
+        due = self.overdue_at + pause / len(self._goals) if alone else math.inf
+        self.overdue_at = min(due, now + pause)
 
     def may_repeat(self, now: float, takes: float) -> bool:
         """Whether to repeat a lost read-back, which takes `takes` [s], at once."""
@@ -157,7 +211,13 @@ class ReadBack:
         return True
 
     def look(
-        self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], now: float, *, collided: bool = False
+        self,
+        servos: Sequence[Answer],
+        sent: Sequence[Sequence[int]],
+        now: float,
+        *,
+        collided: bool = False,
+        alone: bool = False,
     ) -> Overruled | None:
         """Compare the answers with the written values; return a value that only another master can have written, or
         None.
@@ -165,19 +225,26 @@ class ReadBack:
         An answer with an error is ignored: a servo that refuses a read reveals nothing about its goal.
 
         collided: whether a late reply may have destroyed the latest goals on the wire; a servo that holds an older
-        goal is then not at fault.
+        goal is then not at fault. alone: whether only the servo whose turn it was has been read.
         """
-        of_modes = self.is_of_modes
-        self.overdue_at = now + OVERDUE_S
-        if not of_modes and self._are_latest(servos, sent[-1]):
-            self._looks += not collided
+        of_modes = self.kind == MODES
+        self._was_of_goals = self.kind == GOALS
+        self.place = (self.place + 1) % len(servos) if alone else 0
+        if self._was_of_goals and not alone and self._are_latest(servos, sent[-1]):
+            self._looks = [looks + (not collided) for looks in self._looks]
             self.is_unexpected = False
             self._choose_next(now)
             return None
         is_nearly_sure = False
         intact = [_intact(answer) for answer in servos]
-        # Answers about goals begin with ERR and Bus Watchdog.
-        self.watchdogs = [] if of_modes else [(at, each[1]) for at, each in enumerate(intact) if each is not None]
+        # Answers about goals begin with ERR and Bus Watchdog, those about torque with ERR and Torque Enable.
+        told = [(at, each[1]) for at, each in enumerate(intact) if each is not None]
+        self.watchdogs = told if self.kind == GOALS else []
+        if self.kind == TORQUE:
+            # An alert, which explains it, is found in the next cycle.
+            self.torque_off = next(
+                (at for at, is_on in told if not is_on and not (servos[at] or (0,))[0] & ALERT), None
+            )
         foreign = self._foreign(intact, sent, collided=collided)
         if of_modes and not foreign and None not in intact:
             self.modes_seen_at = now
@@ -198,7 +265,7 @@ class ReadBack:
                 return self.sighted
             self.doubts_until = now + _IN_DOUBT_S
             is_nearly_sure |= len(times) >= most - 1
-        if not is_nearly_sure:
+        if not is_nearly_sure and self.place == 0:
             self._choose_next(now)
         return None
 
@@ -214,20 +281,25 @@ class ReadBack:
 
     def _choose_next(self, now: float) -> None:
         """Choose what to read next; a foreign goal may be the first sign of a mode change, which resets the goal."""
-        if self.is_of_modes:
-            self._modes_due, self._goals_since = now + _MODES_S * (0.5 + self._draw.random()), 0
-        else:
+        if self.kind == GOALS:
             self._goals_since += 1
-        enough = _GOALS_PER_MODE_IN_DOUBT if now < self.doubts_until else 1
-        self.is_of_modes = now >= self._modes_due and self._goals_since >= enough
+        else:
+            self._due[self.kind], self._goals_since = (
+                now + _OTHERS_S[self.kind] * (0.5 + self._draws[self.kind].random()),
+                0,
+            )
+        other = min(self._due, key=self._due.__getitem__)
+        enough = _GOALS_PER_OTHER_IN_DOUBT if now < self.doubts_until else 1
+        self.kind = other if now >= self._due[other] and self._goals_since >= enough else GOALS
 
     def _foreign(self, servos: Sequence[Answer], sent: Sequence[Sequence[int]], *, collided: bool) -> list[Overruled]:
         """Return the values that servos hold but this program did not write."""
-        if self.is_of_modes:
-            found = self._other_settings(servos)
+        if self.kind != GOALS:
+            found = self._other_settings(servos) if self.kind == MODES else []
             self.is_unexpected = bool(found)
             return found
-        self._looks += not collided
+        for place, answer in enumerate(servos):
+            self._looks[place] += answer is not None and not collided
         self.is_unexpected = any(
             answer is not None and answer[-1] != value for answer, value in zip(servos, sent[-1], strict=True)
         )
@@ -259,9 +331,14 @@ class ReadBack:
         for place, (answer, missed) in enumerate(zip(servos, self._missed, strict=True)):
             if answer is None or answer[-1] == sent[-1][place] or all(answer[-1] != each[place] for each in before):
                 continue
-            missed.append(self._looks)
-            if len(missed) == LOST_GOALS and self._looks - missed[0] < LOST_OF:
+            missed.append(self._looks[place])
+            if len(missed) == LOST_GOALS and self._looks[place] - missed[0] < LOST_OF:
                 self.lost = Overruled(place, self._goals[place], answer[-1], sent[-1][place])
+
+
+def _of_one(servo_id: int, span: Span) -> GroupRead:
+    """Return a read of one servo: not a fast one, which would be no shorter."""
+    return SyncRead((servo_id,), span)
 
 
 def _intact(answer: Answer) -> Answer:

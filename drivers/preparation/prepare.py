@@ -53,6 +53,7 @@ def learn_latency(servo: Servo) -> None:
         latest = _trips(servo)
         trips = trips + latest
     taken, longest = min(trips, default=0.0) - bytes_s, max(latest, default=0.0) - bytes_s
+    port.off_wire = max(0.0, taken)
     # If nobody replies, the next request raises an error that says so.
     port.latency_measured = taken >= usual + _SLOWER_THAN_KNOWN_S
     if not port.latency_measured:

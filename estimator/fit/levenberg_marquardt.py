@@ -45,6 +45,7 @@ Move = Callable[[Array, Array], Array]
 Limits = Callable[[Array], tuple[Array, Array]]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of motions that diverge; their sum is not finite
 def minimise(
     evaluate: Evaluate,
     start: Array,

@@ -78,6 +78,7 @@ def record(
     from hil.api.experiment import record as record_arm
     from hil.next_step import next_step
     from hil.results.json_form import to_json
+    from hil.runs.run_folder import RunFolder
     from hil.runs.timing import lost_samples
 
     with _watching(config, live, json_only) as follow:
@@ -89,6 +90,8 @@ def record(
     print(f"Run folder: {run.path}, {len(run.samples)} samples.")
     if lost := lost_samples(run.samples, [joint.name for joint in run.config.joints]):
         print(lost)
+    if seldom := RunFolder.open(run.path).load_facts().monitoring:
+        print(f"Warning: {seldom}")
     print(next_step("estimate", run.path))
 
 

@@ -19,6 +19,8 @@ BY_LATENESS = 0.3  # of the lost samples: with at least this share of late ones,
 def warnings_of(config: Config, facts: RunFacts, samples: NDArray[np.void], period: SettledPeriod) -> list[str]:
     """One sentence per warning; those about currents come from `settled_current_findings`."""
     found = [*jump_warnings(config, facts, samples)]
+    if facts.monitoring:
+        found.append(facts.monitoring)
     for index, joint in enumerate(config.joints):
         swing = float(np.nanmax(period.position[index]) - np.nanmin(period.position[index]))
         steps = swing / facts.position_step[index]

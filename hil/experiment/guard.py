@@ -29,7 +29,7 @@ from hil.experiment.checks.joint_faults import JointFaults
 from hil.experiment.command_limits import CommandLimits
 from hil.experiment.deadlines import Deadlines
 from hil.experiment.silence import LATE_WAKE_UP_S, Silence
-from hil.experiment.status_check import OLD_REPLIES, StatusCheck
+from hil.experiment.status_check import OLD_REPLIES, TORQUE_LOST, StatusCheck
 from hil.plan.find_torque import how_to_find_torque
 from hil.plan.recent_motion import RecentMotion
 
@@ -227,6 +227,10 @@ class Guard:
             f"does not accept goals: {held}, and it missed {LOST_GOALS} of the last {LOST_OF} goals. "
             f"{self._status.why_lost()}",
         )
+
+    def torque_is_off(self, index: int) -> NoReturn:
+        """Raise SafetyStop for a joint whose Torque Enable reads 0."""
+        self._stop(index, *TORQUE_LOST)
 
     def rests_at(self, positions: Sequence[float]) -> None:
         """Set the joints' angles from before torque was switched on [rad], by default those of the first sample.

@@ -31,6 +31,7 @@ from hil.runs.event_log import EventLog
 from hil.runs.recording import Recorder
 from hil.runs.run_folder import RunFacts, RunFolder, write_json
 from hil.runs.timing import lateness_histogram
+from hil.setup.bus_rate import seldom_read_back
 from hil.setup.changed_settings import EXPLAINED, WRITTEN, Settings, changed_settings, may_be_later, settings_now
 from hil.setup.lying import from_where_it_lies, moved_without_torque, said_of_the_rest, tolerance_now, wait_for_rest
 from hil.setup.realtime import on_time
@@ -99,7 +100,9 @@ def run_experiment(
         _check_pose(config, bus)
         if config.is_chain and not is_given:
             config, plan = _from_where_it_lies(config, plan, bus, run, note)
-        _write_facts(config, run, plan, bus, shown_path)
+        if seldom := seldom_read_back(bus, bus.prepared, bus.port.off_wire):
+            note(seldom)
+        _write_facts(config, run, plan, bus, shown_path, seldom)
         with Recorder(run.samples_path, len(bus.joints), plan.capacity) as recorder, _watched(clock, watch) as shown:
             # Signals are deferred from before torque comes on until the servos' settings are restored.
             with stop.only_noted(), servo_limits(config, bus, note):
@@ -397,11 +400,12 @@ def _check_inside(config: Config, bus: ServoBus) -> None:
             )
 
 
-def _write_facts(config: Config, run: RunFolder, plan: Plan, bus: ServoBus, shown_path: Path) -> None:
+def _write_facts(config: Config, run: RunFolder, plan: Plan, bus: ServoBus, shown_path: Path, seldom: str) -> None:
     facts = RunFacts(
         config=str(shown_path),
         command_to_sample=bus.prepared.command_to_sample,
         position_step=[joint.servo.position_unit for joint in bus.joints],
         segments=[segment.role for segment in plan.segments],
+        monitoring=seldom,
     )
     run.write_facts(facts, plan)

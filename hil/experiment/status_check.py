@@ -46,6 +46,13 @@ OLD_REPLIES = (
 )
 
 
+TORQUE_LOST = (
+    Cause.TORQUE_OFF,
+    "has lost its torque: Torque Enable reads 0 although this program switched it on. It was rebooted, its supply "
+    "failed for a moment, or another program is using this bus.",
+)
+
+
 class StatusCheck:
     """Compares reported values with the commanded ones. `look` returns the fault, or None.
 
@@ -105,10 +112,7 @@ class StatusCheck:
             error = describe_error(HardwareError(status.hardware_error))
             return Cause.ALERT, f"reports a hardware error: {error}. Find the cause, then power-cycle the servo."
         if status.torque is False:
-            return Cause.TORQUE_OFF, (
-                "has lost its torque: Torque Enable reads 0 although this program switched it on. It was rebooted, its "
-                "supply failed for a moment, or another program is using this bus."
-            )
+            return TORQUE_LOST
         (tick, seen), self._ticks[joint] = self._ticks[joint], (status.tick, now)
         if watchdog := self.look_at_watchdog(status.watchdog):
             return watchdog

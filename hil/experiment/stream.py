@@ -53,6 +53,12 @@ _BY_OTHER_GOALS = {
 }
 """Causes of a stop that may be due to goals sent by another program."""
 
+_BY_LOST_TORQUE = {
+    *(Cause.NOT_FOLLOWING, Cause.FROZEN, Cause.WRONG_SIGN, Cause.OUT_OF_VOLTAGE, Cause.UNEXPECTED),
+    *(Cause.UNLIKE_BEFORE, Cause.POSITION, Cause.VELOCITY),
+}
+"""Causes of a stop that may be due to a servo without torque. Its Torque Enable is then read before torque is cut."""
+
 _BRAKING_WATCHDOG_S = 0.04
 """Timeout of the Bus Watchdog while the arm is braked [s]. It is shorter than during the experiment, which must allow
 for late commands: if the cable is unplugged during braking, the current must not continue for long.
@@ -152,6 +158,8 @@ class Stream:
         """Play the whole plan. Raises ExperimentError, SafetyStop, StopRequested, PortLost."""
         try:
             self._play_all()
+            if (dead := self._bus.read_torque()) is not None:
+                self._guard.torque_is_off(dead)
         except (ExperimentError, BusOverheard) as error:
             self.modes_seen_ago = self._bus.modes_seen_ago
             if isinstance(error, SafetyStop) and error.cause in _BY_OTHER_GOALS and self._bus.commanded_by_another:
@@ -162,7 +170,26 @@ class Stream:
                 self._way_down.lower(error, stopped)
             elif may_brake(self._config, error):
                 self._brake()
+            self._name_lost_torque(error)
             raise
+
+    def _name_lost_torque(self, error: ExperimentError | BusOverheard) -> None:
+        """Raise SafetyStop instead of an error that a servo without torque explains, if there is one."""
+        is_explained = isinstance(error, DidNotMove | NotSettled)
+        if not is_explained and not (isinstance(error, SafetyStop) and error.cause in _BY_LOST_TORQUE):
+            return
+        with suppress(DriverError):
+            if (dead := self._bus.read_torque()) is None:
+                return
+            try:
+                self._guard.torque_is_off(dead)
+            except SafetyStop as lost:
+                symptom = str(error).partition(": ")[0].rstrip(".")
+                lost.args = (f"{lost} Symptom: {symptom}.",)
+                lost.overruled = True
+                for note in getattr(error, "__notes__", ()):
+                    lost.add_note(note)
+                raise lost from error
 
     def _play_all(self) -> None:
         self._rest()

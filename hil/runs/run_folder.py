@@ -18,7 +18,7 @@ import platform
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cache
 from importlib.metadata import version
@@ -64,13 +64,15 @@ class RunFacts:
 
     config: path of the configuration, as the user wrote it. command_to_sample: time from the arrival of the goal
     currents at the servos to the sampling of their positions [s]. position_step: encoder step of each joint [rad].
-    segments: role of each multisine, in the order of the experiment.
+    segments: role of each multisine, in the order of the experiment. monitoring: a warning about what could hardly be
+    monitored; "" if there is none.
     """
 
     config: str
     command_to_sample: float
     position_step: Sequence[float]
     segments: Sequence[str]
+    monitoring: str = field(default="", kw_only=True)
 
 
 @dataclass(frozen=True)

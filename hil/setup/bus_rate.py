@@ -7,11 +7,13 @@ rate.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import floor, isinf
 
 import numpy as np
 
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import DriverError
+from hil.drivers.exchange import Exchange
 from hil.drivers.joint import Joint
 from hil.drivers.servo_model import Mode
 from hil.setup.realtime import on_time
@@ -90,6 +92,32 @@ def check_rate(bus: ServoBus, wanted: float) -> RateReport:
     used = _configured(bus, modes)
     found, fix = f"{used.rate:.0f} Hz possible with {used.name}", _fix(used, modes, wanted)
     return RateReport(tuple(modes), found, fix, "" if fix else _delayed(used, wanted))
+
+
+def seldom_as_measured(bus: ServoBus, modes: Sequence[ExchangeMode]) -> str:
+    """As `seldom_read_back`, for the configured exchange mode as it was measured. Raises DriverError."""
+    used = _configured(bus, modes)
+    exchange = bus.make_exchange(fast=used.fast, one_write=used.one_write)
+    bus.add_read_back(exchange)
+    return seldom_read_back(bus, exchange, max(0.0, used.median_s - exchange.usual_wire_s))
+
+
+def seldom_read_back(bus: ServoBus, exchange: Exchange, off_wire: float) -> str:
+    """Return a sentence on goals and torque that are read back only now and then, since cycles leave no time; "" if
+    they are read back regularly.
+
+    off_wire: what an exchange takes in addition to its time on the wire [s].
+    """
+    every, shortest = exchange.read_back_every(off_wire)
+    if not every:
+        return ""
+    often = "not at all" if isinf(every) else f"only about every {1e3 * every:.0f} ms"
+    return (
+        f"At {1 / bus.config.interval:g} Hz and {bus.port.baud} baud, cycles leave no time to read back what the "
+        f"servos hold: their goals are read back {often}, so another program that writes goals, or a servo that has "
+        f"lost its torque, may be noticed late or never. There is time at {floor(1 / shortest)} Hz or less, or at a "
+        "higher baud rate."
+    )
 
 
 def _faster(first: ExchangeMode, second: ExchangeMode) -> ExchangeMode:

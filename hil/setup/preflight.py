@@ -25,7 +25,7 @@ from hil.plan.chain_plan import check_clearance, check_rest_pose, make_chain_pla
 from hil.plan.find_torque import how_to_find_torque
 from hil.plan.stabiliser import too_slow
 from hil.rest_pose_hint import rest_pose_hint, within_limits
-from hil.setup.bus_rate import check_rate, goals_taken
+from hil.setup.bus_rate import check_rate, goals_taken, seldom_as_measured
 from hil.setup.others import others_on_the_bus
 from hil.setup.session.killed_run import recover
 
@@ -457,6 +457,7 @@ def _goals(bus: ServoBus) -> Iterator[Finding]:
 def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:
     try:
         report = check_rate(bus, config.experiment.rate)
+        seldom = "" if report.fix else seldom_as_measured(bus, report.modes)
     except DriverError as error:
         yield Finding(Level.STOP, "bus", "rate", "not measured", str(error))
         return
@@ -465,6 +466,8 @@ def _rate(config: Config, bus: ServoBus) -> Iterator[Finding]:
     level = Level.STOP if report.fix else Level.WARNING if report.delayed else Level.OK
     found = f"{config.experiment.rate:g} Hz wanted, {report.found}"
     yield Finding(level, "bus", "rate", found, report.fix or report.delayed)
+    if seldom:
+        yield Finding(Level.WARNING, "bus", "monitoring", "goals and torque are read back seldom", seldom)
 
 
 def _port(config: Config) -> str:

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from hil.drivers.control_table import load_control_table
 from hil.drivers.errors import PortLost
 from hil.drivers.exchange import HOST_S, Exchange
-from hil.drivers.others.read_back import LOST_OF, TRY_AGAIN_S
+from hil.drivers.others.read_back import GOALS, LOST_OF, TRY_AGAIN_S
 from hil.drivers.packet import HEADER, Framer, Instruction, crc, encode, encode_status
 from hil.drivers.port import Port
 from hil.drivers.servo_model import Mode
 from hil.drivers.state import read_back_spans, spans
-from hil.drivers.sync_read import FastSyncRead, Span, SyncRead
+from hil.drivers.sync_read import FastSyncRead, Span, SyncRead, one_each
 from hil.drivers.turns import Turns
 
 XM430 = load_control_table("XM430-W350")
@@ -526,13 +526,12 @@ def test_goals_are_compared_with_what_was_sent_though_the_caller_changes_its_lis
     for _ in range(4):
         cycles.cycle(goals)
     goals[:] = [70, 80]
-    goal, mode = read_back_spans([Mode.CURRENT] * 2, [XM430] * 2)
-    assert isinstance(goal, Span) and isinstance(mode, Span)
+    sizes = [one_each(span, 2)[0].size for span in read_back_spans([Mode.CURRENT] * 2, [XM430] * 2)]
     assert cycles._read_back is not None
-    goals_are_asked_for = cycles._read_back.reads[0]
     for _ in range(8):
-        size, held = (goal.size, (7, 8)) if cycles._read_back.read is goals_are_asked_for else (mode.size, (0, 0))
-        answers = [bytes(size - 2) + struct.pack("<h", each) for each in held]
+        kind = cycles._read_back.kind
+        held = (7, 8) if kind == GOALS else (0, 0)
+        answers = [b"\1" + bytes(sizes[kind] - 3) + struct.pack("<h", each) for each in held]
         wire.answers = [b"".join(encode_status(servo, 0, each) for servo, each in enumerate(answers, 1))]
         assert cycles.overruled(wire.now() + 1.5 * HOST_S) is None and not wire.answers
         assert not cycles._late_possible and not cycles.is_in_doubt
@@ -586,7 +585,7 @@ def test_a_read_back_behind_an_echo_is_read_whole() -> None:
     cycles.cycle([7, 8])
     back = cycles._read_back
     assert back is not None and back.read is back.reads[1]
-    _, mode = read_back_spans([Mode.CURRENT] * 2, [XM430] * 2)
+    _, mode, _ = read_back_spans([Mode.CURRENT] * 2, [XM430] * 2)
     assert isinstance(mode, Span)
     wire.answers = [back.read.request + b"".join(encode_status(servo, 0, bytes(mode.size)) for servo in (1, 2))]
     began = wire.time

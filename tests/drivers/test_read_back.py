@@ -1,5 +1,6 @@
 """What the servos hold right before a cycle shows whether another master commands them."""
 
+import math
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -190,6 +191,56 @@ def test_a_watchdog_changed_by_another_program_is_seen_at_any_rate(
             assert not is_changed or clock.now() < start + 0.2 + 0.35
         assert bus.watchdog_changed == (1, ticks) and clock.now() > start + 0.2
     assert latest < interval, "no sample is missed"
+
+
+@pytest.mark.parametrize("interval", [0.001, 1 / 900, 0.00125, 1 / 650, 0.002, 0.0025])
+@pytest.mark.parametrize("lost", [0, 1])
+def test_lost_torque_is_read_at_any_rate(fake_config: Make, interval: float, lost: int) -> None:
+    """Where cycles leave no time for Torque Enable of all servos, one is asked at a time, or a cycle is delayed."""
+    with driven(fake_config(interval=interval, fast_sync_read=False)) as bus:
+        clock, servo = bus.port.clock, bus.port._serial.bus.servos[lost + 1]
+        start = clock.now()
+        for cycle in range(round(0.6 / interval)):
+            clock.wait_until(start + cycle * interval)
+            assert clock.now() < start + (cycle + 1) * interval, "no sample is missed"
+            status = bus.exchange([0.01 * (cycle % 30), 0.1]).status
+            if is_off := cycle * interval >= 0.2:
+                servo.write(64, b"\0")
+            due = start + (cycle + 1) * interval
+            if bus.prepared.read_back_at <= due:
+                bus.check_not_overruled(due)
+            if bus.torque_lost is not None or (status and status[lost] and status[lost].torque is False):
+                break
+            assert not is_off or clock.now() < start + 0.2 + 0.3
+        assert is_off and bus.torque_lost in (lost, None)
+        assert bus.read_torque() == lost
+
+
+@pytest.mark.parametrize(("interval", "every"), [(0.00125, 13), (0.00125, 40), (1 / 650, 9)])
+def test_goals_written_now_and_then_are_found_where_there_is_time_for_one_servo_only(
+    fake_config: Make, interval: float, every: int
+) -> None:
+    """Each stands until the next cycle overwrites it."""
+    times = iter(range(10_000))
+
+    def seldom(servos: Any) -> None:
+        if next(times) % every == 5:
+            servos[2].write(102, b"\xf9\xff")
+
+    with driven(fake_config(interval=interval, fast_sync_read=False)) as bus:
+        start = bus.port.clock.now()
+        with pytest.raises(BusShared, match=r"elbow.*Goal Current reads -7"):
+            after_each(bus, seldom, round(2.0 / interval), interval, late=interval)
+        assert bus.port.clock.now() - start < 12 * every * interval
+
+
+@pytest.mark.parametrize(("interval", "every"), [(0.01, 0.0), (0.00125, 0.0), (0.001, 0.08), (0.0009, 0.1)])
+def test_how_often_goals_are_read_back_is_known_beforehand(fake_config: Make, interval: float, every: float) -> None:
+    with ServoBus.open(fake_config(interval=interval, fast_sync_read=False)) as bus:
+        told, shortest = bus.prepared.read_back_every(bus.port.off_wire)
+        assert told == pytest.approx(every, rel=0.3)
+        assert (interval >= shortest) is (every == 0.0)
+        assert bus.prepared.read_back_every(0.01)[0] == math.inf
 
 
 def test_a_servo_that_does_not_answer_is_asked_once_more_and_left_to_the_next_cycle(fake_config: Make) -> None:

@@ -12,6 +12,7 @@ from hil.drivers.sync_read import Answer, Span
 XM430 = load_control_table("XM430-W350")
 GOALS = Span.of([XM430] * 2, ("Bus Watchdog", "Goal PWM", "Goal Current"))
 MODES = Span.of([XM430] * 2, ("Drive Mode", "Operating Mode"))
+TORQUE = Span.of([XM430] * 2, ("Torque Enable", "Hardware Error Status"))
 OURS, FOREIGN = 40, -7
 MODE, OTHER_MODE = 0, 3
 SENT = [[10, 20], [30, OURS]]
@@ -20,7 +21,7 @@ LONG_AGO = 55
 
 
 def read_back() -> ReadBack:
-    return ReadBack((1, 2), GOALS, MODES, [(MODE,), (MODE,)], fast=False)
+    return ReadBack((1, 2), GOALS, MODES, [(MODE,), (MODE,)], TORQUE, fast=False)
 
 
 def reads_modes(back: ReadBack) -> bool:
@@ -48,7 +49,8 @@ def test_the_second_foreign_goal_is_proof_the_third_of_one_that_lost_writes_may_
 @pytest.mark.parametrize("register", ["Drive Mode", "Operating Mode", "Homing Offset"])
 def test_any_setting_that_changes_what_goals_and_angles_mean_is_compared(register: str) -> None:
     names = ("Drive Mode", "Operating Mode", "Homing Offset")
-    back = ReadBack((1, 2), GOALS, Span.of([XM430] * 2, ("ID", *names)), [(0, 0, -84), (4, 3, 0)], fast=False)
+    spans = GOALS, Span.of([XM430] * 2, ("ID", *names)), [(0, 0, -84), (4, 3, 0)], TORQUE
+    back = ReadBack((1, 2), *spans, fast=False)
     held = {name: value + 7 * (name == register) for name, value in zip(names, (4, 3, 0), strict=True)}
     for now, found in ((0.0, False), (0.01, True)):
         assert reads_modes(back)

@@ -97,7 +97,8 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
     given = Given(torque_scale_std(config), zeros=True, jumps=jumps, torque_source="constant")
     zeros, gravity = config.model.zeros, config.arm.gravity
     result = estimate_any([recording], config.model, 1.0, zeros, facts.config, gravity, given=given).result
-    warnings = (*result.warnings, *current_findings(config, samples).warnings)
+    seldom = (facts.monitoring,) if facts.monitoring else ()
+    warnings = (*result.warnings, *current_findings(config, samples).warnings, *seldom)
     result = replace(result, arm=arm_facts(config), warnings=warnings)
     run.write_result(result)
     return result

@@ -48,6 +48,8 @@ def test_lost_samples_are_blamed_on_what_lost_them(arm_file: Callable[..., Path]
     angle[:, :16] = np.nan
     step = np.full(2, 0.0015)
     period = SettledPeriod(rate, 0.1 * np.ones((2, count)), angle, 1e-3, step)
-    told = warnings_of(config, RunFacts("arm.toml", 1e-3, step.tolist(), ("identify",)), samples, period)
+    facts = RunFacts("arm.toml", 1e-3, step.tolist(), ("identify",), monitoring="Goals were hardly read back.")
+    told = warnings_of(config, facts, samples, period)
+    assert facts.monitoring in told
     lost = [each for each in told if "are missing or far" in each]
     assert len(lost) == 2 and all("8.0 % of the samples" in each and said in each for each in lost)

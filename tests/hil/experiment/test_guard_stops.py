@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,12 +17,12 @@ import serial
 from hil.config.schema import Config, parse_config
 from hil.drivers.bus import ServoBus
 from hil.drivers.errors import BusShared, TorqueNotOff, WrongModel, WrongSetting
-from hil.errors import Cause, ExperimentError, SafetyStop, StopRequested
+from hil.errors import Cause, DidNotMove, ExperimentError, SafetyStop, StopRequested
 from hil.experiment import run
 from hil.experiment.checks import work
 from hil.experiment.model_watch import UNLIKE_ANY_ARM, ModelWatch
 from hil.experiment.run import run_experiment
-from hil.experiment.stream import Progress
+from hil.experiment.stream import Progress, Stream
 from hil.fakes.bus.faults import Fault, FaultKind
 from hil.plan.plan import Plan, make_plan
 from hil.runs.recording import Phase, load_samples, sample_type
@@ -106,7 +107,11 @@ CAUSES: list[tuple[Cause, str, Callable[[list[Any]], None]]] = [
         r"'elbow'.*reports an angle that changed by -0",
         lambda p: fault(p, FaultKind.ENCODER_JUMP, servo=2, amount=-120),
     ),
-    (Cause.NOT_FOLLOWING, r"'shoulder'.*carries 0\.000", lambda p: p[0].bus.servos[1].write(64, b"\x00")),
+    (
+        Cause.TORQUE_OFF,
+        r"'shoulder'.*has lost its torque.*Symptom: .*carries 0\.000",
+        lambda p: p[0].bus.servos[1].write(64, b"\x00"),
+    ),
     (Cause.WRONG_SIGN, r"against its command", lambda p: turn_round(p, 0)),
 ]
 
@@ -122,10 +127,10 @@ def test_what_goes_wrong_in_a_period_stops_the_arm_for_that_cause(
     happens: Callable[[list[Any]], None],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    if cause in (Cause.NOT_FOLLOWING, Cause.WRONG_SIGN):
+    if cause in (Cause.TORQUE_OFF, Cause.WRONG_SIGN):
         # Every layer must stop the arm alone; the model detects a disobedient motor too, and may be first.
         monkeypatch.setattr(ModelWatch, "look", lambda *_: None)
-    low = () if cause is not Cause.NOT_FOLLOWING else (("current_limit = 1.2", "current_limit = 0.5"),)
+    low = () if cause is not Cause.TORQUE_OFF else (("current_limit = 1.2", "current_limit = 0.5"),)
     stop, samples = run_until_stopped(arm(STIFF_GUARD, *low), tmp_path / "run", once(lambda: happens(ports)), plan)
     assert stop.cause is cause and re.search(said, str(stop))
     assert_stopped(ports[0])
@@ -313,6 +318,30 @@ def test_a_return_delay_that_another_program_raised_is_named_before_late_replies
     assert re.match(r"Another program changed .*'elbow'.*Return Delay Time from 0 us to 508 us\)\. Sym", str(stop))
     assert "Operating Mode" not in str(stop) and stop.cause in (Cause.LATE, Cause.MISSING)
     assert_stopped(ports[0])
+
+
+@pytest.mark.parametrize(
+    "symptom",
+    [None, DidNotMove("Joint 'elbow' did not move: it is stuck."), SafetyStop("It jams: x", Cause.UNEXPECTED)],
+)
+def test_torque_that_was_lost_before_this_program_cuts_it_is_named(
+    arm: Arm, tmp_path: Path, ports: list[Any], symptom: ExperimentError | None
+) -> None:
+    """Neither at the end of a run nor at a stop whose cause it may be is lost torque covered by torque off."""
+
+    def play(stream: Stream) -> None:
+        stream._sample([0.0, 0.0], Phase.REST, -1)
+        ports[0].bus.servos[2].write(64, b"\0")
+        if symptom is not None:
+            raise symptom
+
+    config = arm()
+    folder = RunFolder.create(tmp_path / "run", config)
+    with mock.patch.object(Stream, "_play_all", play), pytest.raises(SafetyStop, match="has lost its torque") as stop:
+        run_experiment(config, folder, config.path, lambda _: None)
+    assert stop.value.cause is Cause.TORQUE_OFF and "'elbow'" in str(stop.value)
+    told = "" if symptom is None else f" Symptom: {str(symptom).partition(':')[0]}."
+    assert str(stop.value).endswith(f"is using this bus.{told}")
 
 
 def test_settings_changed_before_torque_comes_on_are_refused(

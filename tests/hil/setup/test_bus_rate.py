@@ -1,6 +1,7 @@
 """The rate that `hil check` measures on the fake bus, whose wire takes the time of a real one."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,8 @@ from hil.drivers.bus import ServoBus
 from hil.fakes.bus.clock import VirtualClock
 from hil.setup import bus_rate
 from hil.setup.bus_rate import ExchangeMode, check_rate
+
+ArmFile = Callable[..., Path]
 
 
 def rate_of(path: Path) -> tuple[int, bool]:
@@ -32,6 +35,15 @@ def test_six_servos_with_shadows_hold_400_hz_at_1_mbaud(tmp_path: Path) -> None:
 def test_a_slower_bus_does_not_and_says_so(tmp_path: Path) -> None:
     possible, enough = rate_of(six_servos(tmp_path, "115_200"))
     assert not enough and possible < 150
+
+
+@pytest.mark.parametrize(("rate", "is_said"), [(400, False), (840, False), (880, True)])
+def test_a_rate_that_leaves_no_time_to_read_goals_back_is_said(arm_file: ArmFile, rate: int, is_said: bool) -> None:
+    findings = hil.check(arm_file(("rate = 400.0 ", f"rate = {rate}.0 "))).findings
+    said = [each for each in findings if each.what == "monitoring"]
+    assert len(said) == is_said
+    if is_said:
+        assert said[0].level == "warning" and re.search(r"every \d+ ms.* time at 8[56]\d Hz or less", said[0].fix)
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,7 @@ class Bus:
         self.modes_seen_ago = math.inf
         self.goals_lost: tuple[int, str] | None = None
         self.watchdog_changed: tuple[int, int] | None = None
+        self.torque_lost: int | None = None
         self.takes = takes
         self.calls: list[Call] = []
         self.velocity = NOTHING
@@ -70,6 +71,9 @@ class Bus:
         after, sent = self.clock.now(), tuple(goals)
         velocity = NOTHING if len(self.calls) % self.moves_every else self.velocity
         return State(now, after, sent, sent, velocity, position, self.error, fine, self.slow, self.status)
+
+    def read_torque(self) -> int | None:
+        return self.torque_lost
 
     def check_not_overruled(self, due: float) -> None:
         self.calls.append(("read back", round(due, 6)))
