@@ -27,7 +27,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
 from hil.estimator.models.conflicts import Conflict, conflicts
-from hil.estimator.selection.segment_verdict import SegmentEvidence, explains_well, judge_segments
+from hil.estimator.selection.segment_verdict import SegmentEvidence, judge_segments
 from hil.estimator.selection.segments import considered, missing_terms, predicted_positions
 from hil.estimator.selection.unsettled import SegmentChoice, choose_by_shooting, held_out_error
 from hil.estimator.selection.verdict import Verdict
@@ -158,7 +158,6 @@ def _judged(
         () if why else contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
     )
     scales = () if spoiled else angle_scale(recordings, estimate, given.origin)
-    unknown, known_well = undetermined(estimate), explains_well(recordings, estimate, fitted.gravity > 0.0)
     odd = (*why, *scales, *contradictory, *implausible(recordings, estimate, fitted.gravity))
     return judge_segments(
         recordings,
@@ -166,15 +165,13 @@ def _judged(
         SegmentEvidence(
             held_out,
             () if spoiled else missing_terms(recordings, estimate),
-            (*((JUMPED,) if given.jumps else ()), *odd, *(() if known_well else unknown)),
+            (*((JUMPED,) if given.jumps else ()), *odd),
             bool(found.faults),
             bool(found.doubts),
             conflicts_found,
+            tuple(undetermined(estimate)),
             spoiled,
-            (
-                *(unknown if known_well else ()),
-                *(() if why else ratios_said(joints, ratios, given.torque_source, contradictory)),
-            ),
+            () if why else ratios_said(joints, ratios, given.torque_source, contradictory),
             fitted.gravity > 0.0,
             found.reason,
         ),
