@@ -18,6 +18,7 @@ MOST_GAP = 0.2  # s between samples; with longer intervals the motion would not 
 MOST_INTERVALS, SHORTEST_GAP = 8.0, 0.04  # intervals longer than this many usual ones, and this many seconds, are gaps
 LONGEST_GAP = 10.0  # s within one recording
 LEAST_NOISE = 1e-5  # rad: lower bound for any arm's encoder
+FEW_OUTLIERS = 0.02  # of a joint's samples
 MOST_ANGLE = 200.0  # rad: larger values must be degrees or encoder steps
 MOST_SPEED = 500.0  # rad/s between samples, likewise
 MOST_TORQUE = 1e4  # N m
@@ -161,7 +162,8 @@ def _check_times(recording: Recording) -> None:
         )
     if float(np.median(step)) > MOST_GAP:
         raise RecordingError(
-            f"samples are {float(np.median(step)):.3g} s apart; at most {MOST_GAP:g} s is allowed. Is time in seconds?"
+            f"samples are {float(np.median(step)):.3g} s apart; at most {MOST_GAP:g} s is allowed. Is time in seconds? "
+            "If not, set columns.time_unit"
         )
     if step.max() > LONGEST_GAP:
         k = int(np.argmax(step))
@@ -198,11 +200,25 @@ def _check_values(recording: Recording) -> None:
             )
 
 
+def _check_outliers(recording: Recording, joint: int) -> None:
+    """Refuse single positions far from all others, which a wrong unit would not explain."""
+    row = recording.position[joint]
+    far = np.flatnonzero(np.abs(row - np.nanmedian(row)) > MOST_ANGLE)
+    if 0 < far.size <= FEW_OUTLIERS * row.size:
+        raise RecordingError(
+            f"joint {joint + 1}: sample {far[0] + 1} at {recording.time[far[0]]:g} s is {row[far[0]]:.4g} rad, far "
+            "from nearly all others: it is an outlier. Leave such positions empty (NaN)"
+        )
+
+
 def _check_motion(recording: Recording) -> None:
     filled = recording.filled()
     for joint, row in enumerate(filled):
         swing = float(row.max() - row.min())
         least = LEAST_MOTION * float(recording.position_step[joint])
+        _check_outliers(recording, joint)
+        if not swing:
+            raise StandstillError(f"the position of joint {joint + 1} is always {row[0]:.4g} rad: check the column")
         if swing <= least:
             raise StandstillError(
                 f"joint {joint + 1} moved by {swing:.2g} rad; at least {least:.2g} rad are needed: check the column "

@@ -15,7 +15,7 @@ ignored, unknown ones are errors.
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, PositiveFloat, ValidationError, model_validator
 
 from hil.config.csv_columns import PLANAR, Columns
 from hil.config.experiment import ModelConfig
@@ -35,13 +35,14 @@ class JointName(Table):
 
 
 class ArmFacts(Table):
-    """`[arm]`; only gravity and geometry are used here."""
+    """`[arm]`; only gravity and geometry are used here. The length of link 1 is compared with the estimate."""
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
     urdf: str | None = Field(None, description="URDF or MJCF of a spatial arm, relative to the TOML file")
     base: list[Turned] = Field(
         [0.0, 0.0, 0.0], min_length=3, max_length=3, description="with urdf: roll, pitch and yaw of the base, rad"
     )
+    link_lengths: list[PositiveFloat] | None = Field(None, description="m, from joint to joint and to the tip")
 
 
 class RecordingConfig(Table):

@@ -20,7 +20,7 @@ from hil.estimation.unsettled.chain_slips import late_torque, refuse_chain_slips
 from hil.estimator.chain.column_faults import ColumnCheck
 from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.base_parameters import BaseParameters
-from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.chain_model import ChainModel, Drive
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.recordings import MotionPiece, RecordedChain, identify_recordings, torque_error
@@ -71,7 +71,7 @@ def estimate_chain_recordings(
     prior = Prior.of(base, arm.parameters)
     wanted = config.model
     model = ChainModel(
-        *(base, wanted.fixed_friction, wanted.drive, wanted.zeros, wanted.torque_scale and base.chain.joints > 1),
+        *(base, wanted.fixed_friction, _drive(config), wanted.zeros, wanted.torque_scale and base.chain.joints > 1),
         base_tilt=wanted.base_tilt,
         lags=base.chain.joints > 1,
         by_voltage=tuple(range(1, base.chain.joints + 1)) if config.columns.drive in {"voltage", "pwm"} else (),
@@ -122,6 +122,15 @@ def estimate_chain_recordings(
         ),
     )
     return ChainEstimated(result, _predicted(recordings, found))
+
+
+def _drive(config: RecordingConfig) -> Drive:
+    """The drive model of the file; by default, a common delay and a lag of each joint.
+
+    Other tools' recordings may have both, and lags that differ by joint are not explained by a delay.
+    """
+    is_given = "model" in config.model_fields_set and "drive" in config.model.model_fields_set
+    return config.model.drive if is_given else "delay_lag"
 
 
 def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescription:
@@ -219,11 +228,12 @@ def _verdict(
         trust = trust if worst <= EXPLAINED else "with care"
         if found.systematic > SYSTEMATIC:
             trust = "with care"
+            lags = ', lags that differ by joint (model.drive = "delay_lag")' if found.model.drive == "delay" else ""
             sentences.append(
                 "Part of the residual repeats with the motion. This increases standard errors by a factor of up to "
                 f"{found.systematic:.1f}, and some values may be wrong by more than their standard errors. An effect "
                 "is missing from the model: torque ripple or cogging, play or elasticity of the gears, a cable, "
-                "friction that depends on load or changes with time, or torques that differed from the commands."
+                f"friction that depends on load or changes with time{lags}, or torques that differed from the commands."
             )
     else:
         trust = "with care"
