@@ -117,10 +117,8 @@ def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, 
 
 
 def _rules(left: float, held_out: Array | None, weakest: str, part: float, unclear: bool) -> tuple[str, ...]:
-    """Name each number beyond its limit for the verdict "yes".
-
-    weakest, part: the least certain parameter and its relative standard error. unclear: whether friction near
-    standstill is undetermined and may have affected other parameters.
+    """Name each number beyond its limit for "yes". part: relative standard error of the parameter `weakest`. unclear:
+    whether undetermined friction near standstill may have affected other parameters.
     """
     limit = EXPLAINED if held_out is None else MUCH_LEFT
     rules = {
@@ -128,14 +126,13 @@ def _rules(left: float, held_out: Array | None, weakest: str, part: float, uncle
         f"the error of the prediction exceeds {percent(GOOD_PREDICTION)}": held_out is not None
         and float(held_out.max()) > GOOD_PREDICTION,
         f"{weakest} is not known to within {percent(WEAK)}": part > WEAK,
-        "terms of friction near standstill are not determined, which is harmless only if the residual is at most "
+        "friction near standstill is not determined, which is harmless only if the residual is at most "
         f"{NEARLY_EXPLAINED:g} times the noise and every parameter is known to within {percent(WELL_KNOWN)}": unclear,
     }
     return tuple(rule for rule, applies in rules.items() if applies)
 
 
 def _is_refused(left: float, held_out: Array | None, evidence: SegmentEvidence) -> bool:
-    """Return whether the estimate is unusable."""
     beyond = left > MUCH_LEFT if held_out is None else not float(held_out.max()) <= USABLE_PREDICTION
     return evidence.faulty or beyond
 
@@ -159,7 +156,7 @@ def _left(estimate: ShootingEstimate, evidence: SegmentEvidence) -> str:
         return "The model explains the motion down to the noise of the positions."
     said = f"{unexplained_motion(joint, float(left[joint]))}: its residual is {left[joint]:.1f} times the noise"
     if left[joint] <= MUCH_LEFT and evidence.held_out is not None:
-        said += f", and up to {MUCH_LEFT:g} times is acceptable if motion that was not fitted is predicted well"
+        said += f" (up to {MUCH_LEFT:g} times is acceptable if other motion is predicted well)"
     said += "."
     seen = [each for each in evidence.candidates if each.evidence > 1.0 and each.explained > NOTICEABLE]
     if seen:

@@ -14,7 +14,7 @@ from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
-from hil.estimation.chain_estimate import vague
+from hil.estimation.chain_estimate import chain_facts, vague
 from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
 from hil.estimation.unsettled.chain_slips import late_torque, refuse_chain_slips, torques_apart
 from hil.estimator.chain.column_faults import ColumnCheck
@@ -28,7 +28,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 from hil.estimator.models.bounds import bound_sentence
 from hil.estimator.models.conflicts import Trust, conflict_sentences, contradicted, lowered
-from hil.results.parts import ChainFacts, Covariance, Quantity, ShootingFit, Timing, Validation, Verdict
+from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Validation, Verdict
 from hil.results.result import ShootingResult
 
 Array = NDArray[np.float64]
@@ -109,17 +109,7 @@ def estimate_chain_recordings(
         verdict=_verdict(found, arm, foretold, prior, contradictory, late),
         warnings=doubted_inertias(arm),
         timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),
-        chain=ChainFacts(
-            urdf=Path(config.arm.urdf or "").name,
-            rotation=tuple(tuple(map(tuple, each)) for each in base.chain.rotation.tolist()),
-            translation=tuple(map(tuple, base.chain.translation.tolist())),
-            axis=tuple(map(tuple, base.chain.axis.tolist())),
-            gravity=tuple(base.chain.gravity.tolist()),
-            groups=dict(zip(base.names, base.groups, strict=True)),
-            from_prior=found.from_prior,
-            held=arm.held,
-            doubts=arm.doubts,
-        ),
+        chain=chain_facts(arm, base, found.from_prior),
     )
     return ChainEstimated(result, _predicted(recordings, found))
 

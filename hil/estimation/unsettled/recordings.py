@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,21 +33,6 @@ from hil.runs.recording_folder import Predicted, describe, save
 from hil.runs.run_folder import write_json
 
 MOST_RECORDINGS = 200
-
-
-@dataclass(frozen=True)
-class _Read:
-    """All recordings of one arm. notes: sentences about what was guessed, corrected or averaged. doubts: contradictions
-    among the columns. unusable: whether these are so large that a model is useless.
-    """
-
-    recordings: tuple[Recording, ...]
-    names: tuple[str, ...]
-    stepped: tuple[bool, ...]
-    columns: Columns
-    notes: tuple[str, ...]
-    doubts: tuple[str, ...]
-    unusable: bool
 
 
 def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder: Path | None) -> ShootingResult:
@@ -114,7 +99,7 @@ def _estimate_chain(
     return result
 
 
-def _read(paths: Sequence[Path], columns: Columns) -> _Read:
+def _read(paths: Sequence[Path], columns: Columns) -> Converted:
     found = [convert(table, columns) for path in paths for table in read_tables(path)]
     if len({len(each.columns.position or ()) for each in found}) > 1:
         raise ConfigError("The files have different numbers of joints: give recordings of one arm.")
@@ -123,8 +108,9 @@ def _read(paths: Sequence[Path], columns: Columns) -> _Read:
         raise CsvError(f"{len(recordings)} recordings, more than {MOST_RECORDINGS}: give fewer files or episodes.")
     names = tuple(name for each in found for name in each.names)
     stepped = tuple(bool(all(flags)) for flags in zip(*(each.stepped for each in found), strict=True))
-    stated, unusable = _notes(found), any(each.unusable for each in found)
-    return _Read(_stepped_alike(recordings, found), names, stepped, found[0].columns, stated, _doubts(found), unusable)
+    notes, doubts = _once(each.notes for each in found), _once(each.doubts for each in found)
+    unusable = any(each.unusable for each in found)
+    return Converted(_stepped_alike(recordings, found), names, stepped, found[0].columns, notes, doubts, unusable)
 
 
 def _stepped_alike(recordings: tuple[Recording, ...], found: Sequence[Converted]) -> tuple[Recording, ...]:
@@ -135,15 +121,11 @@ def _stepped_alike(recordings: tuple[Recording, ...], found: Sequence[Converted]
     return tuple(replace(each, position_step=step) for each in recordings)
 
 
-def _notes(found: Iterable[Converted]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(note for each in found for note in each.notes))
+def _once(sentences: Iterable[Sequence[str]]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(each for some in sentences for each in some))
 
 
-def _doubts(found: Iterable[Converted]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(doubt for each in found for doubt in each.doubts))
-
-
-def _doubted(result: ShootingResult, read: _Read) -> ShootingResult:
+def _doubted(result: ShootingResult, read: Converted) -> ShootingResult:
     """The result with the doubts about the columns added to its verdict."""
     verdict = result.verdict
     if not read.doubts or verdict is None:
@@ -152,7 +134,7 @@ def _doubted(result: ShootingResult, read: _Read) -> ShootingResult:
     return replace(result, verdict=replace(verdict, trust=trust, sentences=(*verdict.sentences, *read.doubts)))
 
 
-def _zeroed(read: _Read, gravity: float) -> _Read:
+def _zeroed(read: Converted, gravity: float) -> Converted:
     """Measure angles from the horizontal, if their origin is not given but can be determined from gravity."""
     if gravity <= 0.0 or read.columns.zero is not None:
         return read
@@ -172,7 +154,7 @@ def _zeroed(read: _Read, gravity: float) -> _Read:
     return replace(read, recordings=moved, columns=columns, notes=(*read.notes, said))
 
 
-def _averaged(read: _Read) -> _Read:
+def _averaged(read: Converted) -> Converted:
     recordings, notes = [], list(read.notes)
     for name, recording in zip(read.names, read.recordings, strict=True):
         mean = mean_period(recording) if read.columns.between == "held" else None
@@ -184,7 +166,7 @@ def _averaged(read: _Read) -> _Read:
     return replace(read, recordings=tuple(recordings), notes=tuple(notes))
 
 
-def _named(found: Estimated, read: _Read, config: RecordingConfig) -> ShootingResult:
+def _named(found: Estimated, read: Converted, config: RecordingConfig) -> ShootingResult:
     result = found.result
     zeros = result.zeros
     if zeros is not None:
@@ -208,7 +190,7 @@ def _back_emf(columns: Columns, result: ShootingResult) -> list[str]:
     return [f"The joints are driven by voltage, so viscous friction includes braking by back-EMF: {', '.join(parts)}."]
 
 
-def _arm(read: _Read, config: RecordingConfig) -> ArmFacts:
+def _arm(read: Converted, config: RecordingConfig) -> ArmFacts:
     """Describe the joints from the recordings; the limits are the observed extremes."""
     columns = read.columns
     gains, names = columns.gains or [1.0] * len(columns.position or ()), config.joint_names
@@ -246,7 +228,7 @@ def _keep(
     paths: Sequence[Path],
     config_path: Path | None,
     config: RecordingConfig,
-    read: _Read,
+    read: Converted,
     predicted: Sequence[NDArray[np.float64]],
 ) -> None:
     kept = [

@@ -50,7 +50,7 @@ def test_values_far_from_the_files_lower_the_verdict(estimate: Any, given: Given
     ("left", "error", "std", "undetermined", "trust", "said"),
     [
         (1.1, 0.011, 1e-4, (), "with care", "the error of the prediction exceeds 1 %"),
-        (2.5, 0.004, 1e-4, (), "yes", "not fully explained: its residual is 2.5 times the noise, and up to 5 times"),
+        (2.5, 0.004, 1e-4, (), "yes", "not fully explained: its residual is 2.5 times the noise (up to 5 times"),
         (5.1, 0.004, 1e-4, (), "with care", "the residual exceeds 5 times the noise"),
         (5.1, 0.06, 1e-4, (), "no", 'An error above 5 % makes the verdict "no"'),
         (1.1, None, 1e-4, (), "with care", "the residual exceeds 1.06 times the noise"),
