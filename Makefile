@@ -7,6 +7,7 @@ BIN := $(VENV)/bin
 
 $(VENV)/installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
+	-$(BIN)/python -m pip install --quiet --upgrade pip  # the one that Python brings takes twice as long below
 	$(BIN)/python -m pip install --quiet --editable ".[dev]"
 	touch $@
 

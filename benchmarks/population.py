@@ -36,6 +36,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.drawn_arms.population_arms import DrawnArm, draw
 from benchmarks.drawn_arms.population_others import draw as draw_other
@@ -181,10 +182,12 @@ def _truth(config: Config, folder: Path) -> dict[str, float]:
     truth = true_parameters(config)
     assert truth is not None and config.fake is not None
     samples = load_samples(folder / "samples.npy", len(config.joints))
-    played = (samples["phase"] == Phase.PERIODIC) & (samples["segment"] == 0)
+    phase, segment, period = (samples[name].astype(np.int64) for name in ("phase", "segment", "period"))
+    written: NDArray[np.float64] = samples["time_before_write"]
+    played = (phase == Phase.PERIODIC) & (segment == 0)
     # Only the last periods of the multisine are fitted, once the motion has settled.
-    fitted = played & (samples["period"] > samples["period"][played].max() - config.experiment.periods)
-    now = base_parameters(config.fake.arm, float(np.median(samples["time_before_write"][fitted])))
+    fitted = played & (period > period[played].max() - config.experiment.periods)
+    now = base_parameters(config.fake.arm, float(np.median(written[fitted])))
     warm = base_parameters(config.fake.arm)
     return {name: value + now[name] - warm[name] for name, value in truth.items()}
 

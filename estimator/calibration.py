@@ -220,7 +220,7 @@ def _misfit(period: SettledPeriod, physics: Physics, state: Array, factor: Array
         period.rate,
         period.command_to_sample,
         steps,
-        delay=physics.delay,
+        delay=physics.delays,
         lag=physics.lags,
     )
     position, _ = simulate(physics, state, torque, 1.0 / (period.rate * steps))

@@ -140,7 +140,7 @@ def predict(
     physics = Physics.of(estimate.parameters)
     steps = steps_per_sample(rate)
     step = 1.0 / (rate * steps)
-    motor = motor_torque(torque, rate, command_to_sample, steps, delay=physics.delay, lag=physics.lags)
+    motor = motor_torque(torque, rate, command_to_sample, steps, delay=physics.delays, lag=physics.lags)
     state = np.stack((estimate.start[0] if pose is None else pose, np.zeros(joints), np.zeros(joints)))
     for period in range(settling.max_periods):
         position, end = simulate(physics, state, motor, step)

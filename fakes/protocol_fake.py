@@ -124,7 +124,7 @@ class FakeSerial(SerialBase):
         here, such a read raises `serial.SerialException`; bytes already received can still be read.
         """
         bus = self._open_bus()
-        timeout = self.timeout
+        timeout = self._timeout
         if timeout is None and bus.on_the_way < size:
             raise serial.SerialException(
                 f"reading {size} bytes without a timeout would block forever: "

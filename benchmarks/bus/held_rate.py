@@ -6,10 +6,14 @@ The arm is held at rest with torque on, with the work of an experiment's stream:
 slow and status reads, checks, recording. `hil fake --pty` serves the servos in another process and takes as long for
 each byte as the wire. Both processes ask for real-time scheduling, each on a core of its own. But the kernel passes on
 the bytes of a pty in a thread of ordinary priority, and virtual machines stall: run it on a quiet machine only. The
-load is printed; `benchmarks/fixed_rate.py` shows how many deadlines are missed without a bus.
+load is printed. Two loops with the same deadlines and real-time settings, which run after each round, show what
+computer and pty alone miss: one only waits, one writes the bytes of an exchange and reads as many as its reply has,
+against a responder in C that takes as long for each byte as the wire, without driver, checks, slow reads or read-backs.
 
-missed: deadlines that were missed. lost: samples in which a reply is missing. late: 99 % and the largest of the times
-from a deadline to the write [ms]. took: median, 99 % and the largest round trip [ms].
+missed: deadlines that were missed. slow: those directly after an exchange that took longer than the wire needs and
+1 ms, so that what was missed is due to computer or pty. lost: samples in which a reply is missing. late: 99 % and the
+largest of the times from a deadline to the write [ms]. took: median, 99 % and the largest round trip [ms]. work: median
+of the time from a reply to the next wait, i.e. of recording and checks [us].
 """
 
 import argparse
@@ -18,6 +22,7 @@ import os
 import re
 import sys
 import tempfile
+import tty
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -26,10 +31,14 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 import numpy as np
 
+from benchmarks.bus.served_pty import responder_binary, served_pty
 from benchmarks.bus.stream_cycle import fake_pty
 from benchmarks.machine import machine
 from hil.config.schema import Config, load_config
 from hil.drivers.bus import ServoBus
+from hil.drivers.clock import WallClock
+from hil.drivers.packet import BROADCAST_ID, Instruction, encode
+from hil.drivers.rate import FixedRate
 from hil.errors import SafetyStop
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
@@ -40,6 +49,8 @@ from hil.setup.realtime import real_time
 CONFIGS = Path(__file__).parents[2] / "configs"
 SERVOS = ((1, 1), (2, 2), (3, 2), (4, 3), (5, 3), (6, 4))  # ID, joint
 RATE = 400.0
+BYTE_NS = 10_000
+SLOW_S = 1e-3
 SMALL_A = 0.02
 """Planned peak current for the checks; the arm is at rest all the time."""
 
@@ -70,10 +81,10 @@ def held(device: str, config: Config, seconds: float, folder: Path) -> dict[str,
         exchange = bus.prepared
         guard = Guard(config, [SMALL_A] * count, patience=exchange.patience, heard_instead=lambda: bus.heard_instead)
         model = ChainWatch(config, [SMALL_A] * count)
-        stopped = ""
+        stopped, worked = "", list[float]()
         with real_time(), bus.torque(config.safety.watchdog):
             try:
-                play(bus, guard, model, recorder, samples)
+                play(bus, guard, model, recorder, samples, worked)
             except SafetyStop as error:
                 stopped = str(error)
         rows = recorder.samples.copy()
@@ -86,16 +97,55 @@ def held(device: str, config: Config, seconds: float, folder: Path) -> dict[str,
         "wire_ms": round(1e3 * exchange.longest, 3),
         "samples": len(rows),
         "missed": int(is_missed.sum()),
+        "slow": _behind_slow_ones(rows, is_missed, exchange.longest + SLOW_S),
         "lost": int(sent["missing"].any(axis=1).sum()),
         "late_ms": [round(float(each), 3) for each in (np.quantile(late, 0.99), late.max())],
         "took_ms": [round(float(each), 3) for each in (*np.quantile(took, (0.5, 0.99)), took.max())],
+        "work_us": round(1e6 * float(np.median(worked))),
         "load": round(os.getloadavg()[0], 1),
         "stopped": stopped,
     }
 
 
-def play(bus: ServoBus, guard: Guard, model: ChainWatch, recorder: Recorder, samples: int) -> None:
-    """The work of `hil.experiment.stream` for samples at rest."""
+def _behind_slow_ones(rows: Any, is_missed: Any, slow_s: float) -> int:
+    """Number of deadlines missed in a row directly after an exchange that took longer than `slow_s` [s]."""
+    count, is_slow = 0, False
+    for took, missed_it in zip(rows["time_after_read"] - rows["time_before_write"], is_missed, strict=True):
+        if missed_it:
+            count += is_slow
+        else:
+            is_slow = took > slow_s
+    return count
+
+
+def bare(seconds: float, device: str | None, *, fast: bool) -> int:
+    """Return how many deadlines are missed with nothing to do, or with the bytes of an exchange over a terminal."""
+    ids = bytes(number for number, _ in SERVOS)
+    goals = bytes((102, 0, 2, 0)) + b"".join(bytes((number, 0, 0)) for number in ids)
+    read = Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ
+    request = encode(BROADCAST_ID, Instruction.SYNC_WRITE, goals)
+    request += encode(BROADCAST_ID, read, bytes((126, 0, 10, 0)) + ids)
+    reply_size = 8 + 14 * len(ids) if fast else 21 * len(ids)
+    with ExitStack() as stack:
+        line = -1
+        if device is not None:
+            line = os.open(device, os.O_RDWR | os.O_NOCTTY)
+            stack.callback(os.close, line)
+            tty.setraw(line)
+        stack.enter_context(real_time())
+        ticks = FixedRate(WallClock(), RATE)
+        for _ in range(round(seconds * RATE)):
+            if ticks.wait().missed or line < 0:
+                continue
+            os.write(line, request)
+            left = reply_size
+            while left:
+                left -= len(os.read(line, left))
+        return ticks.missed
+
+
+def play(bus: ServoBus, guard: Guard, model: ChainWatch, recorder: Recorder, samples: int, worked: list[float]) -> None:
+    """The work of `hil.experiment.stream` for samples at rest. worked: receives what it takes after each reply [s]."""
     pace, goal, sent_at = Pace(bus, RATE, guard), [0.0] * len(bus.joints), None
     for _ in range(samples):
         deadline, now, late = pace.wait()
@@ -109,6 +159,7 @@ def play(bus: ServoBus, guard: Guard, model: ChainWatch, recorder: Recorder, sam
         if state.status is not None and guard.wants_status:
             bus.read_status_next()
         model.look(state)
+        worked.append(bus.port.clock.now() - state.time_after_read)
 
 
 def configured(path: Path, *, fast: bool) -> Config:
@@ -121,7 +172,15 @@ def measure(seconds: float, rounds: int, reads: tuple[bool, ...]) -> list[dict[s
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         path = six_servos(folder)
         device = stack.enter_context(fake_pty(path, real_time=True))
-        return [held(device, configured(path, fast=fast), seconds, folder) for _ in range(rounds) for fast in reads]
+        binary = stack.enter_context(responder_binary())
+        figures = []
+        for _ in range(rounds):
+            for fast in reads:
+                figures.append(held(device, configured(path, fast=fast), seconds, folder))
+                figures[-1]["nothing_missed"] = bare(seconds, None, fast=fast)
+                with served_pty(binary, BYTE_NS, real_time=True) as terminal:
+                    figures[-1]["bytes_missed"] = bare(seconds, terminal, fast=fast)
+        return figures
 
 
 def main() -> None:
@@ -142,8 +201,9 @@ def main() -> None:
         read = "Fast Sync Read" if each["fast"] else "Sync Read"
         print(
             f"{read:15s} longest exchange on the wire {each['wire_ms']:.2f} ms: missed {each['missed']} of "
-            f"{each['samples']}, lost {each['lost']}, late {each['late_ms']}, took {each['took_ms']}, "
-            f"load {each['load']}{each['stopped'] and '; stopped: '}{each['stopped']}"
+            f"{each['samples']} ({each['slow']} slow), by a loop without bus {each['nothing_missed']}, by one of bytes "
+            f"{each['bytes_missed']}; lost {each['lost']}, late {each['late_ms']}, took {each['took_ms']}, "
+            f"work {each['work_us']}, load {each['load']}{each['stopped'] and '; stopped: '}{each['stopped']}"
         )
 
 

@@ -7,10 +7,19 @@ import sys
 import tempfile
 import tty
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from hil.setup.realtime import PRIORITY
+
 SOURCE = Path(__file__).with_name("responder.c")
+
+
+def prioritise(process: int) -> None:
+    """Give a process priority over ordinary programs, and the first core, if that is permitted."""
+    with suppress(OSError):
+        os.sched_setscheduler(process, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setaffinity(process, {min(os.sched_getaffinity(0))})
 
 
 @contextmanager
@@ -26,12 +35,17 @@ def responder_binary() -> Iterator[Path]:
 
 
 @contextmanager
-def served_pty(binary: Path, byte_ns: int) -> Iterator[str]:
-    """Name of a pty whose far end is served by the responder; byte_ns: wire time per byte [ns]."""
+def served_pty(binary: Path, byte_ns: int, *, real_time: bool = False) -> Iterator[str]:
+    """Name of a pty whose far end is served by the responder.
+
+    byte_ns: wire time per byte [ns]. real_time: whether to give the responder priority over ordinary programs.
+    """
     master, slave = os.openpty()
     tty.setraw(slave)
     server = subprocess.Popen([binary, "serve", str(master), str(byte_ns)], pass_fds=[master])
     os.close(master)
+    if real_time:
+        prioritise(server.pid)
     try:
         # Keep the slave open here, so that the responder survives a client that closes its own.
         yield os.ttyname(slave)

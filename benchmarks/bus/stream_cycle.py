@@ -16,20 +16,20 @@ rustypot is optional (`pip install ".[bench]"`).
 
 import argparse
 import json
-import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from benchmarks.bus.served_pty import prioritise
 from benchmarks.bus_cycle import Cycle, ours, sdk
 from benchmarks.machine import machine
 from hil.config.schema import Config, load_config
@@ -40,7 +40,7 @@ from hil.experiment.stop_request import StopRequest
 from hil.experiment.stream import Stream
 from hil.plan.plan import make_plan
 from hil.runs.recording import Phase, Recorder
-from hil.setup.realtime import PRIORITY, real_time
+from hil.setup.realtime import real_time
 
 CONFIG = Path(__file__).parents[2] / "configs" / "fake_two_link.toml"
 REST_S = 1.5
@@ -74,9 +74,7 @@ def fake_pty(config: Path, *, real_time: bool = False) -> Iterator[str]:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         if real_time:
-            with suppress(OSError):
-                os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
-                os.sched_setaffinity(process.pid, {min(os.sched_getaffinity(0))})
+            prioritise(process.pid)
         try:
             yield process.stdout.readline().strip()
         finally:

@@ -160,12 +160,15 @@ def driving_ms(config: Config, told: "Told", story: Story, undisturbed: Story) -
     for joint, (sent, heard) in enumerate(zip(told.sent, told.heard, strict=True)):
         record = undisturbed.record[:, joint]
         goal: Numbers = record["goal"]
-        most = DRIVES_SHARE * float(np.abs(goal[record["driven"]]).max(initial=1))
+        driven: NDArray[np.bool_] = record["driven"]
+        most = DRIVES_SHARE * float(np.abs(goal[driven]).max(initial=1))
         sent_at = np.array([each[0] for each in sent])
         moved = _visible_motion(sent_at, np.array(heard).reshape(-1, 4))
         along = config.joints[joint].direction * np.array([each[1] for each in sent]) * np.sign(moved)
         own = addressed(config, story.record, joint)
-        along *= own["torque"][np.clip(np.searchsorted(own["time"], sent_at) - 1, 0, own.size - 1)]
+        time: Numbers = own["time"]
+        has_torque: Numbers = own["torque"].astype(np.float64)
+        along *= has_torque[np.clip(np.searchsorted(time, sent_at) - 1, 0, own.size - 1)]
         begun = None
         for (when, _), drives in zip(sent, along > most, strict=True):
             if begun is not None:
@@ -370,7 +373,8 @@ def overruled_ms(config: Config, story: Story, told: "Told") -> float:
     longest = 0
     for joint in range(len(config.joints)):
         own = addressed(config, story.record, joint)
-        at = np.flatnonzero(told.disobeys(joint, time, own, 1.0 / config.experiment.rate) & own["driven"])
+        driven: NDArray[np.bool_] = own["driven"]
+        at = np.flatnonzero(told.disobeys(joint, time, own, 1.0 / config.experiment.rate) & driven)
         breaks = np.flatnonzero(np.diff(at) > GAP_MS)
         for start, end in zip(at[np.r_[0, breaks + 1]], at[np.r_[breaks, at.size - 1]], strict=True) if at.size else ():
             longest = max(longest, int(end - start) + 1)
@@ -473,7 +477,8 @@ class Told:
             return np.zeros(time.size, bool)
         when = np.array([each[0] for each in self.sent[joint]])
         goals = np.array([each[1] for each in self.sent[joint]])
-        done: Numbers = np.where(own["torque"], own["goal"], 0)
+        goal: Numbers = own["goal"]
+        done = np.where(own["torque"].astype(bool), goal, 0)
         tolerance = OBEYED * self._largest[joint] + 1
         # While a goal is in transit, the servo may still hold the previous one.
         latest = np.searchsorted(when, time, "right") - 1
@@ -521,8 +526,10 @@ def _same_plan(own: NDArray[Any], undisturbed: NDArray[Any]) -> int:
     Later a different plan is run: a disturbed period does not repeat the one before, so one more is needed.
     """
     goal: Numbers = undisturbed["goal"]
-    largest = float(np.abs(goal[undisturbed["driven"]]).max(initial=1))
-    other = np.abs(own["goal"] - goal) > OBEYED * largest
+    mine: Numbers = own["goal"]
+    driven: NDArray[np.bool_] = undisturbed["driven"]
+    largest = float(np.abs(goal[driven]).max(initial=1))
+    other = np.abs(mine - goal) > OBEYED * largest
     lasting = np.convolve(other, np.ones(LASTING_MS), "valid") > LASTING_MS - GAP_MS
     return int(np.argmax(lasting)) if lasting.any() else own.size
 

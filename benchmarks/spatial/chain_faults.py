@@ -184,7 +184,8 @@ def _judged(ready: Ready, drawn: Drawn, story: Story, readable: bool, changed: t
     reasons = reasons_of(config, drawn, story, ready.undisturbed, told)
     time, driven = record["time"][:, 0], np.asarray(record["driven"].any(axis=1))
     low, high = np.array([joint.position_limit for joint in config.joints]).T
-    moved = record["position"][driven] if driven.any() else record["position"][:1]
+    position: NDArray[np.float64] = record["position"]
+    moved = position[driven] if driven.any() else position[:1]
     unheard = bool(set(drawn.kinds) & UNHEARD)
     cut_ms = max(BOUND_MS, 1e3 * config.safety.watchdog + TRIP_MS) if unheard else BOUND_MS
     lower_ms = 1e3 * (longest_lowering(ready.path) + SETTLES_S)

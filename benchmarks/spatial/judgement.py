@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 import hil
 from hil.clearance.space import Space
@@ -72,7 +73,8 @@ def measured(config: Config, run: Path) -> dict[str, float]:
     seconds, nearest, excess = 0.0, np.inf, -np.inf
     for path in run.rglob("samples.npy"):
         samples = load_samples(path, len(config.joints))
-        q = samples["position"][np.isfinite(samples["position"]).all(axis=1)].T
+        position: NDArray[np.float64] = samples["position"]
+        q = position[np.isfinite(position).all(axis=1)].T
         seconds += float(samples["deadline"][-1] - samples["deadline"][0])
         away = q[:, ~space.lies(q)][:, ::4]
         if away.shape[1]:

@@ -168,11 +168,16 @@ class ReadBack:
         goal is then not at fault.
         """
         of_modes = self.is_of_modes
+        self.overdue_at = now + OVERDUE_S
+        if not of_modes and self._are_latest(servos, sent[-1]):
+            self._looks += not collided
+            self.is_unexpected = False
+            self._choose_next(now)
+            return None
         is_nearly_sure = False
         intact = [_intact(answer) for answer in servos]
         # Answers about goals begin with ERR and Bus Watchdog.
         self.watchdogs = [] if of_modes else [(at, each[1]) for at, each in enumerate(intact) if each is not None]
-        self.overdue_at = now + OVERDUE_S
         foreign = self._foreign(intact, sent, collided=collided)
         if of_modes and not foreign and None not in intact:
             self.modes_seen_at = now
@@ -196,6 +201,16 @@ class ReadBack:
         if not is_nearly_sure:
             self._choose_next(now)
         return None
+
+    def _are_latest(self, servos: Sequence[Answer], goals: Sequence[int]) -> bool:
+        """Return whether all servos hold their latest goals and report no error, as usual."""
+        watchdogs: list[tuple[int, int]] = []
+        for answer, goal in zip(servos, goals, strict=True):
+            if not answer or answer[0] or answer[-1] != goal:
+                return False
+            watchdogs.append((len(watchdogs), answer[1]))
+        self.watchdogs = watchdogs
+        return True
 
     def _choose_next(self, now: float) -> None:
         """Choose what to read next; a foreign goal may be the first sign of a mode change, which resets the goal."""

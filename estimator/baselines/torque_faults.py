@@ -136,10 +136,7 @@ def suspect_late(recordings: Sequence[Recording]) -> Late | None:
 
 
 def suspect_uneven(recordings: Sequence[Recording]) -> Uneven | None:
-    """Return the joints whose best delays differ, judging each joint by its own residual.
-
-    `suspect_late` compares the residuals of the worst joint, which friction may dominate; this evidence is weaker.
-    """
+    """Return the joints whose best delays differ, judging each joint by its own residual."""
     joints = recordings[0].joints
     if joints < 2 or sum(each.time.size for each in recordings) > MOST_SAMPLES:
         return None

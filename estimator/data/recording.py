@@ -85,16 +85,17 @@ class Recording:
                 row[~valid] = np.interp(self.time[~valid], self.time[valid], row[valid])
         return position
 
-    def mean_torque(self, edges: Array, delay: float) -> Array:
+    def mean_torque(self, edges: Array, delay: float | Array) -> Array:
         """Return the mean torque between neighbouring `edges` (n,) [s], with a delay of `delay` [s].
 
-        The result has the shape (joints, n - 1) [N m].
+        Returns (joints, n - 1) [N m]. delay: one value or one per joint.
         """
         at = self.time - self.command_to_sample
-        wanted = edges - delay
+        delays = np.broadcast_to(delay, self.joints)
         rise = np.diff(at)
         means = np.empty((self.joints, len(edges) - 1))
         for joint, torque in enumerate(self.torque):
+            wanted = edges - delays[joint]
             if self.between == "held":
                 total = np.concatenate(([0.0], np.cumsum(torque[:-1] * rise)))
                 k = np.clip(np.searchsorted(at, wanted, side="right") - 1, 0, at.size - 1)

@@ -107,35 +107,39 @@ def _slice(inside: Mask) -> slice:
     return slice(int(at[0]), int(at[-1]) + 1)
 
 
-def grid_torque(recording: Recording, grid: Grid, delay: float, lag: float) -> Array:
-    """Return the mean motor torque over each grid step (joints, steps) [N m], delayed by `delay` [s] and with the lag
-    `lag` [s].
+def grid_torque(recording: Recording, grid: Grid, delays: Array, lags: Array) -> Array:
+    """Return the mean motor torque over each grid step (joints, steps) [N m].
+
+    delays, lags: those of each joint (joints,) [s].
     """
-    torque = recording.mean_torque(grid.edges, delay)
+    torque = recording.mean_torque(grid.edges, delays)
+    return np.stack([_lagging(row, grid.step, float(lag)) for row, lag in zip(torque, lags, strict=True)])
+
+
+def _lagging(torque: Array, step: float, lag: float) -> Array:
     if lag <= 0.0:
         return torque
     from scipy.signal import lfilter
 
     # lag y' = u - y with constant u during a step: the end value and the mean of y are exact.
-    a = np.exp(-grid.step / lag)
-    start = torque[:, :1]
-    end, _ = lfilter([1.0 - a], [1.0, -a], torque, axis=1, zi=a * start)
-    before = np.concatenate((start, end[:, :-1]), axis=1)
-    mean: Array = torque - lag / grid.step * (end - before)
+    a = np.exp(-step / lag)
+    end, _ = lfilter([1.0 - a], [1.0, -a], torque, zi=a * torque[:1])
+    before = np.concatenate((torque[:1], end[:-1]))
+    mean: Array = torque - lag / step * (end - before)
     return mean
 
 
-def grid_torque_slopes(recording: Recording, grid: Grid, delay: float, lag: float) -> Array:
-    """Differentiate `grid_torque` with respect to delay and lag (2, joints, steps) [N m/s], by central differences."""
+def grid_torque_slopes(recording: Recording, grid: Grid, delays: Array, lags: Array) -> Array:
+    """Differentiate `grid_torque` with respect to each joint's delay and lag (2, joints, steps) [N m/s], by central
+    differences. Without a lag, both are the same, as for a tiny lag.
+    """
 
-    def at(delay: float, lag: float) -> Array:
-        return grid_torque(recording, grid, delay, lag)
+    def by(delay: Array | float, lag: Array | float) -> Array:
+        less, more = (grid_torque(recording, grid, delays + s * delay, lags + s * lag) for s in (-1.0, 1.0))
+        return np.asarray((more - less) / (2.0 * np.reshape(delay + lag, (-1, 1))))
 
-    late = (at(delay + DIFFERENCE, lag) - at(delay - DIFFERENCE, lag)) / (2.0 * DIFFERENCE)
-    if lag <= 0.0:
-        return np.stack((late, np.zeros_like(late)))
-    change = min(DIFFERENCE, 0.1 * lag)
-    return np.stack((late, (at(delay, lag + change) - at(delay, lag - change)) / (2.0 * change)))
+    late = by(DIFFERENCE, 0.0)
+    return np.stack((late, by(0.0, np.minimum(DIFFERENCE, 0.1 * lags)) if np.all(lags > 0.0) else late))
 
 
 def _cubic(place: Array, steps: int) -> tuple[Indices, Array]:

@@ -6,11 +6,9 @@ identification techniques for o.d.e.", in Deuflhard and Hairer (eds.), Numerical
 The segments are not joined, since effects that a rigid arm does not have, such as backlash and flexing, may change the
 state between them.
 
-Short segments are fitted first, since they converge even from a poor initial guess; a subset of them suffices to get
-close to the minimum. Longer segments then refine the result, first with coarse integration steps. A segment whose
-residual is larger than usual is downweighted accordingly. An example is a segment in which a joint stuck, which no
-smooth friction law reproduces; with equal weights, such segments would dominate. The typical size of small terms
-(`Term.spread`) serves as a prior, weighted relative to the residual.
+Short segments are fitted first, since they converge even from a poor initial guess. Longer segments then refine the
+result, first with coarse integration steps. A segment whose
+residual is larger than usual is downweighted accordingly. `Term.spread` serves as a prior.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -119,7 +117,7 @@ class Shooting:
         self._scales = (torque, velocity)
         self._model = model
         self._trust = np.ones((len(self.segments), model.joints))
-        self._driven: dict[tuple[float, float], list[tuple[Array, Array]]] = {}
+        self._driven: dict[tuple[float, ...], list[tuple[Array, Array]]] = {}
 
     def coordinates(self, base: Mapping[str, float]) -> Coordinates:
         """Return the parameters' coordinates; `base`: approximate base parameters by name [SI]."""
@@ -271,11 +269,13 @@ class Shooting:
 
     def _torque(self, segment: RecordingSegment, physics: Physics) -> tuple[Array, Array]:
         """Return the motor torque over a segment's grid steps (joints, steps) and its slopes (2, joints, steps)."""
-        key = (physics.delay, physics.lag)
+        joints = self._model.joints
+        times = physics.delays[:joints], physics.lags[:joints]
+        key = tuple(np.concatenate(times).tolist())
         driven = self._driven.get(key)
         if driven is None:
             pairs = list(zip(self._recordings, self._grids, strict=True))
-            driven = [(grid_torque(*pair, *key), grid_torque_slopes(*pair, *key)) for pair in pairs]
+            driven = [(grid_torque(*pair, *times), grid_torque_slopes(*pair, *times)) for pair in pairs]
             if len(self._driven) > 8:
                 self._driven.clear()
             self._driven[key] = driven
@@ -298,8 +298,6 @@ def estimate_by_shooting(
 ) -> ShootingEstimate:
     """Estimate parameters by maximum likelihood over all `recordings`, cut into segments.
 
-    The result is deterministic.
-
     Args:
         recordings: recordings of one arm.
         model: the model to fit.
@@ -310,7 +308,7 @@ def estimate_by_shooting(
             every start. They can only be determined with gravity.
         of: which segments of each recording to fit; the others are left for validation.
         near: estimate with another model or other segments of the same recordings, used as the only initial guess.
-        options: tolerances and limits.
+        options: tolerances.
 
     Raises:
         RecordingError: if no segment is long enough.
@@ -377,7 +375,8 @@ def _fit(
 ) -> Segmented:
     residual, derivative = partial(problem.residual, coordinates), partial(problem.derivative, coordinates)
     expected = problem.expected(coordinates, shared, own)
-    return minimise_segmented(residual, derivative, shared, own, ftol, options.minimiser, expected)
+    moved = coordinates.moved_in_proportion
+    return minimise_segmented(residual, derivative, shared, own, ftol, options.minimiser, expected, moved)
 
 
 def _estimate(

@@ -23,6 +23,7 @@ TYPICAL_CABLE = 0.15  # stiffness of a stiff cable, as a fraction of the RMS tor
 TYPICAL_COGGING = 0.01  # typical cogging, as a fraction of the RMS torque; only a scale
 LEAST_RISE = 0.05  # Stribeck rise below which nothing is disguised
 TYPICAL_SQUARE = 1.0 / 3.0  # mean square of a joint's speed, relative to that of its highest; only a guess
+MOST_DECREASE = 0.8  # of a base parameter in one step, relative to itself
 TYPICAL_BEND = 0.01  # rad: typical presliding deflection; only a scale
 
 
@@ -71,6 +72,22 @@ class Coordinates:
         widths = np.flatnonzero(self._floors)
         least = self.options.min_width * self._floors[widths]
         y[widths] = np.log(np.maximum(np.exp(x[widths]) * (1.0 + step[widths]), least))
+        return y
+
+    def moved_in_proportion(self, x: Array, step: Array) -> Array:
+        """Return the point that `step` (coordinates,) reaches from `x`; both arrays may end with other coordinates.
+
+        Base parameters themselves change in proportion: valleys of undetermined sums of inertias are straight in these.
+        """
+        y, count = x + step, len(self.names)
+        for index, term in enumerate(map(term_of, self.names)):
+            if term.part == "base" and term.range == "positive":
+                y[index] = x[index] + np.log1p(max(step[index], -MOST_DECREASE))
+        value, there, slope = self.values(x[:count]), self.values(y[:count]), self.slopes(x[:count])
+        for share, first, second in self._shares:
+            part = (value[share] + slope[share] @ step[:count]) / np.sqrt(there[first] * there[second])
+            if abs(part) < self.options.max_initial_share:
+                y[share] = np.arctanh(part)
         return y
 
     def limit(self, x: Array, least: Array, most: Array, max_relative_decrease: float) -> None:

@@ -2,7 +2,7 @@
 
 A segment's own unknowns only affect its own residuals, so the normal equations have an arrowhead structure: each
 segment's block is eliminated separately (Schur complement), and the corresponding columns of the Jacobian are computed
-for all segments at once. Hundreds of initial states cost as much as four.
+for all segments at once.
 """
 
 from collections.abc import Callable, Sequence
@@ -41,11 +41,7 @@ class Expected:
     precision: Array
     """Inverse variances times `weight` (shared,), 0 without a prior."""
     weight: float = 1.0
-    """Mean square of the residual in units of the noise.
-
-    If the residual is larger than the noise, the data carry correspondingly less information, so the prior is weighted
-    by this factor.
-    """
+    """Mean square of the residual in units of the noise."""
 
     @classmethod
     def nothing(cls, size: int) -> "Expected":
@@ -72,6 +68,8 @@ class Segmented:
     scores: Array
     """Gradient of each segment with respect to the shared coordinates, with its own eliminated (segments, shared)."""
     iterations: int
+    variance: float
+    """Sum of squares per degree of freedom."""
     expected: Expected | None = None
     """The prior's contribution to `information` (shared, shared)."""
 
@@ -83,6 +81,8 @@ class Segmented:
         times the number of coordinates, correlations cannot be estimated; then a single factor scales the covariance
         for white noise. The covariance is infinite for coordinates that can change, alone or together, without
         affecting the residual.
+
+        Scores at the minimum are smaller than at the true values, so no variance is less than for white residuals.
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.
@@ -100,6 +100,8 @@ class Segmented:
             if self.expected is not None:
                 meat += self.expected.weight * np.diag(self.expected.precision)
             covariance = bread @ meat @ bread
+        wider = np.maximum(np.sqrt(self.variance * np.diag(bread) / np.maximum(np.diag(covariance), 1e-300)), 1.0)
+        covariance *= np.outer(wider, wider)
         if groups is not None and np.unique(groups).size > 1:
             together = np.stack([self.scores[groups == group].sum(axis=0) for group in np.unique(groups)])
             fewer = len(together) / (len(together) - 1)
@@ -163,10 +165,11 @@ def minimise_segmented(
     ftol: float,
     options: SegmentedMinimiserOptions = DEFAULTS,
     expected: Expected | None = None,
+    move: Callable[[Array, Array], Array] = np.add,
 ) -> Segmented:
     """Minimise the sum of |residual|^2 over all segments by Levenberg-Marquardt.
 
-    `residual` and `derivative` are called from several threads; the result does not depend on the number of threads.
+    `residual` and `derivative` are called from several threads, whose number does not change the result.
 
     Args:
         residual: returns the residuals of a segment.
@@ -176,6 +179,7 @@ def minimise_segmented(
         ftol: stop when the relative decrease of a step is below this.
         options: limits of the iteration.
         expected: prior on the shared coordinates.
+        move: returns the shared coordinates that a step from others reaches.
 
     Raises:
         ConvergenceError: if the simulation diverges, or if the relative decrease still exceeds `options.unfinished`
@@ -195,7 +199,8 @@ def minimise_segmented(
             blocks = _blocks(derivative, shared, own, threads)
             gained = 0.0
             while damping < options.max_damping:
-                there = _stepped(blocks, prior, shared, own, damping, options.max_step)
+                step, own_there = _stepped(blocks, prior, shared, own, damping, options.max_step)
+                there = move(shared, step), own_there
                 rows_there = _residuals(residual, *there, threads)
                 gained = cost - _cost(rows_there) - prior.cost(there[0])
                 if gained > 0.0:
@@ -208,7 +213,9 @@ def minimise_segmented(
                 blocks = _blocks(derivative, shared, own, threads)
                 information, scores, _, _ = blocks.reduced(0.0)
                 information = information + np.diag(prior.precision)
-                return Segmented(shared, own, cost, information, scores, iteration, prior)
+                freedom = sum(map(np.count_nonzero, rows)) - shared.size - own.size  # residuals of 0 are missing
+                variance = _cost(rows) / max(freedom, 1)
+                return Segmented(shared, own, cost, information, scores, iteration, variance, prior)
     raise ConvergenceError(
         f"after {options.max_iterations} iterations the sum of squares, {cost:.4g}, still falls by {gained:.2g} per "
         "iteration: try a simpler friction model or shorter segments"
@@ -251,4 +258,4 @@ def _stepped(
     step = -linalg.lstsq(matrix, gradient / scale, rcond=1e-13)[0] / scale
     step = np.clip(step, -max_step, max_step)
     own_step = -known - np.einsum("sij,j->si", solve, step)
-    return shared + step, own + np.clip(own_step, -max_step, max_step)
+    return step, own + np.clip(own_step, -max_step, max_step)

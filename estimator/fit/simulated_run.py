@@ -63,7 +63,7 @@ class SimulatedRun:
         """Return the simulated encoder angles (joints, samples) [rad] without derivatives; see `pieces`."""
         samples = round(horizon * self.command.shape[1])
         of = self.command, self.rate, self.command_to_sample, self.steps
-        torque = motor_torque(*of, delay=physics.delay, lag=physics.lags)[:, :samples]
+        torque = motor_torque(*of, delay=physics.delays, lag=physics.lags)[:, :samples]
         springs = None
         if tracking_stiffness is not None:
             springs = tracking_stiffness, self._spring_ends(physics)[:, :samples]
@@ -100,7 +100,7 @@ class SimulatedRun:
         step = 1.0 / (self.rate * self.steps)
         motion = sensitive(physics)(physics, start, causes, step, self.max_substeps, tracking_stiffness)
         of = self.command, self.rate, self.command_to_sample, self.steps
-        torque, slopes = torque_and_slopes(*of, delay=physics.delay, lag=physics.lags)
+        torque, slopes = torque_and_slopes(*of, delay=physics.delays, lag=physics.lags)
         samples = round(horizon * samples)
         for first in range(0, samples, PIECE):
             part = slice(first, min(first + PIECE, samples))

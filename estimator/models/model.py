@@ -43,13 +43,13 @@ class Model:
         zeros: adds zero errors of the encoders, true angle = measured angle + zero; the first joint's is observable
             only under gravity.
         torque_scale: multiplies the second joint's torque by the ratio of true to assumed torque constant relative to
-            the first joint's. A single unknown torque constant scales all parameters; the ratio of two is identifiable,
-            since both joints move the same masses.
+            the first joint's.
         saturation: reduces the torque by the fraction saturation torque^2.
         cable: adds cable_stiffness q to the load torque (the angle at which the cable is slack is part of the offset).
         encoder: a joint at q is measured to be at q + encoder_sin_once sin q + encoder_cos_once cos q +
             encoder_sin_twice sin 2q + encoder_cos_twice cos 2q.
-        lags: the second joint's torque has the lag lag + lag_difference.
+        lags: the second joint's torque has the lag lag + lag_difference, or without a lag the delay
+            delay + lag_difference.
 
     Raises ModelError for other names, for other than one or two joints, and for torque_scale with one joint.
     """

@@ -51,7 +51,7 @@ class Physics:
     encoder: Array = field(default_factory=lambda: np.zeros((2, len(ENCODER))))
     """Encoder errors by joint, in the order of ENCODER (2, terms) [rad]."""
     lag_difference: float = 0.0
-    """Lag of the second joint's torque minus the lag of the first joint's torque [s]."""
+    """Lag (without a lag, delay) of the second joint's torque minus that of the first joint's torque [s]."""
 
     @classmethod
     def of(cls, parameters: Mapping[str, float]) -> "Physics":
@@ -75,15 +75,19 @@ class Physics:
         return physics
 
     @property
+    def delays(self) -> Array:
+        """Pure delay of each joint's torque (2,) [s]."""
+        return np.array([self.delay, self.delay + (0.0 if self.lag > 0.0 else self.lag_difference)])
+
+    @property
     def lags(self) -> Array:
         """Time constant of each joint's lag (2,) [s]; joint 2's stays above 0 if there is any lag."""
-        other = max(self.lag + self.lag_difference, LEAST_LAG if self.lag_difference else 0.0)
-        return np.array([self.lag, other])
+        return np.array([self.lag, max(self.lag + self.lag_difference, LEAST_LAG) if self.lag > 0.0 else 0.0])
 
     @property
     def late(self) -> Array:
         """Total delay of each joint's torque: pure delay plus lag (2,) [s]."""
-        late: Array = self.lags + max(self.delay, 0.0)
+        late: Array = self.lags + np.maximum(self.delays, 0.0)
         return late
 
     def crossing_times(self) -> tuple[float, float]:

@@ -66,7 +66,7 @@ OPTIONS: dict[Option, str] = {
     "saturation": "torque saturation: torque falls short of large commands",
     "cable": "a cable or spring that pulls the joint towards one angle",
     "encoder": "encoder errors that repeat once and twice per turn",
-    "lags": "different lags of the two joints' current loops",
+    "lags": "different lags or delays of the two joints' torques",
 }
 """Optional parts of a model and their descriptions; also keys of `[model]`."""
 BEYOND_SPEEDS = 3.0
@@ -278,7 +278,7 @@ _DECLARED = (
     Term(
         "lag_difference",
         "s",
-        "lag of the joint's current loop relative to joint 1's",
+        "lag of the joint's torque relative to joint 1's; without lags, of its delay",
         part="lags",
         first_joint=2,
         range="any",

@@ -5,7 +5,7 @@ model lacks. One simulation with derivatives with respect to all of them yields 
 each term would bring (C. R. Rao's score test, Proc. Cambridge Phil. Soc. 44 (1948) 50) and the resulting changes of the
 fitted parameters. Terms that cannot be ruled out, such as an encoder's zero or torque saturation, therefore widen the
 standard errors even if the motion does not reveal them: they are "considered" (S. F. Schmidt, Advances in Control
-Systems 3 (1966) 293), with their typical size as the prior, to which the information from the motion is added.
+Systems 3 (1966) 293), with their typical size as the prior.
 """
 
 from collections.abc import Mapping, Sequence
@@ -267,9 +267,7 @@ def richer_models(model: Model) -> dict[str, Model]:
 
 
 def _may_be(option: str, model: Model) -> bool:
-    if option == "lags":
-        return model.joints == 2 and model.drive != "delay"
-    return option != "torque_scale" or model.joints == 2
+    return option not in ("torque_scale", "lags") or model.joints == 2
 
 
 def _started(name: str, change: float, known: Mapping[str, float]) -> float:

@@ -44,7 +44,7 @@ def _from_before(physics: Physics, other: SettledPeriod, before: Array) -> Array
 def _free(physics: Physics, other: SettledPeriod, state: Array) -> list[Array]:
     steps = steps_per_sample(other.rate)
     of = other.torque, other.rate, other.command_to_sample, steps
-    torque = motor_torque(*of, delay=physics.delay, lag=physics.lags)
+    torque = motor_torque(*of, delay=physics.delays, lag=physics.lags)
     periods = []
     for _ in range(1 + other.periods):
         position, state = simulate(physics, state, torque, 1.0 / (other.rate * steps))

@@ -83,7 +83,7 @@ def settled_prediction_error(period: SettledPeriod, parameters: Mapping[str, flo
     steps = steps_per_sample(period.rate)
     step = 1.0 / (period.rate * steps)
     motor = motor_torque(
-        period.torque, period.rate, period.command_to_sample, steps, delay=physics.delay, lag=physics.lags
+        period.torque, period.rate, period.command_to_sample, steps, delay=physics.delays, lag=physics.lags
     )
     filled = period.filled()
     state = np.stack((filled.mean(axis=1), np.zeros(period.joints), np.zeros(period.joints)))

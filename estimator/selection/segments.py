@@ -14,7 +14,7 @@ from hil.estimator.models.terms import Option, term_of
 from hil.estimator.options import ShootingOptions
 from hil.estimator.selection.candidates import Candidate, Linearised, colour, ranked, richer_models, unruled, widened
 
-NOT_HERE: tuple[Option, ...] = ("zeros", "encoder", "lags", "ripple", "cogging")
+NOT_HERE: tuple[Option, ...] = ("zeros", "encoder", "ripple", "cogging")
 """Options that multiple shooting replaces (by the zeros of each recording) or does not support."""
 COARSE = ShootingOptions().coarse_step
 KNOWN_SHARE = 1.0 / 3.0  # fraction of a held-out segment that determines its initial state; the rest is predicted
@@ -84,8 +84,8 @@ def held_out_errors(
     """Return the RMS error of predicted segments relative to the motion's RMS, per joint (joints,), and its median.
 
     The initial state of a segment is estimated from its first third; the rest is predicted from the torque alone. The
-    median is taken over segments, since the error of a segment in which the arm tumbles can be arbitrarily large. A
-    prediction that diverges counts as wrong by half a turn.
+    median is taken over segments, since the error can be huge if the arm tumbles. A prediction that diverges counts as
+    wrong by half a turn.
     """
     problem = _posed(recordings, estimate, of)
     values, joints = estimate.parameters, estimate.model.joints

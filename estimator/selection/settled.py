@@ -132,7 +132,7 @@ class Selection:
         """Extend `model` to the richest one that the data support; raises ConvergenceError."""
         unknown: set[Option] = {"zeros"}
         if model.joints == 2:
-            unknown |= {"torque_scale"} if model.drive == "delay" else {"torque_scale", "lags"}
+            unknown |= {"torque_scale", "lags"}
         smooth = replace(model, friction=FRICTIONS[-1]).having(*unknown, *SMOOTH)
         self._begin(model.having(*unknown), coarse=True)
         self._begin(smooth, coarse=True)

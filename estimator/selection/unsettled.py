@@ -1,9 +1,8 @@
 """Friction model selection for recordings without a settled period.
 
-The procedure is the same as for settled periods (`hil.estimator.selection.settled`). Stribeck friction is fitted first.
+As for settled periods (`hil.estimator.selection.settled`), Stribeck friction is fitted first.
 If it does not explain the motion, or if score tests find a significant term, all other smooth terms are added at once,
-with their typical sizes as a prior; then insignificant terms are removed. Every fit but the first starts from an
-earlier result.
+with their typical sizes as a prior; then insignificant terms are removed.
 
 If the motion is explained down to the noise, the likelihood decides. Otherwise a richer model may merely compensate for
 another missing term. Then every other segment of each recording is fitted and the rest are predicted, also by models
@@ -46,9 +45,7 @@ class SegmentTrial:
     held_out: Array | None
     """RMS error relative to the motion's RMS (joints,); None if the fit did not converge."""
     score: float
-    """Median of the segments' relative errors over all joints, since the error of a segment in which the arm tumbles
-    can be huge.
-    """
+    """Median of the segments' relative errors over all joints."""
     seconds: float
 
 
@@ -94,7 +91,7 @@ def choose_by_shooting(
             "a specific model"
         )
     joints = recordings[0].joints
-    unknown: tuple[Option, ...] = ("torque_scale",) if joints == 2 else ()
+    unknown: tuple[Option, ...] = ("torque_scale", "lags") if joints == 2 else ()
     search = _Search(recordings, start, length, zeros, options, "torque_scale" if torque_scale else None)
     plain = search.fit(Model(joints, "stribeck", drive, unknown), options=QUICK)
     if plain is None:

@@ -103,8 +103,8 @@ class Stabilised:
 
 
 def _earlier(physics: Physics, command_to_sample: float) -> Physics:
-    """Return the physics with the lag reduced by `command_to_sample` [s], the time by which commands act earlier."""
-    return replace(physics, lag=max(physics.lag - command_to_sample, 1e-5))
+    """Return the physics with the delay added to the lag, less `command_to_sample` [s]: commands act earlier."""
+    return replace(physics, lag=max(physics.lag + physics.delay - command_to_sample, 1e-5), delay=0.0)
 
 
 def resting(pose: Array) -> Array:

@@ -1,8 +1,4 @@
-"""Motor torque from the commanded torque: held, delayed, and averaged over each integration step.
-
-The code is compiled because the likelihood needs it in every simulation; in numpy, it would take up a third of the
-simulation time.
-"""
+"""Motor torque from the commanded torque: held, delayed, and averaged over each integration step."""
 
 import math
 from collections.abc import Callable
@@ -15,7 +11,7 @@ from hil.estimator.compiled import compiled, inner
 
 
 def motor_torque(
-    command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float | Array
+    command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float | Array, lag: float | Array
 ) -> Array:
     """Return the mean motor torque over each of `steps` equal steps after each sample (joints, samples, steps) [N m].
 
@@ -26,17 +22,18 @@ def motor_torque(
         rate: sampling rate [1/s].
         command_to_sample: time from command k's effect to sample k [s].
         steps: integration steps per sample.
-        delay: delay of the torque [s].
-        lag: time constant of a subsequent first-order lag [s], one value or one per joint.
+        delay: delay of the torque [s], one value or one per joint.
+        lag: time constant of a subsequent first-order lag [s], likewise.
     """
     return _torque(command, rate, command_to_sample, steps, delay, lag)[0]
 
 
 def torque_and_slopes(
-    command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float, lag: float | Array
+    command: Array, rate: float, command_to_sample: float, steps: int, *, delay: float | Array, lag: float | Array
 ) -> tuple[Array, Array]:
     """Return `motor_torque` and its derivatives (2, joints, samples, steps) [N m/s] with respect to delay and lag.
 
+    Without a lag, both are the same, as for a tiny lag.
     If a command changes exactly at the edge of a step and there is no lag, the derivative with respect to delay is
     one-sided, towards smaller delays.
     """
@@ -45,16 +42,16 @@ def torque_and_slopes(
 
 
 def _torque(
-    command: Array, rate: float, command_to_sample: float, steps: int, delay: float, lag: float | Array
+    command: Array, rate: float, command_to_sample: float, steps: int, delay: float | Array, lag: float | Array
 ) -> tuple[Array, Array, Array]:
     """Return the mean torque over each step, and its derivatives with respect to delay and lag."""
     joints, samples = command.shape
     total = np.zeros((joints, samples + 1))
     np.cumsum(command, axis=1, out=total[:, 1:])
-    edges = np.arange(steps + 1) / (steps * rate) + command_to_sample - delay
+    delays, lags = (np.resize(np.asarray(each, dtype=np.float64), joints) for each in (delay, lag))
+    edges = np.arange(steps + 1) / (steps * rate) + command_to_sample - delays[:, None]
     shifts = np.floor(edges * rate)
     phases = edges - shifts / rate
-    lags = np.asarray(lag, dtype=np.float64)[:joints] if np.ndim(lag) else np.full(joints, lag)
     fading = np.where(lags[:, None] > 0.0, np.exp(-phases / np.where(lags > 0.0, lags, 1.0)[:, None]), 0.0)
     torque, late, change = (np.empty((joints, samples, steps)) for _ in range(3))
     lagging = np.empty((2, samples))
@@ -63,7 +60,7 @@ def _torque(
             np.ascontiguousarray(command),
             total,
             rate,
-            np.ascontiguousarray(lags),
+            lags,
             shifts.astype(np.int64),
             phases,
             fading,
@@ -73,8 +70,9 @@ def _torque(
     return torque, late, change
 
 
-# Compiled code takes its arguments by position. Edge i of each sample's steps lies `phases[i]` [s] after the command
-# that is `shifts[i]` commands later; `fading[j, i]` is the fraction of the lag's deviation that remains by then.
+# Compiled code takes its arguments by position. For joint j, edge i of each sample's steps lies `phases[j, i]` [s]
+# after the command that is `shifts[j, i]` commands later; `fading[j, i]` is the fraction of the lag's deviation that
+# remains by then.
 def _average_loop(
     command: Any,
     total: Any,
@@ -96,22 +94,21 @@ def _average_loop(
         for k in range(samples):
             gathered_before = present_before = by_lag_before = 0.0
             for i in range(steps + 1):
-                turns, at = shifts[i] // samples, shifts[i] % samples + k
+                turns, at = shifts[j, i] // samples, shifts[j, i] % samples + k
                 if at >= samples:
                     turns, at = turns + 1, at - samples
                 held = command[j, at]
                 # Integral of the held command since command 0.
-                gathered = (turns * total[j, samples] + total[j, at]) / rate + held * phases[i]
+                gathered = (turns * total[j, samples] + total[j, at]) / rate + held * phases[j, i]
                 left = (lagging[0, at] - held) * fading[j, i]
                 present = held + left
-                # Without a lag, the torque jumps with the command and has no derivative with respect to the lag.
-                by_lag = left * phases[i] / (lag * lag) + lagging[1, at] * fading[j, i] if lag > 0.0 else 0.0
+                by_lag = left * phases[j, i] / (lag * lag) + lagging[1, at] * fading[j, i] if lag > 0.0 else 0.0
                 if i > 0:
                     # lag y' = u - y, integrated over a step: the mean of y is that of u minus what the lag stores.
                     stored = (present - present_before) * per_time
                     torque[j, k, i - 1] = (gathered - gathered_before) * per_time - lag * stored
                     late[j, k, i - 1] = -stored
-                    change[j, k, i - 1] = -stored - lag * (by_lag - by_lag_before) * per_time if lag > 0.0 else 0.0
+                    change[j, k, i - 1] = -stored - lag * (by_lag - by_lag_before) * per_time
                 gathered_before, present_before, by_lag_before = gathered, present, by_lag
 
 

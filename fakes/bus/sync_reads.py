@@ -7,6 +7,7 @@ of its time here.
 
 import functools
 from collections.abc import Mapping, Sequence
+from struct import Struct
 from typing import NamedTuple, Protocol
 
 from hil.drivers.packet import ALERT, BROADCAST_ID, HEADER, MAX_LENGTH, Instruction, crc, encode_status
@@ -23,6 +24,7 @@ _PLACE_LENGTH = 4  # address and length of a group read, before the IDs
 _FRONT_LENGTH = 8  # header, ID, LEN, INST of a status
 _STUFFED = b"\xff\xff\xfd"
 _ALERT = {0: b"\0", ALERT: bytes((ALERT,))}
+_pack_crc = Struct("<H").pack
 
 
 class JointStates(Protocol):
@@ -76,7 +78,7 @@ class GroupReads:
                 reply = encode_status(servo.id, servo.alert, data)
             else:
                 reply = front + _ALERT[servo.alert] + data
-                reply += crc(reply).to_bytes(2, "little")
+                reply += _pack_crc(crc(reply))
             replies.append((servo.id, servo.return_delay_s, reply))
         return replies
 
@@ -92,8 +94,8 @@ class GroupReads:
         replies = []
         sent = 0
         for (servo, _, _, id_byte), data in zip(request.parts, told, strict=True):
-            whole = b"".join((whole, _ALERT[servo.alert], id_byte, data))
-            whole += crc(whole).to_bytes(2, "little")
+            whole += _ALERT[servo.alert] + id_byte + data
+            whole += _pack_crc(crc(whole))
             replies.append((servo.id, servo.return_delay_s, whole[sent:]))
             sent = len(whole)
         return replies
@@ -110,8 +112,8 @@ class GroupReads:
             if is_of_state:
                 told.append(servo.present.state(positions[place], velocities[place], currents[place]))
                 continue
-            data = servo.memory.read(address, length)
-            if data is None or servo.memory.is_indirect(address, length):
+            data = servo.memory.read_plain(address, length)
+            if data is None:
                 return None
             told.append(data)
         return told or None

@@ -54,6 +54,12 @@ class Memory:
             return bytes([data[points.get(at, at)] for at in range(address, address + length)])
         return bytes(self.data[address : address + length])
 
+    def read_plain(self, address: int, length: int) -> bytes | None:
+        """Like `read`, but also None if the range includes indirect data; faster."""
+        if self._points or (address, length) not in self._readable:
+            return None if self.is_indirect(address, length) else self.read(address, length)
+        return bytes(self.data[address : address + length])
+
     def is_indirect(self, address: int, length: int) -> bool:
         """Return whether the range includes indirect data that refers to another address."""
         points = self._points

@@ -21,9 +21,10 @@ Values = NDArray[np.float64]
 
 def lateness(rows: NDArray[np.void]) -> Values:
     """Time from each row's deadline to its write [s], in the shape of `rows`; 0 if nothing was written."""
-    sent = rows["time_after_read"] > rows["time_before_write"]
-    late: Values = np.where(sent, rows["time_before_write"] - rows["deadline"], 0.0)
-    return late
+    deadline: Values = rows["deadline"]
+    written: Values = rows["time_before_write"]
+    read: Values = rows["time_after_read"]
+    return np.where(read > written, written - deadline, 0.0)
 
 
 def acting_torque(goals: Values, late: Values, rate: float) -> Values:

@@ -24,13 +24,15 @@ def torque_limit(config: Config, samples: NDArray[np.void], index: int | None = 
         if index not in (None, place):
             continue
         low, high = joint.position_limit
-        rest, position = config.arm.rest_pose[place], samples["position"][:, place]
+        rest = config.arm.rest_pose[place]
+        position: NDArray[np.float64] = samples["position"][:, place]
+        goals: NDArray[np.float64] = samples["goal_current"][:, place]
+        velocity: NDArray[np.float64] = samples["velocity"][:, place]
         goal = "voltage_limit" if joint.drive_mode is Mode.PWM else "current_limit"
         below, above = rest - np.nanmin(position), np.nanmax(position) - rest
         shares |= {
-            f"{goal} of {joint.name}": float(np.nanmax(np.abs(samples["goal_current"][:, place]))) / joint.goal_limit,
-            f"velocity_limit of {joint.name}": float(np.nanmax(np.abs(samples["velocity"][:, place])))
-            / joint.velocity_limit,
+            f"{goal} of {joint.name}": float(np.nanmax(np.abs(goals))) / joint.goal_limit,
+            f"velocity_limit of {joint.name}": float(np.nanmax(np.abs(velocity))) / joint.velocity_limit,
             f"position_limit of {joint.name}": float(max(below / (rest - low), above / (high - rest))),
         }
     setting = max(shares, key=lambda name: shares[name])

@@ -181,9 +181,10 @@ def _with_neglected(covariance: NDArray[np.float64], estimate: Estimate) -> NDAr
 
 def _mean_time(facts: RunFacts, samples: NDArray[np.void], role: str) -> float:
     """Mean time of the last period of a multisine, on the port's clock [s]."""
-    rows = samples[(samples["phase"] == Phase.PERIODIC) & (samples["segment"] == facts.segments.index(role))]
-    last = rows["period"] == rows["period"].max()
-    return float(rows["deadline"][last].mean())
+    phase, segment, period = (samples[name].astype(np.int64) for name in ("phase", "segment", "period"))
+    deadline: NDArray[np.float64] = samples["deadline"]
+    played = (phase == Phase.PERIODIC) & (segment == facts.segments.index(role))
+    return float(deadline[played & (period == period[played].max())].mean())
 
 
 def _estimate(

@@ -126,7 +126,9 @@ def _stabilised(config: Config, rows: NDArray[np.void], torque: NDArray[np.float
     with_former = rows[first - 1 : first + torque.shape[1]]
     given = np.nan_to_num(feedback_torque(config, with_former)).T
     excitation = _by_period(torque - given, config.experiment.samples).mean(axis=0)
-    former = np.nan_to_num(np.stack((with_former["position"][0], with_former["velocity"][0])))
+    position: NDArray[np.float64] = with_former["position"][0]
+    velocity: NDArray[np.float64] = with_former["velocity"][0]
+    former = np.nan_to_num(np.stack((position, velocity)))
     commanded = with_former["goal_current"][0] * _torque_constants(config)
     return Stabilised(feedback_of(config), np.ascontiguousarray(excitation), former, commanded)
 

@@ -308,7 +308,8 @@ class Stream:
         window = rest_window(self._plan.rate)
         for _ in range(0, self._plan.end_samples, window):
             self._play(self._silence(window), Phase.COMING_TO_REST)
-            speeds = np.abs(self._recorder.samples["velocity"][-window:])
+            velocity: NDArray[np.float64] = self._recorder.samples["velocity"]
+            speeds = np.abs(velocity[-window:])
             # Missing replies are ignored; a joint without any reply does not count as being at rest.
             fastest = np.fmax.reduce(speeds, axis=0)
             if (fastest < self._config.safety.rest_velocity).all():

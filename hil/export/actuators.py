@@ -19,7 +19,7 @@ def add_actuators(root: ET.Element, model: ArmModel | ChainArmModel) -> None:
     comment(actuators, f"controls are the servos' goals: {units}")
     for number, facts in enumerate(model.joints, start=1):
         lag = model.values.get("lag", 0.0) * model.values.get(f"lag_ratio_{number}", 1.0)
-        lag += model.values.get(f"lag_difference_{number}", 0.0)
+        lag += model.values.get(f"lag_difference_{number}", 0.0) if lag > 0 else 0.0  # otherwise of pure delays
         drive = {"dyntype": "filterexact", "dynprm": numbers(lag)} if lag > 0 else {}
         away = min(0.0, model.values.get(f"cable_stiffness_{number}", 0.0))
         ET.SubElement(

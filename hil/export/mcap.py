@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil import __version__
 from hil.errors import ExportError, RunFolderError
@@ -81,12 +82,14 @@ def _write_scene(writer: Any, source: Recorded, start: int) -> None:
     """Write the arm's shapes once, and its frames for every sample in which all joints were read."""
     scene = moving_scene(source.config)
     samples = source.samples
-    time = samples["deadline"] - samples["deadline"][0]
+    deadline: NDArray[np.float64] = samples["deadline"]
+    position: NDArray[np.float64] = samples["position"]
+    time = deadline - deadline[0]
     due = np.unique(np.searchsorted(time, np.arange(0.0, float(time[-1]) + 1.0 / _SHOWN_HZ, 1.0 / _SHOWN_HZ)))
     due = due[due < len(samples)]
-    seen = due[np.isfinite(samples["position"][due]).all(axis=1)]
+    seen = due[np.isfinite(position[due]).all(axis=1)]
     stamps = [start + round(float(time[row]) * 1e9) for row in seen]
-    moving = transform_messages(scene, samples["position"][seen].T.astype(np.float64), stamps)
+    moving = transform_messages(scene, position[seen].T.astype(np.float64), stamps)
     for topic, name, schema, messages in (
         ("/arm", SCENE, scene_schema(), [(start, scene_message(scene, start))]),
         ("/transforms", TRANSFORMS, transforms_schema(), list(zip(stamps, moving, strict=True))),

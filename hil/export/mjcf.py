@@ -12,7 +12,7 @@ from hil.export.mass_distribution import LinkMass, distribute
 from hil.export.source import Source, write_text
 from hil.export.xml_text import axis, describe, numbers, to_text
 
-_CARRIED = ("armature", "offset", "lag", "lag_difference", "cable_stiffness")
+_CARRIED = ("armature", "offset", "lag", "cable_stiffness")
 
 
 def export_mjcf(source: Source, path: Path) -> list[str]:
@@ -23,7 +23,7 @@ def export_mjcf(source: Source, path: Path) -> list[str]:
     if isinstance(model, ChainArmModel):
         return export_chain_mjcf(source, model, path)
     links = distribute(model, source.link_length)
-    left = left_out(model, _CARRIED)
+    left = left_out(model, (*_CARRIED, "lag_difference") if "lag" in model.values else _CARRIED)
     root = ET.Element("mujoco", model="arm")
     describe(root, model, left)
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")

@@ -202,7 +202,8 @@ def _rows(arms: ChainArms, config: Config, samples: NDArray[np.void]) -> tuple[A
 
     smooth = butter(4, cut_off, fs=rate, output="sos")
     position = sosfiltfilt(smooth, _filled(played["position"]), axis=0)
-    torque = sosfiltfilt(smooth, played["goal_current"] * constants, axis=0)
+    goals: Array = played["goal_current"]
+    torque = sosfiltfilt(smooth, goals * constants, axis=0)
     velocity = np.gradient(position, 1.0 / rate, axis=0)
     acceleration = np.gradient(velocity, 1.0 / rate, axis=0)
     is_free = np.abs(position - np.array(config.arm.rest_pose)).max(axis=1) > _LYING_RAD

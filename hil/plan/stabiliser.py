@@ -135,8 +135,6 @@ def feedback_torque(config: Config, samples: NDArray[np.void]) -> NDArray[np.flo
     """The stabiliser's torque in all rows but the first (rows - 1, joints) [N m]; NaN where a reply is missing."""
     assert config.stabiliser is not None
     stiffness, damping = np.array(config.stabiliser.stiffness), np.array(config.stabiliser.damping)
-    former = samples[:-1]
-    torque: NDArray[np.float64] = (
-        stiffness * (np.array(config.arm.rest_pose) - former["position"]) - damping * former["velocity"]
-    )
-    return torque
+    position: NDArray[np.float64] = samples["position"][:-1]
+    velocity: NDArray[np.float64] = samples["velocity"][:-1]
+    return stiffness * (np.array(config.arm.rest_pose) - position) - damping * velocity

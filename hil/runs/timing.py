@@ -21,7 +21,7 @@ def timing(samples: NDArray[np.void], rate: float) -> StreamTiming:
     """Achieved rate, lateness, round trips, missed ticks, lost replies and clock drifts of a recording."""
     sent = _sent(samples)
     lateness_us = _lateness_us(sent)
-    round_trip_us = 1e6 * (sent["time_after_read"] - sent["time_before_write"])
+    round_trip_us = 1e6 * _round_trip(sent)
     span = float(samples["deadline"][-1] - samples["deadline"][0]) + 1 / rate
     tenth = max(1, len(sent) // 10)
     return StreamTiming(
@@ -47,7 +47,7 @@ def lost_samples(samples: NDArray[np.void], names: Sequence[str]) -> str:
     """One sentence about the fraction of samples without a reply, by joint; "" if it is at most LOST_SHARE for each."""
     if not len(samples):
         return ""
-    sent = samples["time_after_read"] > samples["time_before_write"]
+    sent = _round_trip(samples) > 0.0
     shares = np.mean(samples["missing"] | ~sent[:, None], axis=0)
     if float(shares.max()) <= LOST_SHARE:
         return ""
@@ -65,14 +65,22 @@ def lost_samples(samples: NDArray[np.void], names: Sequence[str]) -> str:
 
 def _sent(samples: NDArray[np.void]) -> NDArray[np.void]:
     """The samples whose deadline was not missed."""
-    sent: NDArray[np.void] = samples[samples["time_after_read"] > samples["time_before_write"]]
+    sent: NDArray[np.void] = samples[_round_trip(samples) > 0.0]
     return sent
+
+
+def _round_trip(samples: NDArray[np.void]) -> NDArray[np.float64]:
+    """From write to reply, in the shape of `samples` [s]; 0 where nothing was written."""
+    before: NDArray[np.float64] = samples["time_before_write"]
+    after: NDArray[np.float64] = samples["time_after_read"]
+    return after - before
 
 
 def _lateness_us(sent: NDArray[np.void]) -> NDArray[np.float64]:
     # A virtual clock does not advance during computation, so rounding errors may have either sign.
-    late: NDArray[np.float64] = np.maximum(0.0, 1e6 * (sent["time_before_write"] - sent["deadline"]))
-    return late
+    written: NDArray[np.float64] = sent["time_before_write"]
+    deadline: NDArray[np.float64] = sent["deadline"]
+    return np.maximum(0.0, 1e6 * (written - deadline))
 
 
 def _quantiles(values: NDArray[np.float64]) -> Quantiles:

@@ -161,7 +161,7 @@ class PathDesigner:
         best: tuple[float, Array, Array] | None = None
         for number in range(CENTRES):
             told()
-            share = np.full(self._joints, 0.5) if number < 4 else random.uniform(0.15, 0.85, self._joints)
+            share: Array = np.full(self._joints, 0.5) if number < 4 else random.uniform(0.15, 0.85, self._joints)
             centre, lines = low + share * (high - low), self._random_lines(random)
             path = self._fitted(centre, lines, self._few)
             if path is None:

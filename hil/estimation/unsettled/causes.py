@@ -101,8 +101,8 @@ def _uneven(recordings: Sequence[Recording]) -> tuple[str, ...]:
         f"The position of joint {found.late} may be logged about {1e3 * found.by:.2g} ms later, relative to its "
         f"torque, than that of joint {found.early}: inverse dynamics of one of these joints leaves "
         f"{100 * found.residual:.2g} % of its torque unexplained with its own delay, "
-        f"{100 * found.residual_given:.2g} % with the other's. A single delay is estimated for both: log all columns "
-        "at the same time, or shift those of one joint.",
+        f"{100 * found.residual_given:.2g} % with the other's. Log all columns at the same time, or shift those of "
+        "one joint.",
     )
 
 

@@ -44,7 +44,7 @@ JUMPED = (
     "A position jumped (see the warnings), so angles before and after the jump are inconsistent: use only the part "
     "before or after it, or put each part in a separate file."
 )
-NOT_HERE = ("ripple", "cogging", "encoder", "lags")
+NOT_HERE = ("ripple", "cogging", "encoder")
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,11 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
     only_planar(config, "an estimate from all samples")
     samples = load_samples(run.samples_path, len(config.joints))
     constants = np.array([joint.torque_per_goal for joint in config.joints])
+    written: NDArray[np.float64] = samples["time_before_write"]
+    goals: NDArray[np.float64] = samples["goal_current"]
     recording = Recording(
-        samples["time_before_write"] - samples["time_before_write"][:1],
-        (samples["goal_current"] * constants).T,
+        written - written[:1],
+        (goals * constants).T,
         samples["position"].T.copy(),
         np.array(facts.position_step),
         between="held",

@@ -39,7 +39,9 @@ def _row(space: Space, name: str, poses: NDArray[np.float64], on_the_way: bool) 
 def _poses(data: RunData, space: Space, phases: tuple[Phase, ...]) -> NDArray[np.float64]:
     """Poses away from the rest pose (joints, poses) [rad]."""
     every = max(1, round(data.config.experiment.rate / _LOOKED_AT_HZ))
-    q = data.samples["position"][np.isin(data.samples["phase"], phases)][::every].T
+    position: NDArray[np.float64] = data.samples["position"]
+    phase: NDArray[np.uint8] = data.samples["phase"]
+    q = position[np.isin(phase, phases)][::every].T
     q = q[:, np.isfinite(q).all(axis=0)]
     return q[:, ~space.lies(q)]
 

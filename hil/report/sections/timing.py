@@ -10,14 +10,18 @@ from hil.report.words import number
 from hil.results.parts import Quantiles
 
 _BINS = 60
+Values = NDArray[np.float64]
 
 
 def timing(data: RunData) -> Section:
     """Return this section of the report."""
     samples = data.samples
-    sent = samples[samples["time_after_read"] > samples["time_before_write"]]
-    lateness = 1e6 * (sent["time_before_write"] - sent["deadline"])
-    round_trip = 1e6 * (sent["time_after_read"] - sent["time_before_write"])
+    deadline: Values = samples["deadline"]
+    written: Values = samples["time_before_write"]
+    read: Values = samples["time_after_read"]
+    sent = read > written
+    lateness = 1e6 * (written - deadline)[sent]
+    round_trip = 1e6 * (read - written)[sent]
     kept = data.result.timing
     rows = [
         ("requested rate", f"{data.config.experiment.rate:g} Hz"),

@@ -14,7 +14,8 @@ from hil.estimator.fit.multiple_shooting import Shooting, estimate_by_shooting
 from hil.estimator.fit.segmented_least_squares import Segmented
 from hil.estimator.models.model import Model
 from hil.estimator.selection.prediction import prediction_rms
-from hil.estimator.selection.segments import held_out_errors
+from hil.estimator.selection.pruning import pruned_model
+from hil.estimator.selection.segments import considered, held_out_errors, missing_terms
 from hil.estimator.selection.unsettled import choose_by_shooting
 from hil.fakes.plants.arm import Arm, base_parameters
 from hil.fakes.plants.plant import make_plant
@@ -22,8 +23,11 @@ from hil.fakes.plants.plant import make_plant
 STEP = 2.0 * np.pi / 4096
 
 
-def swing(arm: Arm, seconds: float, seed: int) -> Recording:
-    """Return an aperiodic motion: sines without a common period, from rest, sampled with jitter."""
+def swing(arm: Arm, seconds: float, seed: int, late: float = 0.0) -> Recording:
+    """Return an aperiodic motion: sines without a common period, from rest, sampled with jitter.
+
+    late: delay of the last joint's torque [s], shorter than every interval.
+    """
     random = np.random.default_rng(seed)
     joints = len(arm.links)
     time = np.cumsum(random.uniform(0.0015, 0.0035, round(seconds / 0.0025)))
@@ -34,6 +38,9 @@ def swing(arm: Arm, seconds: float, seed: int) -> Recording:
     plant = make_plant(arm)
     position = np.empty_like(torque)
     for k, now in enumerate(time):
+        if k and late:
+            former = np.append(torque[:-1, k - 1], torque[-1, max(k - 2, 0)])
+            plant.advance(time[k - 1] + late, former / constant)
         plant.advance(now, torque[:, k - 1] / constant if k else np.zeros(joints))
         position[:, k] = plant.position
     return Recording(time, torque, np.round(position / STEP) * STEP, np.full(joints, STEP), between="held")
@@ -71,6 +78,43 @@ def test_torque_constants_that_are_off_by_different_factors_are_told_apart(recor
     estimate = estimate_by_shooting([believed], Model(2, options={"torque_scale"}), start(believed))
     assert estimate.parameters["torque_scale_2"] == pytest.approx(1.1, rel=2e-3)
     assert np.all(estimate.residual_rms < 0.32 * STEP)
+
+
+def test_torques_of_two_joints_may_have_different_delays(ideal_arm: Arm, recording: Recording) -> None:
+    late, own = swing(ideal_arm, 8.0, 1, late=1.2e-3), Model(2, options={"lags"})
+    equal, different = (estimate_by_shooting([each], own, start(each)) for each in (recording, late))
+    assert max(map(abs, errors(different, ideal_arm).values())) < 0.01
+    index = different.names.index("lag_difference_2")
+    assert different.value[index] == pytest.approx(1.2e-3, abs=3.5 * different.std[index])
+    assert different.std[index] < 1e-4
+    assert np.all(different.residual_rms < 0.32 * STEP)
+    # Delays are kept only if they differ.
+    kept, dropped = (pruned_model(own, e.names, e.value, e.covariance, 1e-3, None) for e in (different, equal))
+    assert (kept, dropped) == (own, Model(2))
+
+
+def test_a_difference_of_delays_that_is_not_fitted_is_found_and_widens_the_errors(ideal_arm: Arm) -> None:
+    late = swing(ideal_arm, 4.0, 1, late=1.2e-3)
+    estimate = estimate_by_shooting([late], Model(2), start(late))
+    found = missing_terms([late], estimate)[0]
+    assert found.part == "lags" and found.evidence > 1.0
+    assert found.values["lag_difference_2"] == pytest.approx(1.2e-3, rel=0.2)
+    assert np.all(considered([late], estimate).std >= estimate.std)
+
+
+def test_a_step_changes_inertias_in_proportion(ideal_arm: Arm, recording: Recording) -> None:
+    """In coordinates, a fit takes 80 iterations where only sums of inertias are determined, and this way 14."""
+    problem = Shooting([recording], Model(2, options={"asymmetry"}), 1.0)
+    coordinates = problem.coordinates(base_parameters(ideal_arm))
+    value = np.array([base_parameters(ideal_arm).get(name, 0.01) for name in coordinates.names])
+    x = coordinates.coordinates(value)
+    value, change = coordinates.values(x), np.zeros(x.size)
+    change[:4] = 0.4 * value[2] * np.array([1.0, -1.0, 1.0, -1.0])
+    change[6:10] = 0.2 * value[6:10]
+    step = np.linalg.solve(coordinates.slopes(x), change)
+    there = coordinates.moved_in_proportion(np.append(x, 3.0), np.append(step, 0.5))
+    assert coordinates.values(there[:-1])[:12] == pytest.approx((value + change)[:12], rel=1e-9) and there[-1] == 3.5
+    assert np.all(coordinates.values(coordinates.moved_in_proportion(x, np.full(x.size, -9.0)))[[0, 2, 3]] > 0.0)
 
 
 def test_recordings_are_used_together_each_with_its_own_encoder_zeros(ideal_arm: Arm, recording: Recording) -> None:
@@ -198,10 +242,22 @@ def test_what_changes_together_and_leaves_no_trace_is_not_known() -> None:
     """Of three coordinates, the motion reveals the first and the sum of the others."""
     information = np.array([[4.0, 0.0, 0.0], [0.0, 9.0, 9.0], [0.0, 9.0, 9.0]])
     scores = np.array([[1.0, 0.5, 0.5], [-0.5, 1.0, 1.0]])
-    found = Segmented(np.zeros(3), np.zeros((2, 4)), 1.0, information, scores, 1)
+    found = Segmented(np.zeros(3), np.zeros((2, 4)), 1.0, information, scores, 1, 0.0)
     std = np.sqrt(np.diag(found.covariance()))
     assert np.isfinite(std[0]) and std[0] > 0.0
     assert np.isinf(std[1:]).all()
+
+
+@pytest.mark.parametrize("segments", [4, 40])
+def test_scores_that_the_fit_has_made_small_do_not_make_it_certain(segments: int) -> None:
+    """Errors are at least those of white noise; larger scores, as of correlated residuals, still increase them."""
+    scores = np.random.default_rng(3).normal(size=(segments, 2)) * np.array([0.1, 1.0]) * np.sqrt(8.0 / segments)
+    scores[:, 1] *= 5.0
+    information = np.diag([4.0, 9.0])
+    least = Segmented(np.zeros(2), np.zeros((segments, 4)), 1.0, information, 0.01 * scores, 1, 1.2).covariance()
+    assert np.diag(least) == pytest.approx([1.2 / 4.0, 1.2 / 9.0])
+    usual = Segmented(np.zeros(2), np.zeros((segments, 4)), 1.0, information, scores, 1, 1.2).covariance()
+    assert usual[0, 0] >= 1.2 / 4.0 and usual[1, 1] > 5.0 * 1.2 / 9.0
 
 
 def test_recordings_that_disagree_make_all_less_certain() -> None:
@@ -211,7 +267,7 @@ def test_recordings_that_disagree_make_all_less_certain() -> None:
     noise = random.normal(size=(12, 2))
     repeated = np.repeat([[3.0, -1.0], [-2.0, 2.0], [-1.0, -1.0]], 4, axis=0)
     alone, alike = (
-        Segmented(np.zeros(2), np.zeros((12, 4)), 1.0, np.eye(2), scores, 1) for scores in (noise, repeated)
+        Segmented(np.zeros(2), np.zeros((12, 4)), 1.0, np.eye(2), scores, 1, 0.0) for scores in (noise, repeated)
     )
     grown = [np.diag(found.covariance(groups) / found.covariance()) for found in (alone, alike)]
     assert grown[0].max() < 2.5

@@ -36,6 +36,17 @@ def test_torque_is_that_of_a_lag_followed_from_command_to_command(lag: float, de
     assert given == pytest.approx(followed(command, 2.5e-4, delay, lag), abs=1e-9)
 
 
+def test_each_joint_has_its_own_delay() -> None:
+    command, delays = np.random.default_rng(3).normal(size=(2, 30)), np.array([1.1e-3, 6e-3])
+    both, slopes = torque_and_slopes(command, RATE, 3e-4, STEPS, delay=delays, lag=0.0)
+    for joint, delay in enumerate(delays):
+        alone = {"delay": delay, "lag": 0.0}
+        assert both[joint] == pytest.approx(motor_torque(command[[joint]], RATE, 3e-4, STEPS, **alone)[0])
+        # Without a lag, a tiny one acts like a delay.
+        late, lag = torque_and_slopes(command[[joint]], RATE, 3e-4, STEPS, **alone)[1][:, 0]
+        assert np.allclose(slopes[:, joint], [late, lag]) and np.allclose(late, lag)
+
+
 def test_torque_slopes_are_those_of_the_torque() -> None:
     command = np.random.default_rng(2).normal(size=(1, 30))
     at = {"delay": 1.1e-3, "lag": 2e-3}
