@@ -13,9 +13,9 @@ ignored, unknown ones are errors.
 """
 
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, Field, PositiveFloat, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from hil.config.csv_columns import PLANAR, Columns
 from hil.config.experiment import ModelConfig
@@ -42,7 +42,9 @@ class ArmFacts(Table):
     base: list[Turned] = Field(
         [0.0, 0.0, 0.0], min_length=3, max_length=3, description="with urdf: roll, pitch and yaw of the base, rad"
     )
-    link_lengths: list[PositiveFloat] | None = Field(None, description="m, from joint to joint and to the tip")
+    link_lengths: list[Annotated[float, Field(gt=0, le=3)]] | None = Field(
+        None, description="m, from joint to joint and to the tip"
+    )
 
 
 class RecordingConfig(Table):

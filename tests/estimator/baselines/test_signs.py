@@ -115,7 +115,7 @@ def test_a_joint_that_is_logged_later_than_the_other_is_named(joint: int, late: 
 
 
 def test_quarter_turns_are_preferred_to_an_angle_that_explains_hardly_more() -> None:
-    """Joint 2 of an excellent recording was turned by 0.56 rad for 1 % of the residual; its fit failed after minutes."""
+    """Joint 2 of an excellent recording was turned by 0.56 rad for 1 % of the residual, and its fit failed."""
     motion = two_joints(8.0)
     torque = motion.torque + 0.3 * np.random.default_rng(1).standard_normal(motion.torque.shape)
     hanging = motion.position + np.array([[np.pi / 2], [0.0]])
