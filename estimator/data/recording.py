@@ -18,7 +18,6 @@ MOST_GAP = 0.2  # s between samples; with longer intervals the motion would not 
 MOST_INTERVALS, SHORTEST_GAP = 8.0, 0.04  # intervals longer than this many usual ones, and this many seconds, are gaps
 LONGEST_GAP = 10.0  # s within one recording
 LEAST_NOISE = 1e-5  # rad: lower bound for any arm's encoder
-FEW_OUTLIERS = 0.02  # of a joint's samples
 MOST_ANGLE = 200.0  # rad: larger values must be degrees or encoder steps
 MOST_SPEED = 500.0  # rad/s between samples, likewise
 MOST_TORQUE = 1e4  # N m
@@ -201,23 +200,23 @@ def _check_values(recording: Recording) -> None:
             )
 
 
-def _check_outliers(recording: Recording, joint: int) -> None:
-    """Refuse single positions far from all others, which a wrong unit would not explain."""
-    row = recording.position[joint]
-    far = np.flatnonzero(np.abs(row - np.nanmedian(row)) > MOST_ANGLE)
-    if 0 < far.size <= FEW_OUTLIERS * row.size:
-        raise RecordingError(
-            f"joint {joint + 1}: sample {far[0] + 1} at {recording.time[far[0]]:g} s is {row[far[0]]:.4g} rad, far "
-            "from nearly all others: it is an outlier. Leave such positions empty (NaN)"
-        )
-
-
 def _check_motion(recording: Recording) -> None:
     filled = recording.filled()
     for joint, row in enumerate(filled):
         swing = float(row.max() - row.min())
         least = LEAST_MOTION * float(recording.position_step[joint])
-        _check_outliers(recording, joint)
+        step = np.abs(np.diff(row))
+        speed = step / np.diff(recording.time)
+        k = int(np.argmax(speed))
+        is_turn = abs(step[k] - 2.0 * np.pi) < 0.5  # even if it is taken back: the angle wraps
+        # In a wrong unit, any small movement may look like an outlier.
+        if speed[k] > MOST_SPEED and not is_turn and (step[k] > MOST_ANGLE or swing <= MOST_ANGLE):
+            for at in {k, k + 1} - {0, row.size - 1}:
+                if abs(row[at + 1] - row[at - 1]) < 0.2 * min(step[at - 1], step[at]):
+                    raise RecordingError(
+                        f"joint {joint + 1}: sample {at + 1} at {recording.time[at]:g} s is {step[k]:.3g} rad away "
+                        "from both its neighbours: it is an outlier. Leave such positions empty (NaN)"
+                    )
         if not swing:
             raise StandstillError(f"the position of joint {joint + 1} is always {row[0]:.4g} rad: check the column")
         if swing <= least:
@@ -225,22 +224,12 @@ def _check_motion(recording: Recording) -> None:
                 f"joint {joint + 1} moved by {swing:.2g} rad; at least {least:.2g} rad are needed: check the column "
                 "and its unit, or drive the joint harder"
             )
-        step = np.abs(np.diff(row))
-        speed = step / np.diff(recording.time)
-        k = int(np.argmax(speed))
         if swing > MOST_ANGLE:
             raise RecordingError(
                 f"joint {joint + 1} moves through {swing:.4g} rad, more than {MOST_ANGLE:g}: are these degrees or "
                 "encoder steps? Set the column's unit"
             )
         if speed[k] > MOST_SPEED:
-            is_turn = abs(step[k] - 2.0 * np.pi) < 0.5  # even if it is taken back: the angle wraps
-            for at in () if is_turn else {k, k + 1} - {0, row.size - 1}:
-                if abs(row[at + 1] - row[at - 1]) < 0.2 * min(step[at - 1], step[at]):
-                    raise RecordingError(
-                        f"joint {joint + 1}: sample {at + 1} at {recording.time[at]:g} s is {step[k]:.3g} rad away "
-                        "from both its neighbours: it is an outlier. Leave such positions empty (NaN)"
-                    )
             raise RecordingError(
                 f"joint {joint + 1} jumps by {step[k]:.3g} rad, {speed[k]:.3g} rad/s, after sample {k + 1} at "
                 f"{recording.time[k]:g} s: unwrap the angle, or check its unit"
