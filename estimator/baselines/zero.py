@@ -15,6 +15,10 @@ from hil.estimator.models.terms import base_names
 CUTOFF, WIDTH = 8.0, 0.05  # Hz, rad/s
 EXPLAINED = 0.5  # maximum ratio of the torque's residual with free zero angles to that with the given ones
 LEAST = 0.3  # rad: smaller zero errors are left to the fit
+QUARTER, TIE = 0.5 * np.pi, 1.05
+"""Quarter turns [rad] are preferred if they leave a residual of up to TIE times the smallest: a weak or slow motion
+determines the zero of joint 2 poorly.
+"""
 SURE = 0.05  # fraction of the largest torque: weaker gravity does not reveal an angle
 
 
@@ -28,15 +32,11 @@ def turned_zeros(recordings: Sequence[Recording]) -> Array | None:
     names = base_names(joints)
     gravity = [names.index(f"gravity_{joint + 1}") for joint in range(joints)]
     try:
-        upright = [filtered_rows(each, CUTOFF, WIDTH) for each in recordings]
-        turned = [filtered_rows(_turned(each), CUTOFF, WIDTH) for each in recordings]
+        plain, tau = _rows(recordings, np.zeros(joints))
+        sines = _rows(recordings, np.eye(joints)[0] * -QUARTER)[0][:, gravity]
     except EstimationError:
         return None
-    Y = np.concatenate([rows.regressor for rows in upright], axis=1)
-    sines = np.concatenate([rows.regressor for rows in turned], axis=1)[:, :, gravity]
-    tau = np.concatenate([rows.torque for rows in upright], axis=1).reshape(-1)
-    plain = Y.reshape(-1, Y.shape[2])
-    both = np.concatenate((plain, sines.reshape(-1, joints)), axis=1)
+    both = np.concatenate((plain, sines), axis=1)
     (_, left), (found, left_turned) = (_solved(A, tau) for A in (plain, both))
     if left_turned > EXPLAINED * left:
         return None
@@ -48,13 +48,21 @@ def turned_zeros(recordings: Sequence[Recording]) -> Array | None:
     zeros = np.concatenate((angle[:1], np.diff(angle)))
     zeros = (zeros + np.pi) % (2.0 * np.pi) - np.pi
     zeros[1:] = np.where(size[1:] < SURE * float(np.abs(tau).max()), 0.0, zeros[1:])
-    return None if abs(zeros[0]) < LEAST else np.asarray(zeros)
+    if abs(zeros[0]) < LEAST:
+        return None
+    whole = np.round(zeros / QUARTER) * QUARTER + 0.0  # not -0.0
+    for simple in (whole, np.eye(joints)[0] * whole[0]):
+        if _solved(*_rows(recordings, simple))[1] < TIE * left_turned:
+            return np.asarray(simple)
+    return np.asarray(zeros)
 
 
-def _turned(recording: Recording) -> Recording:
-    position = recording.position.copy()
-    position[0] -= 0.5 * np.pi
-    return replace(recording, position=position)
+def _rows(recordings: Sequence[Recording], zeros: Array) -> tuple[Array, Array]:
+    """Return the regressor and torques of inverse dynamics with `zeros` (joints,) [rad] added to the angles."""
+    turned = (replace(each, position=each.position + zeros[:, None]) for each in recordings)
+    rows = [filtered_rows(each, CUTOFF, WIDTH) for each in turned]
+    Y = np.concatenate([each.regressor for each in rows], axis=1)
+    return Y.reshape(-1, Y.shape[2]), np.concatenate([each.torque for each in rows], axis=1).reshape(-1)
 
 
 def _solved(A: Array, b: Array) -> tuple[Array, float]:

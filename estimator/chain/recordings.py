@@ -79,8 +79,6 @@ class RecordedChain:
     """RMS of the one-step-ahead residual relative to the noise of the angles (joints,); NaN for a regression."""
     residual: Array
     """RMS of the one-step-ahead residual (joints,) [rad]; NaN for a regression."""
-    torque_residual: Array
-    """RMS of the regression's torque residual relative to the torque (joints,)."""
     positions: tuple[Array, ...]
     """One-step-ahead prediction for each recording (joints, samples) [rad] at `MotionPiece`'s times."""
     cutoff: float
@@ -117,7 +115,6 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
         if recording.joints != model.joints:
             raise ModelError(f"the model has {model.joints} joints but a recording has {recording.joints}")
     value, std, cutoff = _regression(recordings, model, prior)
-    left = _torque_residual(recordings, model, value, cutoff)
     count = model.base.count
     if any(recording.between != "held" for recording in recordings):
         nothing = np.full(model.joints, np.nan)
@@ -130,12 +127,13 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
             False,
             nothing,
             nothing,
-            left,
             (),
             cutoff,
             _from_prior(model, std[:count], prior),
         )
     pieces = [MotionPiece.of(recording) for recording in recordings]
+    Y, torque = filtered_torques(recordings, model, cutoff, LAG)
+    left = _relative(torque - Y @ value, torque)
     linear = ChainLinear(value, std, LAG, tuple(map(_beginning, pieces)), left)
     fit = fit_periods(pieces, model, linear, prior)
     squares = [np.square(piece.position - found) for piece, found in zip(pieces, fit.positions, strict=True)]
@@ -151,7 +149,6 @@ def identify_recordings(recordings: Sequence[Recording], model: ChainModel, prio
         True,
         rms / noise,
         rms,
-        left,
         fit.positions,
         cutoff,
         _from_prior(model, spread, prior),
@@ -210,11 +207,6 @@ def _repeated(recordings: Sequence[Recording], model: ChainModel, value: Array, 
             negative = np.flatnonzero(rho <= 0.0)
             most = max(most, 1.0 + 2.0 * float(rho[1 : negative[0] if negative.size else rho.size].sum()))
     return most
-
-
-def _torque_residual(recordings: Sequence[Recording], model: ChainModel, value: Array, cutoff: float) -> Array:
-    Y, torque = filtered_torques(recordings, model, cutoff, LAG)
-    return _relative(torque - Y @ value, torque)
 
 
 def _relative(error: Array, torque: Array) -> Array:

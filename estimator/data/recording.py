@@ -162,7 +162,8 @@ def _check_times(recording: Recording) -> None:
         )
     if float(np.median(step)) > MOST_GAP:
         raise RecordingError(
-            f"samples are {float(np.median(step)):.3g} s apart; at most {MOST_GAP:g} s is allowed. Is time in seconds?"
+            f"samples are {float(np.median(step)):.3g} s apart; at most {MOST_GAP:g} s is allowed. Is time in seconds? "
+            "If not, set columns.time_unit"
         )
     if step.max() > LONGEST_GAP:
         k = int(np.argmax(step))
@@ -204,27 +205,31 @@ def _check_motion(recording: Recording) -> None:
     for joint, row in enumerate(filled):
         swing = float(row.max() - row.min())
         least = LEAST_MOTION * float(recording.position_step[joint])
+        step = np.abs(np.diff(row))
+        speed = step / np.diff(recording.time)
+        k = int(np.argmax(speed))
+        is_turn = abs(step[k] - 2.0 * np.pi) < 0.5  # even if it is taken back: the angle wraps
+        # In a wrong unit, any small movement may look like an outlier.
+        if speed[k] > MOST_SPEED and not is_turn and (step[k] > MOST_ANGLE or swing <= MOST_ANGLE):
+            for at in {k, k + 1} - {0, row.size - 1}:
+                if abs(row[at + 1] - row[at - 1]) < 0.2 * min(step[at - 1], step[at]):
+                    raise RecordingError(
+                        f"joint {joint + 1}: sample {at + 1} at {recording.time[at]:g} s is {step[k]:.3g} rad away "
+                        "from both its neighbours: it is an outlier. Leave such positions empty (NaN)"
+                    )
+        if not swing:
+            raise StandstillError(f"the position of joint {joint + 1} is always {row[0]:.4g} rad: check the column")
         if swing <= least:
             raise StandstillError(
                 f"joint {joint + 1} moved by {swing:.2g} rad; at least {least:.2g} rad are needed: check the column "
                 "and its unit, or drive the joint harder"
             )
-        step = np.abs(np.diff(row))
-        speed = step / np.diff(recording.time)
-        k = int(np.argmax(speed))
         if swing > MOST_ANGLE:
             raise RecordingError(
                 f"joint {joint + 1} moves through {swing:.4g} rad, more than {MOST_ANGLE:g}: are these degrees or "
                 "encoder steps? Set the column's unit"
             )
         if speed[k] > MOST_SPEED:
-            is_turn = abs(step[k] - 2.0 * np.pi) < 0.5  # even if it is taken back: the angle wraps
-            for at in () if is_turn else {k, k + 1} - {0, row.size - 1}:
-                if abs(row[at + 1] - row[at - 1]) < 0.2 * min(step[at - 1], step[at]):
-                    raise RecordingError(
-                        f"joint {joint + 1}: sample {at + 1} at {recording.time[at]:g} s is {step[k]:.3g} rad away "
-                        "from both its neighbours: it is an outlier. Leave such positions empty (NaN)"
-                    )
             raise RecordingError(
                 f"joint {joint + 1} jumps by {step[k]:.3g} rad, {speed[k]:.3g} rad/s, after sample {k + 1} at "
                 f"{recording.time[k]:g} s: unwrap the angle, or check its unit"

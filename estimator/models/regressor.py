@@ -51,18 +51,6 @@ def regressor(position: Array, velocity: Array, acceleration: Array, coulomb_wid
     return Y
 
 
-def inverse_dynamics(
-    theta: Array, position: Array, velocity: Array, acceleration: Array, coulomb_width: float | Array = 0.0
-) -> Array:
-    """Return the joint torques (joints, samples) [N m] of a motion, from the equations in this module's docstring.
-
-    `theta`: base parameters in the order of `hil.estimator.models.terms.base_names`; other arguments and errors as in
-    `regressor`.
-    """
-    torque: Array = regressor(position, velocity, acceleration, coulomb_width) @ theta
-    return torque
-
-
 def _signs(velocity: Array, width: Array) -> Array:
     soft = np.tanh(velocity / np.where(width > 0.0, width, 1.0)[:, None])
     return np.where(width[:, None] > 0.0, soft, np.sign(velocity))

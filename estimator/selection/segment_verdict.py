@@ -21,6 +21,7 @@ from hil.estimator.selection.verdict import (
     WELL_KNOWN,
     Verdict,
     percent,
+    unexplained_motion,
 )
 
 NEARLY_EXPLAINED = 1.5  # ratio of residual to noise up to which undetermined friction near standstill does no harm
@@ -52,6 +53,8 @@ class SegmentEvidence:
     """Whether a warning casts doubt on the estimate."""
     conflicts: tuple[Conflict, ...] = ()
     """Values far from those known beforehand."""
+    undetermined: tuple[str, ...] = ()
+    """Friction terms near standstill that the motion does not determine, as a sentence; harmless if `explains_well`."""
     spoiled: bool = False
     """Whether the recordings themselves are at fault, so that neither more terms nor other motion would help."""
     notes: tuple[str, ...] = ()
@@ -84,60 +87,77 @@ def explains_well(recordings: Sequence[Recording], estimate: ShootingEstimate, g
 
 
 def judge_segments(recordings: Sequence[Recording], estimate: ShootingEstimate, evidence: SegmentEvidence) -> Verdict:
-    """Return the verdict on `estimate`, whose standard errors include the effect of omitted terms."""
+    """Return the verdict on `estimate`, whose standard errors include the effect of omitted terms.
+
+    Every number that rules out "yes" is stated together with its limit.
+    """
     relative = relative_std(recordings, estimate, evidence.gravity)
     left, held_out = float(estimate.residual_over_noise.max()), evidence.held_out
     weakest = max(relative, key=lambda name: relative[name])
     explained = left <= EXPLAINED
-    trust = _trust(left, held_out, relative[weakest], evidence)
-    trust = lowered(trust, contradicted(evidence.conflicts, explained))
+    against = contradicted(evidence.conflicts, explained)
+    unclear = bool(evidence.undetermined) and not explains_well(recordings, estimate, evidence.gravity)
+    rules = _rules(left, held_out, weakest, relative[weakest], unclear)
+    rules += ("a warning casts doubt on the recording",) if evidence.doubtful else ()
+    trust: Trust = "with care" if rules or evidence.doubts or against else "yes"
+    trust = lowered("no" if _is_refused(left, held_out, evidence) else trust, against)
     sentences = (
         *((f"Do not use these numbers: {evidence.reason or 'see the warnings'}.",) if evidence.faulty else ()),
-        _left(estimate, evidence, trust),
+        _left(estimate, evidence),
         _predicted(held_out, estimate.segment_length),
         *_refused(left, held_out, evidence),
         *conflict_sentences(evidence.conflicts, explained),
         *evidence.doubts,
+        *evidence.undetermined,
         *evidence.notes,
         _weakest(weakest, relative[weakest], evidence.spoiled),
+        *((f'The verdict is not "yes" because {" and because ".join(rules)}.',) if rules and trust != "no" else ()),
     )
     return Verdict(trust, weakest, sentences)
 
 
-def _trust(left: float, held_out: Array | None, weakest: float, evidence: SegmentEvidence) -> Trust:
-    worst = np.inf if held_out is None else float(held_out.max())
-    if evidence.faulty or (held_out is not None and not worst <= USABLE_PREDICTION):
-        return "no"
-    if held_out is None and left > MUCH_LEFT:
-        return "no"
-    doubtful = weakest > WEAK or evidence.doubtful or bool(evidence.doubts)
+def _rules(left: float, held_out: Array | None, weakest: str, part: float, unclear: bool) -> tuple[str, ...]:
+    """Name each number beyond its limit for "yes". part: relative standard error of the parameter `weakest`. unclear:
+    whether undetermined friction near standstill may have affected other parameters.
+    """
     limit = EXPLAINED if held_out is None else MUCH_LEFT
-    return "with care" if doubtful or left > limit or (held_out is not None and worst > GOOD_PREDICTION) else "yes"
+    rules = {
+        f"the residual exceeds {limit:g} times the noise": left > limit,
+        f"the error of the prediction exceeds {percent(GOOD_PREDICTION)}": held_out is not None
+        and float(held_out.max()) > GOOD_PREDICTION,
+        f"{weakest} is not known to within {percent(WEAK)}": part > WEAK,
+        "friction near standstill is not determined, which is harmless only if the residual is at most "
+        f"{NEARLY_EXPLAINED:g} times the noise and every parameter is known to within {percent(WELL_KNOWN)}": unclear,
+    }
+    return tuple(rule for rule, applies in rules.items() if applies)
+
+
+def _is_refused(left: float, held_out: Array | None, evidence: SegmentEvidence) -> bool:
+    beyond = left > MUCH_LEFT if held_out is None else not float(held_out.max()) <= USABLE_PREDICTION
+    return evidence.faulty or beyond
 
 
 def _refused(left: float, held_out: Array | None, evidence: SegmentEvidence) -> tuple[str, ...]:
     """Name the rule that makes the verdict "no", and a remedy unless the recordings are already said to be at fault."""
-    if evidence.faulty:
+    if evidence.faulty or not _is_refused(left, held_out, evidence):
         return ()
     remedy = "" if evidence.spoiled else ": check the columns, their units, and whether anything touched the arm"
     if held_out is None:
-        rule = f'Without that check, a residual above {MUCH_LEFT:g} times the noise makes the verdict "no"'
-        return (f"{rule}{remedy}.",) if left > MUCH_LEFT else ()
-    wrong = not float(held_out.max()) <= USABLE_PREDICTION
-    return (f'An error above {percent(USABLE_PREDICTION)} makes the verdict "no"{remedy}.',) if wrong else ()
+        rule = f"Without that check, a residual above {MUCH_LEFT:g} times the noise"
+    else:
+        rule = f"An error above {percent(USABLE_PREDICTION)}"
+    return (f'{rule} makes the verdict "no"{remedy}.',)
 
 
-def _left(estimate: ShootingEstimate, evidence: SegmentEvidence, trust: Trust) -> str:
+def _left(estimate: ShootingEstimate, evidence: SegmentEvidence) -> str:
     left = estimate.residual_over_noise
     joint = int(np.argmax(left))
     if left[joint] <= EXPLAINED:
         return "The model explains the motion down to the noise of the positions."
-    moves = (
-        f"The motion of joint {joint + 1} is not fully explained"
-        if trust == "yes"
-        else f"Joint {joint + 1} moves in a way that the model cannot explain"
-    )
-    said = f"{moves}: its residual is {left[joint]:.1f} times the noise."
+    said = f"{unexplained_motion(joint, float(left[joint]))}: its residual is {left[joint]:.1f} times the noise"
+    if left[joint] <= MUCH_LEFT and evidence.held_out is not None:
+        said += f" (up to {MUCH_LEFT:g} times is acceptable if other motion is predicted well)"
+    said += "."
     seen = [each for each in evidence.candidates if each.evidence > 1.0 and each.explained > NOTICEABLE]
     if seen:
         part = seen[0].part.replace("_", " ")

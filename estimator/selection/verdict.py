@@ -144,15 +144,20 @@ def _unexplained(estimate: Estimate, validation: Validation, evidence: Evidence,
     left = validation.residual_over_floor
     joint = int(np.argmax(left))
     error = float(validation.levels.model_error.max())
-    moves = "is not fully explained" if trust == "yes" else "moves in a way that the model cannot explain"
-    subject = f"The motion of joint {joint + 1}" if trust == "yes" else f"Joint {joint + 1}"
     said = (
-        f"{subject} {moves}: its residual is {left[joint]:.1f} times the noise, a model error of {error:.2g} encoder "
-        "steps RMS."
+        f"{unexplained_motion(joint, float(left[joint]))}: its residual is {left[joint]:.1f} times the noise, a model "
+        f"error of {error:.2g} encoder steps RMS."
     )
     if evidence.disturbances:
         return said
     return " ".join((said, _suspicion(estimate, evidence), _spoilt(validation, trust)))
+
+
+def unexplained_motion(joint: int, left: float) -> str:
+    """Return the beginning of a sentence about a joint, from 0, whose residual is `left` times the noise."""
+    if left <= MUCH_LEFT:
+        return f"The motion of joint {joint + 1} is not fully explained"
+    return f"Joint {joint + 1} moves in a way that the model cannot explain"
 
 
 def _suspicion(estimate: Estimate, evidence: Evidence) -> str:

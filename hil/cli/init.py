@@ -31,15 +31,15 @@ def init(
     from hil.setup.measured_bus import measured_bus
     from hil.setup.scan import scan
 
-    if out.exists():
-        raise ConfigError(f"{out} already exists: choose another file with --out, or remove it.")
-    if not out.absolute().parent.is_dir():
-        raise ConfigError(f"--out {out}: the folder {out.parent} does not exist. Create it first.")
     url = port_url(port)
     bauds = tuple(baud or BAUD_RATES)
     terminal = Terminal(quiet=False)
     opened = open_port(url, bauds[0])
     try:
+        if out.exists():
+            raise ConfigError(f"{out} already exists: choose another file with --out, or remove it.")
+        if not out.absolute().parent.is_dir():
+            raise ConfigError(f"--out {out}: the folder {out.parent} does not exist. Create it first.")
         with terminal.scanning() as watch:
             heard = list(scan(opened, bauds, watch))
         answers = interview(opened, url_for(url, out), heard, _default if yes else _prompt, _say)

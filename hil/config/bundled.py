@@ -19,15 +19,15 @@ def find_config(path: Path) -> Path:
 
 
 def meant(path: Path) -> str:
-    """Return a hint for a `path` that does not exist: the same name with ".toml", or the bundled configurations. "" if
-    there is no hint.
+    """Return a hint for a `path` that does not exist: the same name with ".toml", or the bundled configurations, which
+    have the names of the files in configs/. "" if there is no hint.
     """
     if path.suffix == "" and not path.exists() and path.with_suffix(".toml").is_file():
         return f" Did you mean {path.with_suffix('.toml')}?"
-    if not _is_name(path) or path.exists():
-        return ""
     names = list(bundled_configs())
-    close = get_close_matches(path.name, names, n=1)
+    if path.exists() or (not _is_name(path) and path.stem not in names):
+        return ""
+    close = get_close_matches(path.stem, names, n=1)
     if close:
         return f" Did you mean the bundled configuration {close[0]}?"
     return f" Bundled configurations: {', '.join(names)}."

@@ -105,6 +105,20 @@ class Columns(Table):
             return [gain / ohm for gain, ohm in zip(self.torque_constant, self.resistance, strict=True)]
         return None if self.torque_constant is None or self.drive != "current" else list(self.torque_constant)
 
+    def without_effect(self, *, in_ticks: bool) -> tuple[str, ...]:
+        """Return the given keys that do not apply to these columns. in_ticks: whether positions are in ticks."""
+        by_voltage = self.drive in {"voltage", "pwm"}
+        applies = {
+            "time_unit": self.time is not None,
+            "ticks_per_turn": in_ticks,
+            **{f"{kind}_unit": self.drive == kind for kind in ("torque", "current", "voltage", "pwm")},
+            "torque_constant": by_voltage or self.drive == "current",
+            "supply_voltage": self.drive == "pwm",
+            "resistance": by_voltage and self.torque_per_volt is None,
+            "torque_per_volt": by_voltage,
+        }
+        return tuple(key for key, used in applies.items() if not used and getattr(self, key) is not None)
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         drives = [kind for kind in ("torque", "current", "voltage", "pwm") if getattr(self, kind) is not None]

@@ -13,7 +13,7 @@ ignored, unknown ones are errors.
 """
 
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
@@ -35,12 +35,15 @@ class JointName(Table):
 
 
 class ArmFacts(Table):
-    """`[arm]`; only gravity and geometry are used here."""
+    """`[arm]`; only gravity and geometry are used here. The length of link 1 is compared with the estimate."""
 
     gravity: float = Field(9.81, ge=0, le=30, description="m/s^2 in the arm's plane")
     urdf: str | None = Field(None, description="URDF or MJCF of a spatial arm, relative to the TOML file")
     base: list[Turned] = Field(
         [0.0, 0.0, 0.0], min_length=3, max_length=3, description="with urdf: roll, pitch and yaw of the base, rad"
+    )
+    link_lengths: list[Annotated[float, Field(gt=0, le=3)]] | None = Field(
+        None, description="m, from joint to joint and to the tip"
     )
 
 

@@ -2,13 +2,13 @@
 
 import time
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.chain import described_arm, doubted_inertias
 from hil.config.schema import Config
+from hil.description.arm import ArmDescription
 from hil.errors import RecordingCutShort
 from hil.estimation.drive.currents import settled_current_findings
 from hil.estimation.model_from_config import voltage_driven
@@ -21,6 +21,7 @@ from hil.estimation.torque_constants import RATIO, contradictions, ratios_of
 from hil.estimation.truth import back_emf, scaled
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import SYSTEMATIC, ChainEstimate, identify_chain
+from hil.estimator.chain.model.base_parameters import BaseParameters
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.model.tilt import TILT, tilt_between
@@ -107,7 +108,7 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
         ),
         timing=RunTiming.of(timing(samples, config.experiment.rate), seconds),
         arm=arm_facts(config),
-        chain=_facts(config, estimate, known),
+        chain=chain_facts(described_arm(config), known.base, estimate.from_prior),
         truth=truth,
         truth_scaled=scaled(truth, config, extra),
     )
@@ -156,16 +157,17 @@ def true_chain_parameters(config: Config, known: KnownChain) -> dict[str, float]
     return truth
 
 
-def _facts(config: Config, estimate: ChainEstimate, known: KnownChain) -> ChainFacts:
-    arm, chain = described_arm(config), known.base.chain
+def chain_facts(arm: ArmDescription, base: BaseParameters, from_prior: tuple[str, ...]) -> ChainFacts:
+    """The part of the description that a model needs. from_prior: base parameters that the data barely constrain."""
+    chain = base.chain
     return ChainFacts(
-        urdf=Path(config.arm.urdf or "").name,
+        urdf=arm.path.name,
         rotation=tuple(tuple(map(tuple, each)) for each in chain.rotation.tolist()),
         translation=tuple(map(tuple, chain.translation.tolist())),
         axis=tuple(map(tuple, chain.axis.tolist())),
         gravity=tuple(chain.gravity.tolist()),
-        groups=dict(zip(known.base.names, known.base.groups, strict=True)),
-        from_prior=estimate.from_prior,
+        groups=dict(zip(base.names, base.groups, strict=True)),
+        from_prior=from_prior,
         held=arm.held,
         doubts=arm.doubts,
     )

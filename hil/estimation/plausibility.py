@@ -4,8 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hil.config.schema import Config
+from hil.config.known_quantities import KnownConfig
+from hil.config.recording import ArmFacts
+from hil.config.schema import ArmConfig, Config
 from hil.estimation.torque_constants import contradictions, ratios_of
+from hil.estimator.fit.multiple_shooting import ShootingEstimate
 from hil.estimator.identify import Estimate
 from hil.estimator.models.conflicts import Conflict, conflicts
 from hil.plan.chain_model import torque_constant_stds
@@ -26,22 +29,24 @@ def doubts(
     ratios = ratios_of(estimate.names, estimate.value, estimate.std)
     joints = [joint.name for joint in config.joints]
     return (
-        *_length(config, estimate),
+        *wrong_length(link_length(config.known, config.arm), config.arm.gravity, estimate),
         *_weight(config, estimate, largest_torque),
         *contradictions(joints, ratios, torque_scale_std(config), "constant", known),
     )
 
 
-def _length(config: Config, estimate: Estimate) -> list[str]:
-    """Check coupling * gravity / gravity_2, which should equal the measured length of link 1."""
-    length = _link_length(config)
-    if length is None or estimate.model.joints != 2 or not config.arm.gravity:
+def wrong_length(length: float | None, gravity: float, estimate: Estimate | ShootingEstimate) -> list[str]:
+    """Check coupling * gravity / gravity_2, which should equal the measured `length` of link 1 [m], if it is known.
+
+    gravity: gravity in the arm's plane [m/s^2].
+    """
+    if length is None or estimate.model.joints != 2 or not gravity:
         return []
     value = estimate.parameters
     coupling, weight = value["coupling"], value["gravity_2"]
     if not coupling or not weight:
         return []
-    found = coupling * config.arm.gravity / weight
+    found = coupling * gravity / weight
     at = [estimate.names.index(name) for name in ("coupling", "gravity_2")]
     slope = np.array([found / coupling, -found / weight])
     std = float(np.sqrt(max(0.0, slope @ estimate.covariance[np.ix_(at, at)] @ slope)))
@@ -90,8 +95,8 @@ def torque_scale_std(config: Config) -> dict[str, float]:
     return {"torque_scale_2": float(np.linalg.norm(unsure))} if unsure.size == 2 and unsure.any() else {}
 
 
-def _link_length(config: Config) -> float | None:
+def link_length(known: KnownConfig | None, arm: ArmConfig | ArmFacts) -> float | None:
     """Length of link 1 [m] from [known] or link_lengths; None if neither is given."""
-    if config.known is not None and config.known.length_1 is not None:
-        return config.known.quantities()["length_1"].value
-    return None if config.arm.link_lengths is None else config.arm.link_lengths[0]
+    if known is not None and known.length_1 is not None:
+        return known.quantities()["length_1"].value
+    return None if arm.link_lengths is None else arm.link_lengths[0]

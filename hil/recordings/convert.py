@@ -53,6 +53,7 @@ def convert(table: Table, columns: Columns) -> Converted:
     whole = guessed(table, columns)
     notes = [] if whole == columns else [said(whole, table)]
     assert whole.position is not None and whole.drive is not None  # or guessed would have raised
+    notes += _unused(table, whole)
     time = _time(table, whole)
     ticks = 0.0 if whole.ticks_per_turn is None else 2.0 * np.pi / whole.ticks_per_turn
     position = np.stack(
@@ -96,6 +97,16 @@ def convert(table: Table, columns: Columns) -> Converted:
         velocity_doubts(found),
         contradict(found),
     )
+
+
+def _unused(table: Table, columns: Columns) -> list[str]:
+    """State which keys of [columns] have no effect, since that of a wrong key would be missed."""
+    stated = [columns.position_unit, *(unit_of(table.find(name)[2] or "") for name in columns.position or ())]
+    unused = [f"columns.{key}" for key in columns.without_effect(in_ticks=TICKS in stated)]
+    if not unused:
+        return []
+    have = "has" if len(unused) == 1 else "have"
+    return [f"{table.source}: {', '.join(unused)} {have} no effect on columns of {columns.drive} and position."]
 
 
 def _steps(found: Sequence[float | None], position: Values) -> Values:

@@ -12,7 +12,7 @@ from hil.estimator.errors import ModelError, ShapeError
 from hil.estimator.fit.reparametrisation import Coordinates, Sizes, scales_of
 from hil.estimator.models.model import Model
 from hil.estimator.models.parameters import Physics
-from hil.estimator.models.regressor import inverse_dynamics, regressor
+from hil.estimator.models.regressor import regressor
 from hil.estimator.models.terms import base_names, units_of
 from hil.estimator.options import CoordinateOptions
 from hil.estimator.simulation.arm import simulate
@@ -30,7 +30,7 @@ def test_regressor_gives_the_torque_of_the_written_equations(theta: np.ndarray, 
     tau1 += g1 * np.cos(q1) + g2 * np.cos(q1 + q2) + fv1 * v1 + fc1 * np.sign(v1) + o1
     tau2 = (d + b * c) * a1 + (d + ia) * a2 + b * s * v1**2
     tau2 += g2 * np.cos(q1 + q2) + fv2 * v2 + fc2 * np.sign(v2) + o2
-    torque = inverse_dynamics(theta, *(part[:, None] for part in motion))
+    torque = regressor(*(part[:, None] for part in motion)) @ theta
     assert np.allclose(torque[:, 0], (tau1, tau2), atol=1e-9)
 
 
@@ -134,7 +134,7 @@ def test_simulation_obeys_inverse_dynamics() -> None:
     t = (np.arange(samples * steps) + 0.5) / (rate * steps)
     speed, size, shift = np.array([[3.0], [5.0]]), np.array([[0.8], [0.6]]), np.array([[-1.57], [0.3]])
     position, velocity = shift + size * np.sin(speed * t), size * speed * np.cos(speed * t)
-    torque = inverse_dynamics(theta, position, velocity, -size * speed**2 * np.sin(speed * t), width)
+    torque = regressor(position, velocity, -size * speed**2 * np.sin(speed * t), width) @ theta
     physics = Physics.of(
         {**dict(zip(names, theta.tolist(), strict=True)), "coulomb_width_1": width, "coulomb_width_2": width}
     )

@@ -13,7 +13,7 @@ import pytest
 from hil import load_model
 from hil.arm_model import ArmModel
 from hil.errors import ResultError
-from hil.estimator.models.regressor import inverse_dynamics
+from hil.estimator.models.regressor import regressor
 from hil.estimator.models.terms import base_names
 from hil.export.parameters import export_toml
 from hil.export.source import Source
@@ -32,7 +32,7 @@ def test_it_has_the_estimators_equations(identified: Path) -> None:
     sharp = dataclasses.replace(model, values={name: model.values[name] for name in names})
     q, dq, ddq = motions((500, 2))
     theta = np.array([model.values[name] for name in names])
-    expected = inverse_dynamics(theta, q.T, dq.T, ddq.T).T
+    expected = (regressor(q.T, dq.T, ddq.T) @ theta).T
     np.testing.assert_allclose(sharp.inverse_dynamics(q, dq, ddq), expected, atol=1e-13)
 
 

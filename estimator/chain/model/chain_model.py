@@ -76,7 +76,7 @@ class ChainModel:
             terms.append((ADDED_MASS, "1"))
         terms += [(f"back_emf_{joint}", "1") for joint in self.by_voltage]
         terms += [(name, "s") for name in DRIVE[self.drive]]
-        if self.lags and "lag" in DRIVE[self.drive]:
+        if self._has_lags:
             terms += [(f"lag_ratio_{joint}", "1") for joint in self._numbers[1:]]
         return terms
 
@@ -95,9 +95,13 @@ class ChainModel:
     def description(self) -> str:
         """Text that names the friction model, the options and the drive model."""
         words = {"zeros": self.zeros, "torque scales": self.torque_scale, "base tilt": self.base_tilt}
-        words |= {"added mass": self.added_mass, "lags": self.lags and self.drive != "delay"}
-        words["back-EMF"] = bool(self.by_voltage)
+        words |= {"added mass": self.added_mass, "lags": self._has_lags, "back-EMF": bool(self.by_voltage)}
         return " + ".join((self.friction, *(word for word, there in words.items() if there), self.drive))
+
+    @property
+    def _has_lags(self) -> bool:
+        """Whether each joint has a lag of its own."""
+        return self.lags and "lag" in DRIVE[self.drive]
 
     @property
     def _numbers(self) -> range:

@@ -14,13 +14,13 @@ from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import read_arm
 from hil.description.urdf import rotation_of
 from hil.errors import ConfigError
-from hil.estimation.chain_estimate import vague
+from hil.estimation.chain_estimate import chain_facts, vague
 from hil.estimation.torque_constants import contradictions, ratios_of, ratios_said
 from hil.estimation.unsettled.chain_slips import late_torque, refuse_chain_slips, torques_apart
 from hil.estimator.chain.column_faults import ColumnCheck
 from hil.estimator.chain.identify import SYSTEMATIC
 from hil.estimator.chain.model.base_parameters import BaseParameters
-from hil.estimator.chain.model.chain_model import ChainModel
+from hil.estimator.chain.model.chain_model import ChainModel, Drive
 from hil.estimator.chain.model.geometry import Chain
 from hil.estimator.chain.model.prior import Prior
 from hil.estimator.chain.recordings import MotionPiece, RecordedChain, identify_recordings, torque_error
@@ -28,7 +28,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 from hil.estimator.models.bounds import bound_sentence
 from hil.estimator.models.conflicts import Trust, conflict_sentences, contradicted, lowered
-from hil.results.parts import ChainFacts, Covariance, Quantity, ShootingFit, Timing, Validation, Verdict
+from hil.results.parts import Covariance, Quantity, ShootingFit, Timing, Validation, Verdict
 from hil.results.result import ShootingResult
 
 Array = NDArray[np.float64]
@@ -70,10 +70,14 @@ def estimate_chain_recordings(
     base = BaseParameters.of(Chain(*arm.geometry, gravity), tilts=config.model.base_tilt)
     prior = Prior.of(base, arm.parameters)
     wanted = config.model
-    # One delay for all would leave differences between the joints' lags unexplained.
-    drive = wanted.drive if "model" in config.model_fields_set or base.chain.joints == 1 else "delay_lag"
     model = ChainModel(
-        *(base, wanted.fixed_friction, drive, wanted.zeros, wanted.torque_scale and base.chain.joints > 1),
+        *(
+            base,
+            wanted.fixed_friction,
+            _drive(config, base.chain.joints),
+            wanted.zeros,
+            wanted.torque_scale and base.chain.joints > 1,
+        ),
         base_tilt=wanted.base_tilt,
         lags=base.chain.joints > 1,
         by_voltage=tuple(range(1, base.chain.joints + 1)) if config.columns.drive in {"voltage", "pwm"} else (),
@@ -111,19 +115,18 @@ def estimate_chain_recordings(
         verdict=_verdict(found, arm, foretold, prior, contradictory, late),
         warnings=doubted_inertias(arm),
         timing=Timing(estimation_seconds=round(time.perf_counter() - began, 3)),
-        chain=ChainFacts(
-            urdf=Path(config.arm.urdf or "").name,
-            rotation=tuple(tuple(map(tuple, each)) for each in base.chain.rotation.tolist()),
-            translation=tuple(map(tuple, base.chain.translation.tolist())),
-            axis=tuple(map(tuple, base.chain.axis.tolist())),
-            gravity=tuple(base.chain.gravity.tolist()),
-            groups=dict(zip(base.names, base.groups, strict=True)),
-            from_prior=found.from_prior,
-            held=arm.held,
-            doubts=arm.doubts,
-        ),
+        chain=chain_facts(arm, base, found.from_prior),
     )
     return ChainEstimated(result, _predicted(recordings, found))
+
+
+def _drive(config: RecordingConfig, joints: int) -> Drive:
+    """The drive model of the file; by default, for several joints, a common delay and a lag of each.
+
+    Other tools' recordings may have both, and lags that differ by joint are not explained by a delay.
+    """
+    is_given = "model" in config.model_fields_set and "drive" in config.model.model_fields_set
+    return config.model.drive if is_given or joints == 1 else "delay_lag"
 
 
 def _described(config: RecordingConfig, joints: int, shown: str) -> ArmDescription:
@@ -221,11 +224,12 @@ def _verdict(
         trust = trust if worst <= EXPLAINED else "with care"
         if found.systematic > SYSTEMATIC:
             trust = "with care"
+            lags = ', lags that differ by joint (model.drive = "delay_lag")' if found.model.drive == "delay" else ""
             sentences.append(
                 "Part of the residual repeats with the motion. This increases standard errors by a factor of up to "
                 f"{found.systematic:.1f}, and some values may be wrong by more than their standard errors. An effect "
                 "is missing from the model: torque ripple or cogging, play or elasticity of the gears, a cable, "
-                "friction that depends on load or changes with time, or torques that differed from the commands."
+                f"friction that depends on load or changes with time{lags}, or torques that differed from the commands."
             )
     else:
         trust = "with care"

@@ -13,7 +13,7 @@ from hil.config.experiment import ModelConfig
 from hil.errors import ConfigError
 from hil.estimation.drive.currents import current_findings
 from hil.estimation.model_from_config import wanted_model
-from hil.estimation.plausibility import torque_scale_std
+from hil.estimation.plausibility import link_length, torque_scale_std, wrong_length
 from hil.estimation.result import arm_facts
 from hil.estimation.result_checks import describe_segment_choice, describe_verdict
 from hil.estimation.slips.position_jumps import jump_warnings
@@ -27,7 +27,7 @@ from hil.estimator.data.recording import Recording
 from hil.estimator.errors import RecordingError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
 from hil.estimator.models.conflicts import Conflict, conflicts
-from hil.estimator.selection.segment_verdict import SegmentEvidence, explains_well, judge_segments
+from hil.estimator.selection.segment_verdict import SegmentEvidence, judge_segments
 from hil.estimator.selection.segments import considered, missing_terms, predicted_positions
 from hil.estimator.selection.unsettled import SegmentChoice, choose_by_shooting, held_out_error
 from hil.estimator.selection.verdict import Verdict
@@ -65,7 +65,8 @@ class Given:
     torque_scale_std: relative standard deviation of the ratio of the torque constants, by parameter. zeros: whether a
     configuration defines the encoder zeros. names: names of the recordings. jumps: a sentence for each joint of a
     recording whose position jumped. torque_source: where the torques come from. origin: the angles [rad] at which the
-    position columns are 0, by default 0. repeats: whether each recording is the mean of similar periods.
+    position columns are 0, by default 0. repeats: whether each recording is the mean of similar periods. length:
+    measured length of link 1 [m].
     """
 
     torque_scale_std: Mapping[str, float] = field(default_factory=dict)
@@ -75,6 +76,7 @@ class Given:
     torque_source: Source = "column"
     origin: tuple[float, ...] = ()
     repeats: bool = False
+    length: float | None = None
 
 
 def estimate_unsettled(run: RunFolder) -> ShootingResult:
@@ -94,7 +96,8 @@ def estimate_unsettled(run: RunFolder) -> ShootingResult:
         command_to_sample=facts.command_to_sample,
     )
     jumps = tuple(jump_warnings(config, facts, samples))
-    given = Given(torque_scale_std(config), zeros=True, jumps=jumps, torque_source="constant")
+    length = link_length(config.known, config.arm)
+    given = Given(torque_scale_std(config), zeros=True, jumps=jumps, torque_source="constant", length=length)
     zeros, gravity = config.model.zeros, config.arm.gravity
     result = estimate_any([recording], config.model, 1.0, zeros, facts.config, gravity, given=given).result
     seldom = (facts.monitoring,) if facts.monitoring else ()
@@ -161,23 +164,21 @@ def _judged(
         () if why else contradictions(joints, ratios, given.torque_scale_std, given.torque_source, conflicts_found)
     )
     scales = () if spoiled else angle_scale(recordings, estimate, given.origin)
-    unknown, known_well = undetermined(estimate), explains_well(recordings, estimate, fitted.gravity > 0.0)
-    odd = (*why, *scales, *contradictory, *implausible(recordings, estimate, fitted.gravity))
+    lengths = () if spoiled else wrong_length(given.length, fitted.gravity, estimate)
+    odd = (*why, *scales, *contradictory, *lengths, *implausible(recordings, estimate, fitted.gravity))
     return judge_segments(
         recordings,
         estimate,
         SegmentEvidence(
             held_out,
             () if spoiled else missing_terms(recordings, estimate),
-            (*((JUMPED,) if given.jumps else ()), *odd, *(() if known_well else unknown)),
+            (*((JUMPED,) if given.jumps else ()), *odd),
             bool(found.faults),
             bool(found.doubts),
             conflicts_found,
+            tuple(undetermined(estimate)),
             spoiled,
-            (
-                *(unknown if known_well else ()),
-                *(() if why else ratios_said(joints, ratios, given.torque_source, contradictory)),
-            ),
+            () if why else ratios_said(joints, ratios, given.torque_source, contradictory),
             fitted.gravity > 0.0,
             found.reason,
         ),

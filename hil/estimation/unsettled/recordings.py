@@ -4,7 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from hil.config.csv_columns import Columns
 from hil.config.recording import RecordingConfig, load_recording_config
 from hil.errors import ConfigError, CsvError
 from hil.estimation.physical import physical_of
+from hil.estimation.plausibility import link_length
 from hil.estimation.slips.recorded_jumps import jump_sentences
 from hil.estimation.unsettled.chain_recordings import estimate_chain_recordings
 from hil.estimation.unsettled.estimate import Estimated, Given, estimate_any
@@ -32,21 +33,6 @@ from hil.runs.recording_folder import Predicted, describe, save
 from hil.runs.run_folder import write_json
 
 MOST_RECORDINGS = 200
-
-
-@dataclass(frozen=True)
-class _Read:
-    """All recordings of one arm. notes: sentences about what was guessed, corrected or averaged. doubts: contradictions
-    among the columns. unusable: whether these are so large that a model is useless.
-    """
-
-    recordings: tuple[Recording, ...]
-    names: tuple[str, ...]
-    stepped: tuple[bool, ...]
-    columns: Columns
-    notes: tuple[str, ...]
-    doubts: tuple[str, ...]
-    unusable: bool
 
 
 def estimate_recordings(paths: Sequence[Path], config_path: Path | None, folder: Path | None) -> ShootingResult:
@@ -76,9 +62,13 @@ def _estimate_planar(
     refuse_slips(read.recordings, ", ".join(map(str, paths)), columns.zero)
     jumps = jump_sentences(whole.recordings, whole.names, whole.stepped)
     repeats = all(one is not mean for one, mean in zip(whole.recordings, read.recordings, strict=True))
-    given = Given(names=read.names, jumps=jumps, origin=tuple(columns.zero or ()), repeats=repeats)
+    lengths, joints = config.arm.link_lengths, read.recordings[0].joints
+    if lengths is not None and len(lengths) != joints:
+        raise ConfigError(f"{shown}: arm.link_lengths: give one length per position column ({joints}).")
+    length = link_length(config.known, config.arm)
+    given = Given(names=read.names, jumps=jumps, origin=tuple(columns.zero or ()), repeats=repeats, length=length)
     found = estimate_any(read.recordings, config.model, columns.segment, zeros, shown, gravity, read.stepped, given)
-    result = _doubted(_named(found, read, gravity), read)
+    result = _doubted(_named(found, read, config), read)
     if config.known is not None:
         result = replace(result, physical=physical_of(result, config.known.quantities(), gravity))
     if folder is not None:
@@ -94,11 +84,9 @@ def _estimate_chain(
     read = _read(paths, config.columns)
     shown = ", ".join(map(str, paths)) if config_path is None else str(config_path)
     found = estimate_chain_recordings(read.recordings, config, shown, ", ".join(map(str, paths)))
-    arm = _arm(read, config.arm.gravity)
-    names = config.joint_names
-    assert names is not None and config.arm.urdf is not None  # checked by the estimate
-    arm = replace(arm, joints=tuple(replace(each, name=name) for each, name in zip(arm.joints, names, strict=True)))
-    jumps = jump_sentences(read.recordings, read.names, read.stepped, names)
+    arm = _arm(read, config)
+    assert config.arm.urdf is not None  # checked by the estimate
+    jumps = jump_sentences(read.recordings, read.names, read.stepped, tuple(joint.name for joint in arm.joints))
     warnings = (*jumps, *found.result.warnings)
     result = replace(found.result, recordings=read.names, arm=arm, notes=read.notes, warnings=warnings)
     result = _doubted(result, read)
@@ -111,7 +99,7 @@ def _estimate_chain(
     return result
 
 
-def _read(paths: Sequence[Path], columns: Columns) -> _Read:
+def _read(paths: Sequence[Path], columns: Columns) -> Converted:
     found = [convert(table, columns) for path in paths for table in read_tables(path)]
     if len({len(each.columns.position or ()) for each in found}) > 1:
         raise ConfigError("The files have different numbers of joints: give recordings of one arm.")
@@ -120,8 +108,9 @@ def _read(paths: Sequence[Path], columns: Columns) -> _Read:
         raise CsvError(f"{len(recordings)} recordings, more than {MOST_RECORDINGS}: give fewer files or episodes.")
     names = tuple(name for each in found for name in each.names)
     stepped = tuple(bool(all(flags)) for flags in zip(*(each.stepped for each in found), strict=True))
-    stated, unusable = _notes(found), any(each.unusable for each in found)
-    return _Read(_stepped_alike(recordings, found), names, stepped, found[0].columns, stated, _doubts(found), unusable)
+    notes, doubts = _once(each.notes for each in found), _once(each.doubts for each in found)
+    unusable = any(each.unusable for each in found)
+    return Converted(_stepped_alike(recordings, found), names, stepped, found[0].columns, notes, doubts, unusable)
 
 
 def _stepped_alike(recordings: tuple[Recording, ...], found: Sequence[Converted]) -> tuple[Recording, ...]:
@@ -132,15 +121,11 @@ def _stepped_alike(recordings: tuple[Recording, ...], found: Sequence[Converted]
     return tuple(replace(each, position_step=step) for each in recordings)
 
 
-def _notes(found: Iterable[Converted]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(note for each in found for note in each.notes))
+def _once(sentences: Iterable[Sequence[str]]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(each for some in sentences for each in some))
 
 
-def _doubts(found: Iterable[Converted]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(doubt for each in found for doubt in each.doubts))
-
-
-def _doubted(result: ShootingResult, read: _Read) -> ShootingResult:
+def _doubted(result: ShootingResult, read: Converted) -> ShootingResult:
     """The result with the doubts about the columns added to its verdict."""
     verdict = result.verdict
     if not read.doubts or verdict is None:
@@ -149,7 +134,7 @@ def _doubted(result: ShootingResult, read: _Read) -> ShootingResult:
     return replace(result, verdict=replace(verdict, trust=trust, sentences=(*verdict.sentences, *read.doubts)))
 
 
-def _zeroed(read: _Read, gravity: float) -> _Read:
+def _zeroed(read: Converted, gravity: float) -> Converted:
     """Measure angles from the horizontal, if their origin is not given but can be determined from gravity."""
     if gravity <= 0.0 or read.columns.zero is not None:
         return read
@@ -169,7 +154,7 @@ def _zeroed(read: _Read, gravity: float) -> _Read:
     return replace(read, recordings=moved, columns=columns, notes=(*read.notes, said))
 
 
-def _averaged(read: _Read) -> _Read:
+def _averaged(read: Converted) -> Converted:
     recordings, notes = [], list(read.notes)
     for name, recording in zip(read.names, read.recordings, strict=True):
         mean = mean_period(recording) if read.columns.between == "held" else None
@@ -181,12 +166,12 @@ def _averaged(read: _Read) -> _Read:
     return replace(read, recordings=tuple(recordings), notes=tuple(notes))
 
 
-def _named(found: Estimated, read: _Read, gravity: float) -> ShootingResult:
+def _named(found: Estimated, read: Converted, config: RecordingConfig) -> ShootingResult:
     result = found.result
     zeros = result.zeros
     if zeros is not None:
         zeros = tuple(replace(zero, recording=name) for name, zero in zip(read.names, zeros, strict=True))
-    arm = _arm(read, gravity)
+    arm = _arm(read, config)
     notes = [*read.notes, *_back_emf(read.columns, result)]
     return replace(result, recordings=read.names, zeros=zeros, arm=arm, notes=tuple(notes))
 
@@ -205,12 +190,13 @@ def _back_emf(columns: Columns, result: ShootingResult) -> list[str]:
     return [f"The joints are driven by voltage, so viscous friction includes braking by back-EMF: {', '.join(parts)}."]
 
 
-def _arm(read: _Read, gravity: float) -> ArmFacts:
+def _arm(read: Converted, config: RecordingConfig) -> ArmFacts:
     """Describe the joints from the recordings; the limits are the observed extremes."""
     columns = read.columns
-    gains = columns.gains or [1.0] * len(columns.position or ())
+    gains, names = columns.gains or [1.0] * len(columns.position or ()), config.joint_names
+    named = names if names is not None and len(names) == len(gains) else _joint_names(columns.position or ())
     joints = []
-    for joint, (name, gain) in enumerate(zip(_joint_names(columns.position or ()), gains, strict=True)):
+    for joint, (name, gain) in enumerate(zip(named, gains, strict=True)):
         position = np.concatenate([each.position[joint] for each in read.recordings])
         speed = np.concatenate([np.diff(each.filled()[joint]) / np.diff(each.time) for each in read.recordings])
         goal = max(float(np.abs(each.torque[joint]).max()) for each in read.recordings) / gain
@@ -227,10 +213,10 @@ def _arm(read: _Read, gravity: float) -> ArmFacts:
             )
         )
     rest = read.recordings[0].filled()[:, 0]
-    return ArmFacts(gravity, tuple(rest.tolist()), tuple(joints))
+    return ArmFacts(config.arm.gravity, tuple(rest.tolist()), tuple(joints))
 
 
-def _joint_names(columns: Sequence[str]) -> list[str]:
+def _joint_names(columns: Sequence[str]) -> Sequence[str]:
     """Joint names from the column names; numbers if there are none."""
     last = [re.split(r"[./]", split_head(name)[0])[-1] for name in columns]
     named = len(set(last)) == len(last) and not any(re.search(r"\d", name) for name in last) and len(last) > 1
@@ -242,7 +228,7 @@ def _keep(
     paths: Sequence[Path],
     config_path: Path | None,
     config: RecordingConfig,
-    read: _Read,
+    read: Converted,
     predicted: Sequence[NDArray[np.float64]],
 ) -> None:
     kept = [

@@ -193,7 +193,7 @@ def test_mean_torque_is_the_integral_of_what_was_held_or_drawn() -> None:
     ("change", "error", "said"),
     [
         (lambda r: {"time": r.time[::-1]}, RecordingError, "it must increase"),
-        (lambda r: {"time": 1000.0 * r.time}, RecordingError, "Is time in seconds"),
+        (lambda r: {"time": 1000.0 * r.time}, RecordingError, r"Is time in seconds\? .* columns\.time_unit"),
         (lambda r: {"time": r.time + 30.0 * (r.time > 1.0)}, RecordingError, "split the recording there"),
         (lambda r: {"time": np.where(r.time > 1.0, np.nan, r.time)}, RecordingError, "time of sample"),
         (lambda r: {"position": 4096.0 * r.position}, RecordingError, "are these degrees or encoder"),
@@ -205,7 +205,15 @@ def test_mean_torque_is_the_integral_of_what_was_held_or_drawn() -> None:
             r"joint 1: sample 100 at \S+ s is \S+ rad away from both its neighbours: it is an outlier",
         ),
         (lambda r: {"position": np.full_like(r.position, np.nan)}, RecordingError, "0 % of"),
-        (lambda r: {"position": np.zeros_like(r.position)}, StandstillError, "joint 1 moved by 0 rad"),
+        (lambda r: {"position": np.zeros_like(r.position)}, StandstillError, "joint 1 is always 0 rad"),
+        (
+            lambda r: {
+                "position": np.where(r.time == r.time[9], 1e300, r.position),
+                "position_step": np.full(2, 1e300),
+            },
+            RecordingError,
+            r"joint 1: sample 10 at \S+ s is 1e\+300 rad away from both its neighbours: it is an outlier",
+        ),
         (lambda r: {"torque": np.where(r.time > 1.0, np.nan, r.torque)}, RecordingError, "torques are not finite"),
         (lambda r: {"torque": 0.0 * r.torque}, RecordingError, "all torques are 0"),
         (lambda r: {"torque": 1e6 * r.torque}, RecordingError, "check its unit"),

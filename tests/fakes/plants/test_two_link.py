@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from hil.estimator.models.regressor import inverse_dynamics
+from hil.estimator.models.regressor import regressor
 from hil.estimator.models.terms import base_names
 from hil.fakes.plants import two_link
 from hil.fakes.plants.arm import Arm, armature, base_parameters
@@ -90,7 +90,7 @@ def test_plant_and_regressor_are_the_same_arm(
     acceleration = [(after - before) / step for before, after in zip(velocity, plant.velocity, strict=True)]
     theta = np.array(list(base_parameters(smooth).values()))
     column = [np.array(x)[:, None] for x in (position, velocity, acceleration)]
-    torque = inverse_dynamics(theta, *column, coulomb_width=0.3)[:, 0]
+    torque = (regressor(*column, coulomb_width=0.3) @ theta)[:, 0]
     assert np.allclose(torque, 1.8 * np.array(current), rtol=0.0, atol=1e-6)
 
 

@@ -43,6 +43,8 @@ def test_defaults_make_a_file_that_runs(arm_file: ArmFile, capsys: pytest.Captur
     assert hil("check", "mine.toml") == 0
     assert hil("init", arm_file(), "--yes", "--out", "mine.toml") == 2
     assert "mine.toml already exists" in capsys.readouterr().err
+    assert hil("init", "nonsense", "--yes", "--out", "mine.toml") == 2
+    assert "Cannot open port 'nonsense'" in capsys.readouterr().err
 
 
 def test_answers_are_asked_again_until_they_make_sense(arm_file: ArmFile) -> None:

@@ -134,6 +134,8 @@ def test_an_absent_file_and_one_that_is_no_text(tmp_path: Path) -> None:
 def test_a_misspelt_bundled_name_is_guessed() -> None:
     with pytest.raises(ConfigError, match="Did you mean the bundled configuration fake_two_link"):
         load_config(Path("fake_two_lnk"))
+    with pytest.raises(ConfigError, match="Did you mean the bundled configuration fake_two_link"):
+        load_config(Path("no_such_folder/fake_two_link.toml"))
     with pytest.raises(ConfigError, match="Bundled configurations: fake_horizontal, "):
         load_config(Path("no_such_arm_at_all"))
 

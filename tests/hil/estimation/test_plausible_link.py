@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hil.estimation.plausibility import wrong_length
 from hil.estimation.unsettled.plausibility import implausible
 
 
@@ -16,6 +17,18 @@ def test_a_length_that_no_arm_has_is_named(time: float, named: bool) -> None:
     estimate: Any = SimpleNamespace(parameters=value, names=tuple(value), value=values, std=0.01 * values)
     found = implausible([SimpleNamespace(joints=0)], estimate, 9.81)  # type: ignore[list-item]
     assert any("link 1 would be" in said for said in found) is named
+
+
+@pytest.mark.parametrize(
+    ("length", "gravity", "named"), [(0.2, 9.81, False), (0.3, 9.81, True), (0.12, 9.81, True), (0.3, 0.0, False)]
+)
+def test_a_wrong_length_of_link_1_is_named(length: float, gravity: float, named: bool) -> None:
+    value = {"coupling": 0.2 * 0.4 / 9.81, "gravity_2": 0.4}
+    covariance = np.diag([8e-6**2, 4e-4**2])
+    model = SimpleNamespace(joints=2)
+    estimate: Any = SimpleNamespace(parameters=value, names=tuple(value), covariance=covariance, model=model)
+    assert bool(wrong_length(length, gravity, estimate)) is named
+    assert not wrong_length(None, gravity, estimate)
 
 
 @pytest.mark.parametrize(("inertia", "named"), [(0.0142, False), (1.42e-4, True)])

@@ -46,6 +46,34 @@ def test_values_far_from_the_files_lower_the_verdict(estimate: Any, given: Given
     assert bool(said) == ("standard deviations from" in " ".join(verdict.sentences))
 
 
+@pytest.mark.parametrize(
+    ("left", "error", "std", "undetermined", "trust", "said"),
+    [
+        (1.1, 0.011, 1e-4, (), "with care", "the error of the prediction exceeds 1 %"),
+        (2.5, 0.004, 1e-4, (), "yes", "not fully explained: its residual is 2.5 times the noise (up to 5 times"),
+        (5.1, 0.004, 1e-4, (), "with care", "the residual exceeds 5 times the noise"),
+        (5.1, 0.06, 1e-4, (), "no", 'An error above 5 % makes the verdict "no"'),
+        (1.1, None, 1e-4, (), "with care", "the residual exceeds 1.06 times the noise"),
+        (1.0, 0.004, 5e-3, (), "with care", "viscous_1 is not known to within 10 %"),
+        (1.5, 0.004, 1e-4, ("Not determined: x.",), "yes", "Not determined: x."),
+        (1.6, 0.004, 1e-4, ("Not determined: x.",), "with care", "only if the residual is at most 1.5 times the noise"),
+    ],
+)
+def test_the_verdict_names_the_limit_that_a_number_exceeds(
+    left: float, error: float | None, std: float, undetermined: tuple[str, ...], trust: str, said: str
+) -> None:
+    """One rule for all recordings; a residual of 1.1 times the noise is not "cannot explain"."""
+    recordings: Any = [SimpleNamespace(torque=np.ones((2, 10)))]
+    estimate = estimated(left=left)
+    estimate.std[2] = std
+    held_out = None if error is None else np.array([error])
+    verdict = judge_segments(recordings, estimate, SegmentEvidence(held_out, undetermined=undetermined))
+    sentences = " ".join(verdict.sentences)
+    assert verdict.trust == trust and said in sentences
+    assert ("cannot explain" in sentences) == (left > 5.0)
+    assert ('The verdict is not "yes" because' in sentences) == (trust == "with care")
+
+
 @pytest.mark.parametrize("spoiled", [True, False])
 def test_the_verdict_gives_its_own_reason_and_no_infinite_uncertainty(spoiled: bool) -> None:
     recordings: Any = [SimpleNamespace(torque=np.ones((2, 10)))]

@@ -12,9 +12,10 @@ import pytest
 
 import hil as api
 from benchmarks import chain as bench
+from hil.config.recording import parse_recording_config
 from hil.errors import ConfigError, CsvError
 from hil.estimation.unsettled import chain_recordings
-from hil.estimation.unsettled.chain_recordings import _verdict
+from hil.estimation.unsettled.chain_recordings import _drive, _verdict
 from hil.estimator.chain.model.chain_model import ChainModel
 from hil.estimator.errors import ConvergenceError
 from tests.support.command_line import hil
@@ -76,7 +77,7 @@ def test_commanded_torque_gives_the_likelihood(setup: bench.Setup, capsys: pytes
 
 @pytest.mark.parametrize(
     ("given", "drive"),
-    [("", "delay_lag"), ('[model]\ndrive = "delay"\n', "delay"), ('[model]\nfriction = "stribeck"\n', "lag")],
+    [("", "delay_lag"), ('[model]\ndrive = "delay"\n', "delay"), ('[model]\nfriction = "stribeck"\n', "delay_lag")],
 )
 def test_joints_have_lags_of_their_own_unless_the_file_says_otherwise(
     setup: bench.Setup, monkeypatch: pytest.MonkeyPatch, given: str, drive: str
@@ -129,6 +130,20 @@ def test_errors_that_repeat_with_the_motion_are_trusted_with_care(setup: bench.S
     assert "repeats with the motion" in hidden.sentences[1]
     found.systematic, found.std = 0.9, 1.1 * setup.prior.std
     assert _verdict(found, arm, np.full(4, 0.01), setup.prior).trust == "with care"
+
+
+@pytest.mark.parametrize(("model", "drive"), [("", "delay_lag"), ('[model]\nfriction = "stribeck"\n', "delay_lag")])
+def test_lags_may_differ_by_joint_unless_the_file_gives_the_drive(setup: bench.Setup, model: str, drive: str) -> None:
+    """Lags of 1 to 2 ms were fitted by one delay: viscous friction was 4 standard errors off."""
+    assert _drive(parse_recording_config(model, Path("arm.toml")), 4) == drive
+    assert _drive(parse_recording_config('[model]\ndrive = "delay"\n', Path("arm.toml")), 4) == "delay"
+    fitted_model = ChainModel(setup.base, drive="delay_lag", lags=True)
+    assert "lag_ratio_4" in fitted_model.names and "lags" in fitted_model.description
+    common = ChainModel(setup.base, drive="delay", lags=True)
+    assert "lag_ratio_4" not in common.names and "lags" not in common.description
+    arm, found = fitted(setup, residual_over_noise=np.ones(4), systematic=3.0)
+    found.model = common
+    assert "lags that differ by joint" in " ".join(_verdict(found, arm, np.full(4, 0.01), setup.prior).sentences)
 
 
 def test_an_incomplete_model_that_fails_its_own_prediction_is_not_trusted(setup: bench.Setup) -> None:

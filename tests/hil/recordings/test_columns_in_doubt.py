@@ -122,6 +122,47 @@ def test_a_dataset_whose_description_is_no_table_is_refused(text: str, tmp_path:
         read_dataset(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("keys", "unused"),
+    [
+        (
+            {"torque": ["tau1"], "supply_voltage": 12.0, "ticks_per_turn": 4096.0},
+            "ticks_per_turn, columns.supply_voltage",
+        ),
+        ({"torque": ["tau1"], "torque_constant": [1.0], "current_unit": "A"}, "current_unit, columns.torque_constant"),
+        ({"current": ["tau1"], "torque_constant": [1.0]}, ""),
+        ({"pwm": ["tau1"], "supply_voltage": 12.0, "torque_per_volt": [1.0], "resistance": [5.0]}, "resistance"),
+        ({"pwm": ["tau1"], "supply_voltage": 12.0, "torque_constant": [1.0], "resistance": [5.0]}, ""),
+    ],
+)
+def test_keys_without_effect_are_named(keys: dict[str, Any], unused: str) -> None:
+    columns = Columns.model_validate({"time": "t", "position": ["q1"], **keys})
+    notes = " ".join(convert(table(q1=rounded(1.2), tau1=rounded(0.5)), columns).notes)
+    assert (f"arm.csv: columns.{unused} ha" in notes) if unused else ("no effect" not in notes)
+
+
+@pytest.mark.parametrize(
+    ("given", "used"), [(("shoulder",), ("shoulder",)), (("a", "b"), ("joint_1",)), ((), ("joint_1",))]
+)
+def test_results_name_joints_as_the_configuration_does(given: tuple[str, ...], used: tuple[str, ...]) -> None:
+    config = parse_recording_config("".join(f'[[joints]]\nname = "{name}"\n' for name in given), Path("arm.toml"))
+    columns = Columns(time="t", position=["q1"], torque=["tau1"])
+    read: Any = convert(table(q1=rounded(1.2), tau1=rounded(0.5)), columns)
+    assert tuple(joint.name for joint in estimates._arm(read, config).joints) == used
+
+
+@pytest.mark.parametrize(
+    ("lengths", "said"), [("[0]", "must be greater than 0"), ("[0.2, 0.2, 0.2]", "one length per")]
+)
+def test_link_lengths_are_checked(lengths: str, said: str, tmp_path: Path) -> None:
+    rows = zip(TIME, rounded(1.2), rounded(0.5), strict=True)
+    text = "t,q1,tau1\n" + "\n".join(",".join(map(str, row)) for row in rows)
+    (tmp_path / "arm.csv").write_text(text, encoding="utf-8")
+    (tmp_path / "arm.toml").write_text(f"[arm]\nlink_lengths = {lengths}\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=said):
+        estimates.estimate_recordings([tmp_path / "arm.csv"], tmp_path / "arm.toml", None)
+
+
 @pytest.mark.parametrize("unit", ["mNm", "mN m", "mN*m"])
 def test_a_torque_unit_needs_no_space(unit: str) -> None:
     assert Columns.model_validate({"torque_unit": unit}).torque_unit == "mN m"
