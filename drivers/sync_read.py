@@ -266,7 +266,6 @@ class FastSyncRead:
         return [packet[start + 1] for _, start in self._intact(packet)]
 
     def _packet(self, received: bytes) -> bytes:
-        """Return the received bytes from the start of the status packet."""
         at = received.find(self._front)
         return received[at:] if at >= 0 else b""
 

@@ -1,8 +1,7 @@
 """Compiled loops whose disk cache is invalidated by any change in the code or constants compiled into them.
 
-numba stores compiled code next to the source and checks only the date of that one file. Functions inlined from other
-modules, and constants taken from them, could therefore be older than their sources; and if a file changes while a
-program starts, old code could be stored under the new date. So the cache is stamped with a hash of the loaded code.
+numba stores compiled code next to the source and checks only the date of that one file. Functions and constants inlined
+from other modules could therefore be older than their sources. So the cache is stamped with a hash of the loaded code.
 """
 
 import hashlib

@@ -1,8 +1,7 @@
 """Options of the fits: tolerances, limits and initial guesses, in one frozen object per fit.
 
 Names follow scipy.optimize: `ftol` is the relative decrease of the sum of squares below which a fit has converged,
-`max_iterations` the maximum number of iterations. All published figures of this project were measured with the
-defaults.
+`max_iterations` the maximum number of iterations.
 """
 
 from dataclasses import dataclass

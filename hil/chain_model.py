@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hil.arm_model import ArmModel, Array
+from hil.arm_model import ArmModel
+from hil.estimator.arrays import Array
 from hil.estimator.chain.model.tilt import TILT, tilted
 
 _INERTIA = (("xx", 0, 0), ("xy", 0, 1), ("xz", 0, 2), ("yy", 1, 1), ("yz", 1, 2), ("zz", 2, 2))

@@ -66,7 +66,6 @@ class Signs:
 
 
 def _columns(kind: str, signs: Sequence[int], names: Sequence[str]) -> str:
-    """The reversed columns of one kind, as text; "" if there are none."""
     found = [name for name, sign in zip(names, signs, strict=True) if sign < 0]
     if len(found) < 2:
         return f"the {kind} of {found[0]}" if found else ""

@@ -2,9 +2,8 @@
 
 N = J'WJ is the information, S the scatter of the score J'Wr. For independent errors S = N. Rounding errors of a slow
 joint, and model errors, are correlated between samples. S takes this into account if the products of the score are
-summed over lags (Newey and West, Econometrica 55 (1987) 703). With Bartlett's kernel and L lags, this equals the
-sum, over all windows of L samples, of the outer product of the window's score with itself, divided by L. It takes one
-pass for any L.
+summed over lags (Newey and West, Econometrica 55 (1987) 703). With Bartlett's kernel and L lags, this equals the sum,
+over all windows of L samples, of the outer product of the window's score with itself, divided by L.
 
 A model error is not only correlated: it repeats at every reversal, so averaging does not remove it, and the part that
 resembles the effect of a parameter leaves no residual at all. Therefore the non-white part of the residual widens the

@@ -1,8 +1,8 @@
 """Minimisation of the likelihood from several initial guesses, with coarse integration steps first.
 
-Most iterations use coarse integration steps; fine steps decide between minima that coarse ones cannot separate. The
-noise level of each joint is itself estimated before the final iterations, in which outliers are downweighted (Huber),
-so that a few corrupted readings do no harm.
+Fine steps then decide between minima that coarse ones cannot separate. The noise level of each joint is itself
+estimated before the final iterations, in which outliers are downweighted (Huber), so that a few corrupted readings do
+no harm.
 """
 
 from collections.abc import Callable, Sequence

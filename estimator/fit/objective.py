@@ -88,7 +88,6 @@ class Objective:
         return total
 
     def _expected(self, x: Array) -> Quadratic:
-        """Return the contribution of the priors."""
         normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
         normal[: self.count, : self.count] = np.diag(self.prior.precision)
         gradient[: self.count] = self.prior.precision * (x[: self.count] - self.prior.centre)

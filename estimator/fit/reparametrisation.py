@@ -2,9 +2,8 @@
 
 The range, scale and longest step of each parameter are declared in `hil.estimator.models.terms`. Positive parameters
 are exponentials of their coordinates. Coupling is a fraction of its bound: sqrt(inertia_1 inertia_2) tanh(z), where z
-is its coordinate. This bound holds for every arm with positive masses and keeps the mass matrix positive definite.
-Likewise, the asymmetry of viscous friction is viscous tanh(z), which keeps friction positive in both directions. The
-width of the smoothed Coulomb step stays above a floor.
+is its coordinate. This keeps the mass matrix positive definite. Likewise, the asymmetry of viscous friction is viscous
+tanh(z), which keeps friction positive in both directions.
 """
 
 from dataclasses import dataclass

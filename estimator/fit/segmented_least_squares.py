@@ -1,8 +1,7 @@
 """Nonlinear least squares with some unknowns shared by all segments and others specific to each segment.
 
 A segment's own unknowns only affect its own residuals, so the normal equations have an arrowhead structure: each
-segment's block is eliminated separately (Schur complement), and the corresponding columns of the Jacobian are computed
-for all segments at once.
+segment's block is eliminated separately (Schur complement).
 """
 
 from collections.abc import Callable, Sequence

@@ -2,7 +2,7 @@
 
 If position errors are independent and identically distributed, as rounding errors nearly are, the most likely
 parameters minimise the weighted sum of squares. The initial state of each run is estimated as well: simulating until
-the motion is periodic would take two or more periods instead of one. `hil.estimator.fit.multistart` finds the minimum.
+the motion is periodic would take two or more periods instead of one.
 """
 
 from collections.abc import Mapping, Sequence

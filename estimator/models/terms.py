@@ -2,8 +2,8 @@
 
 Fits, results, reports, exports and the configuration take names, units, descriptions, ranges, initial guesses and
 scales from here; docs/architecture.md lists the files that a new term touches. Parameters are named `term_joint`, with
-joints counted from 1, and terms of the whole arm just `term`. This module only imports the standard library, so that
-reading a result imports no large packages.
+joints counted from 1, and terms of the whole arm just `term`. It imports only the standard library, so that reading a
+result is fast.
 """
 
 import re

@@ -303,7 +303,6 @@ class Selection:
         return best
 
     def _better(self, richer: Trial | None, plainer: Trial | None) -> Trial | None:
-        """Return `richer` if its terms reduce the residual sufficiently, otherwise `plainer`."""
         if richer is None or plainer is None:
             return richer or plainer
         if richer.model == plainer.model:
@@ -387,7 +386,6 @@ class Selection:
         *,
         coarse: bool = False,
     ) -> Trial | None:
-        """Return a trial; None if the fit does not converge."""
         try:
             return self._try(model, near, values, coarse=coarse)
         except ConvergenceError:

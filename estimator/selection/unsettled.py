@@ -6,7 +6,7 @@ with their typical sizes as a prior; then insignificant terms are removed.
 
 If the motion is explained down to the noise, the likelihood decides. Otherwise a richer model may merely compensate for
 another missing term. Then every other segment of each recording is fitted and the rest are predicted, also by models
-with presliding friction. The best predictor is fitted once more to all segments.
+with presliding friction.
 """
 
 import time
@@ -210,7 +210,6 @@ class _Search:
         return bool(found) and found[0].evidence > 1.0
 
     def _pruned(self, best: ShootingEstimate) -> ShootingEstimate:
-        """Return the final fit without insignificant terms."""
         for level in self._options.prune_levels:
             model = pruned_model(best.model, best.names, best.value, best.covariance, level, self._fixed)
             if model == best.model:

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.clearance.mesh import UnreadMesh, mesh_corners
 from hil.description.arm import ArmDescription, ArmFileError
 from hil.description.files import is_mjcf
 from hil.description.mjcf import Geom, read_geoms
 from hil.description.urdf import MOST_LENGTH, parse_urdf, rotation_of
+from hil.estimator.arrays import Array
 
-Array = NDArray[np.float64]
 Placed = tuple[int, Array, Array, ET.Element | None]
 
 GUESSED_SHARE, GUESSED_LEAST, GUESSED_MOST = 0.2, 0.015, 0.05

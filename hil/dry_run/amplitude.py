@@ -12,9 +12,8 @@ from hil.config.schema import Config
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import GUARDED, Prediction, predict
 from hil.errors import NoSafeTorque
+from hil.estimator.arrays import Array, Mask
 from hil.plan.plan import Plan, make_plan, scaled
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -213,7 +212,7 @@ def _too_many(config: Config, plan: Plan, few: Ensemble, share: float, pose: Arr
     return bool(passed.sum() > config.safety.limit_chance * count)
 
 
-def _passed(prediction: Prediction, share: float) -> NDArray[np.bool_]:
+def _passed(prediction: Prediction, share: float) -> Mask:
     """Whether each arm exceeds `share` of a limit (arms,)."""
     return np.asarray((prediction.shares[:, :GUARDED] >= share).any(axis=(1, 2)))
 

@@ -10,11 +10,9 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import CONSTANTS, Physics
-
-Array = NDArray[np.float64]
 
 _POINTS = 181
 """Number of angles of the other joint at which the potential energy on the boundary is evaluated."""

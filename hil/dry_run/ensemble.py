@@ -10,13 +10,12 @@ from hil.config.schema import Config
 from hil.dry_run.prior import base_draws
 from hil.errors import ConfigError
 from hil.estimation.result import QUANTISATION_FLOOR_TICKS
+from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import Physics
 from hil.estimator.models.terms import term_of
 from hil.model_file import model_of, read_result
 from hil.plan.chain_model import torque_constant_stds
 from hil.results.result import Result
-
-Array = NDArray[np.float64]
 
 MODEL_SPREAD = 0.005
 """Relative standard deviation added to every identified parameter for model error, which the covariance omits.
@@ -92,16 +91,13 @@ def _joints(count: int) -> str:
     return "1 joint" if count == 1 else f"{count} joints"
 
 
-def result_ensemble(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> Ensemble:
-    """Draw arms from a result. Its covariance is widened by the model error that the residual indicates.
-
-    farther: ratio of the range of motion to be simulated to the range used for identification.
-    """
-    physics = tuple(Physics.of(each) for each in result_draws(result, count, farther, seed))
+def result_ensemble(result: Result, count: int) -> Ensemble:
+    """Draw arms from a result. Its covariance is widened by the model error that the residual indicates."""
+    physics = tuple(Physics.of(each) for each in result_draws(result, count))
     return Ensemble(physics, np.ones((count, result.joints)), "result")
 
 
-def result_draws(result: Result, count: int, farther: float = 1.0, seed: int = 0) -> list[dict[str, float]]:
+def result_draws(result: Result, count: int) -> list[dict[str, float]]:
     """Draw the parameters of `count` arms as in `result_ensemble`, keyed by the estimator's names [SI]."""
     names = result.covariance.names
     covariance = result.covariance.array()
@@ -111,8 +107,8 @@ def result_draws(result: Result, count: int, farther: float = 1.0, seed: int = 0
     covariance = np.where(np.isfinite(covariance), covariance, 0.0)
     # A residual above rounding indicates model error, which shifts parameters by more than their covariance suggests.
     widened = covariance * max(1.0, ticks / QUANTISATION_FLOOR_TICKS) ** 2
-    extra = np.diag((MODEL_SPREAD * max(1.0, farther) * value) ** 2)
-    random = np.random.default_rng((seed, 7))
+    extra = np.diag((MODEL_SPREAD * value) ** 2)
+    random = np.random.default_rng((0, 7))
     drawn = _draws(random, value, widened + extra, count)
     return [_physical(dict(zip(names, row.tolist(), strict=True)), known) for row in drawn]
 

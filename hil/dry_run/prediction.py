@@ -19,12 +19,11 @@ from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.rollout import commands_of, simulate_experiment
+from hil.estimator.arrays import Array
 from hil.estimator.simulation.closed_loop import Feedback
 from hil.estimator.simulation.many_arms import LOWEST, TORQUE, Commands, ManyArms, SettlingRule
 from hil.plan.plan import Plan
 from hil.plan.stabiliser import feedback_of
-
-Array = NDArray[np.float64]
 
 QUANTITIES = ("lowest position", "highest position", "velocity", "current", "torque", "power")
 UNITS = ("rad", "rad", "rad/s", "A", "N m", "W")

@@ -19,12 +19,12 @@ from enum import StrEnum
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.bounded_energy import Boundary, boundary
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import scaled_feedback
+from hil.estimator.arrays import Array
 from hil.estimator.models.parameters import CONSTANTS, Physics
 from hil.estimator.simulation.closed_loop import Feedback, Response, Simulator, respond, resting
 from hil.estimator.simulation.many_arms import COARSE
@@ -33,8 +33,6 @@ from hil.plan.brake import GETS_FASTER, NOTICED_AFTER, braking_gains
 from hil.plan.plan import Plan
 from hil.plan.silence import missing_limit
 from hil.plan.stabiliser import feedback_of
-
-Array = NDArray[np.float64]
 
 LONGEST_S = 1.5
 """Time for which a stopped arm is simulated [s]: long enough for a swing and its return."""

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -13,6 +12,7 @@ from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
 from hil.dry_run.prediction import Prediction, quantities_of
 from hil.dry_run.stopping_distance import Stopping, Way
+from hil.estimator.arrays import Array
 from hil.estimator.selection.verdict import percent
 from hil.printing import print_fitting, say
 
@@ -28,7 +28,7 @@ class FirstRun:
     whole range, its position limits are closer to the rest pose.
     """
 
-    peak_torque: NDArray[np.float64]
+    peak_torque: Array
     prediction: Prediction
     played: Config
 
@@ -92,7 +92,7 @@ def dry_run_json(config: Config, run: DryRun) -> dict[str, Any]:
     }
 
 
-def _rounded(values: NDArray[np.float64]) -> list[float]:
+def _rounded(values: Array) -> list[float]:
     return [round(float(value), 4) for value in values]
 
 
@@ -106,7 +106,7 @@ def _first_json(first: FirstRun) -> dict[str, Any]:
     }
 
 
-def _ways_json(ways: dict[Way, NDArray[np.float64]]) -> dict[str, list[float]]:
+def _ways_json(ways: dict[Way, Array]) -> dict[str, list[float]]:
     return {str(way): [round(float(value), 3) for value in beyond] for way, beyond in ways.items()}
 
 
@@ -227,7 +227,7 @@ def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> 
     ]
 
 
-def _list(values: NDArray[np.float64], digits: int = 2) -> str:
+def _list(values: Array, digits: int = 2) -> str:
     """Format values with `digits` decimals, small ones with two significant digits."""
     return ", ".join(f"{value:.{digits}f}" if value > 10.0 ** (1 - digits) else f"{value:.2g}" for value in values)
 

@@ -5,7 +5,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.chain import described_arm, doubted_inertias
 from hil.config.schema import Config
@@ -19,6 +18,7 @@ from hil.estimation.settled_warnings import warnings_of
 from hil.estimation.slips.position_jumps import jump_disturbances
 from hil.estimation.torque_constants import RATIO, contradictions, ratios_of
 from hil.estimation.truth import back_emf, scaled
+from hil.estimator.arrays import Array
 from hil.estimator.chain.choice import choose_chain
 from hil.estimator.chain.identify import SYSTEMATIC, ChainEstimate, identify_chain
 from hil.estimator.chain.model.chain_model import ChainModel
@@ -171,7 +171,7 @@ def _facts(config: Config, estimate: ChainEstimate, known: KnownChain) -> ChainF
     )
 
 
-def unmoved(config: Config, position: NDArray[np.float64]) -> list[str]:
+def unmoved(config: Config, position: Array) -> list[str]:
     """Names of the joints that move too little to be identified. position: (joints, samples) [rad]."""
     reach = np.ptp(np.where(np.isnan(position), np.nanmean(position, axis=1, keepdims=True), position), axis=1)
     return [joint.name for joint, each in zip(config.joints, reach, strict=True) if each < UNMOVED]
@@ -181,7 +181,7 @@ def _verdict(
     config: Config,
     estimate: ChainEstimate,
     known: KnownChain,
-    held_out: NDArray[np.float64] | None,
+    held_out: Array | None,
     still: list[str],
     disturbances: tuple[str, ...] = (),
 ) -> Verdict:
@@ -274,7 +274,7 @@ def about_zeros(config: Config, estimate: ChainEstimate) -> str:
     )
 
 
-def vague(prior: Prior, names: tuple[str, ...], std: NDArray[np.float64], from_prior: tuple[str, ...]) -> str:
+def vague(prior: Prior, names: tuple[str, ...], std: Array, from_prior: tuple[str, ...]) -> str:
     """Name the base parameters not in `from_prior` whose standard errors exceed the prior's; "" if there are none."""
     found = [name for name in prior.surpassing(names, std) if name not in from_prior]
     if not found:

@@ -13,32 +13,31 @@ those between the arrival of the request and the servo's own sampling.
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array
 from hil.estimator.data.fourier import cut_off, lines_of, motion_of
 from hil.estimator.data.settled_period import SettledPeriod
 
-Values = NDArray[np.float64]
 
-
-def lateness(rows: NDArray[np.void]) -> Values:
+def lateness(rows: NDArray[np.void]) -> Array:
     """Time from each row's deadline to its write [s], in the shape of `rows`; 0 if nothing was written."""
-    deadline: Values = rows["deadline"]
-    written: Values = rows["time_before_write"]
-    read: Values = rows["time_after_read"]
+    deadline: Array = rows["deadline"]
+    written: Array = rows["time_before_write"]
+    read: Array = rows["time_after_read"]
     return np.where(read > written, written - deadline, 0.0)
 
 
-def acting_torque(goals: Values, late: Values, rate: float) -> Values:
+def acting_torque(goals: Array, late: Array, rate: float) -> Array:
     """Mean torque between deadlines (joints, samples) [N m].
 
     goals: held torques (joints, samples + 1) [N m], starting with the one before the period. late: lateness of all but
     the first of them (samples,) [s]. rate: samples per second [Hz].
     """
     before = np.clip(late * rate, 0.0, 1.0)
-    mean: Values = goals[:, 1:] + (goals[:, :-1] - goals[:, 1:]) * before
+    mean: Array = goals[:, 1:] + (goals[:, :-1] - goals[:, 1:]) * before
     return mean
 
 
-def velocity_of(period: SettledPeriod) -> Values:
+def velocity_of(period: SettledPeriod) -> Array:
     """Velocities (joints, samples) [rad/s] from the Fourier lines of the motion that lie above the noise."""
     lines = lines_of(period.filled())
     return motion_of(lines, cut_off(lines), period.fundamental, period.samples).velocity

@@ -4,15 +4,12 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hil.config.joint import USUAL_TORQUE_SPREAD, JointConfig
 from hil.drivers.servo_model import Mode
+from hil.estimator.arrays import Array
 from hil.estimator.models.conflicts import Conflict
 from hil.results.parts import Quantity
 
-Values = NDArray[np.float64]
 RATIO = "torque_scale"
 USUAL_RATIO_STD = math.hypot(USUAL_TORQUE_SPREAD, USUAL_TORQUE_SPREAD)
 CONTRADICTORY = 2.0  # standard deviations, those of the torque constants and of the ratio combined
@@ -76,7 +73,7 @@ def torque_constants_said(joints: Sequence[Driven], extra: Mapping[str, Quantity
     return f"{found}, known to within {100 * first.torque_per_goal_std / first.torque_per_goal:.2g} %."
 
 
-def ratios_of(names: Sequence[str], value: Values, std: Values) -> dict[str, Quantity]:
+def ratios_of(names: Sequence[str], value: Array, std: Array) -> dict[str, Quantity]:
     """The ratios of the torque constants among the parameters `names`."""
     return {
         name: Quantity(float(each), float(error), "1")

@@ -13,12 +13,12 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.state import State
 from hil.dry_run.chain_prior import prior_arms
 from hil.errors import Cause, SafetyStop
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.chain.simulation.motion_observer import ChainObserver
 from hil.estimator.chain.simulation.rollout import ChainArms
 from hil.experiment.checks.apart import causes_of_standstill
@@ -26,8 +26,6 @@ from hil.experiment.checks.consistency import check_standstill
 from hil.experiment.model_watch import UNLIKE_ANY_ARM, Explain
 from hil.plan.chain_model import known_chain
 from hil.plan.obedience import Residual
-
-Array = NDArray[np.float64]
 
 ARMS = 96
 WIDENED = 1.5
@@ -111,7 +109,7 @@ class ChainWatch:
         self._commanded.append((state, torque))
         return self._observer.observe(position, velocity, torque, seconds, is_free, support)
 
-    def _support(self, is_away: NDArray[np.bool_], velocity: Array, torque: Array) -> Array:
+    def _support(self, is_away: Mask, velocity: Array, torque: Array) -> Array:
         """Direction in which a stop may block each joint (joints,): 1, -1, or 0.
 
         is_away: whether each joint is away from its rest angle. torque: commanded (joints,) [N m].

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hil.export.moving_scene import Array, Block, MovingScene, Rod
+from hil.estimator.arrays import Array
+from hil.export.moving_scene import Block, MovingScene, Rod
 
 TRANSFORMS, SCENE = "foxglove.FrameTransforms", "foxglove.SceneUpdate"
 _LINK, _OBSTACLE = {"r": 0.0, "g": 0.45, "b": 0.7, "a": 1.0}, {"r": 0.54, "g": 0.56, "b": 0.6, "a": 0.5}

@@ -12,17 +12,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.arm_model import ArmModel
 from hil.chain_model import ChainArmModel
 from hil.errors import ExportError, RunFolderError
+from hil.estimator.arrays import Array
 from hil.estimator.models.terms import kind_of
 from hil.export.mjcf import export_mjcf
 from hil.export.source import Source
 from hil.export.urdf import export_urdf
-
-Array = NDArray[np.float64]
 
 FORMATS = {"mjcf": (export_mjcf, "xml"), "urdf": (export_urdf, "urdf")}
 TABLE = "arms.parquet"

@@ -8,14 +8,11 @@ limit. As soon as the joint moves and so reveals its friction, the arm is braked
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
+from hil.estimator.arrays import Array, Mask
 from hil.pilot.options import PilotOptions
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 def raised(torque: Array, former: Array, still: Mask, ratio: float, most: Array) -> Array:

@@ -9,15 +9,13 @@ larger deviations from the path.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config, StabiliserConfig
 from hil.drivers.servo_prior import servo_prior
+from hil.estimator.arrays import Array
 from hil.estimator.chain.simulation.rollout import ChainArms, inertias
 from hil.plan.gains import MOST_DAMPING, MOST_DRIVING, most_damping, most_stiffness
 from hil.plan.stabiliser import DELAY_SAMPLES
-
-Array = NDArray[np.float64]
 
 FREQUENCY, DAMPING_RATIO = 3.0, 0.7
 """Natural frequency [Hz] and damping ratio that the stabiliser gives each joint, unless the sample rate is too low."""

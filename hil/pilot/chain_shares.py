@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config, PriorConfig
 from hil.dry_run.chain_prediction import ChainPrediction, predict_chain, simulated_seconds
@@ -16,6 +15,7 @@ from hil.dry_run.chain_stop import foreseen_stops
 from hil.dry_run.chain_summary import nearest_limit, unsafe
 from hil.dry_run.prediction import GUARDED, QUANTITIES, Prediction
 from hil.errors import NoSafeTorque
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.progress import Tell
 from hil.pilot.chain_belief import ChainBelief
 from hil.pilot.chain_paths import Paths
@@ -23,8 +23,6 @@ from hil.plan.chain_model import limit_names
 from hil.plan.chain_plan import NoHeadroom
 from hil.plan.plan import Plan
 from hil.setup.session.servo_session import Say
-
-Array = NDArray[np.float64]
 
 SEARCH_ARMS, ARMS = 24, 72
 """Numbers of arms simulated to find a safe share of the amplitude, and to confirm it."""
@@ -90,7 +88,7 @@ class SafeShares:
     designing: Tell | None = None
     trying: Callable[[str], None] | None = None
     simulated: float = 0.0
-    passed: NDArray[np.bool_] | None = None
+    passed: Mask | None = None
     _path: int = 0
 
     @property

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude, largest_amplitude, most_torque, with_peaks
@@ -17,6 +16,7 @@ from hil.dry_run.prediction import GUARDED, predict
 from hil.dry_run.supply_speed import lowered, slower
 from hil.dry_run.waves import designed_plan, roomy_plan, roomy_plans
 from hil.errors import ExperimentError, NoSafeTorque
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.excitation.harmonics import harmonics_within
 from hil.estimator.models.parameters import Physics
 from hil.pilot.belief import MOVED_STEPS, Belief, earlier_belief, prior_belief
@@ -27,8 +27,6 @@ from hil.pilot.steps import Played, Player, Step
 from hil.plan.plan import Plan, scaled
 from hil.results.result import Result, SettledResult
 from hil.runs.run_folder import RunFolder
-
-Array = NDArray[np.float64]
 
 DEFAULTS = PilotOptions()
 
@@ -52,7 +50,7 @@ class Search:
     swing: Array | None = None
     """Largest range of motion of each joint so far (joints,) [rad]."""
 
-    springs: NDArray[np.bool_] | None = None
+    springs: Mask | None = None
     """Which joints had a spring in the last run with a stabiliser (joints,); None if there was none."""
     options: PilotOptions = DEFAULTS
     from_earlier: bool = False
@@ -60,7 +58,7 @@ class Search:
     earlier_swing: Array | None = None
     """Range of motion of each joint in the earlier run from which the belief comes (joints,) [rad], if known."""
 
-    fast: NDArray[np.bool_] = field(init=False)
+    fast: Mask = field(init=False)
     """Joints that exceeded their velocity limit in the last run before they had moved (joints,)."""
     calm: Array = field(init=False)
     """Cap on the torque (joints,) [N m], below that of all runs in which a joint exceeded its velocity limit before it
@@ -143,7 +141,7 @@ class Search:
             self.player.say(sentence)
 
     @property
-    def moved(self) -> NDArray[np.bool_]:
+    def moved(self) -> Mask:
         """Which joints have moved in any run so far (joints,)."""
         step = np.array([joint.joint.servo.position_unit for joint in self.config.joints])
         swing = np.zeros(len(step)) if self.swing is None else self.swing
@@ -208,7 +206,7 @@ class Search:
                 self._give_up(config, _names(self.config, still))
             self.player.say(" ".join(self._of_still(still)))
 
-    def _of_still(self, still: NDArray[np.bool_]) -> Iterator[str]:
+    def _of_still(self, still: Mask) -> Iterator[str]:
         """Sentences about joints that have not moved."""
         if self.fast.any():
             yield (
@@ -252,7 +250,7 @@ class Search:
         config = config if falls else self._narrowed(config, risky)
         return config, self._with(config, found.plan, wanted)
 
-    def _narrowed(self, config: Config, at: NDArray[np.bool_]) -> Config:
+    def _narrowed(self, config: Config, at: Mask) -> Config:
         pose = np.array(config.arm.rest_pose) if self.pose is None else self.pose
         return narrowed(config, pose, at, self.options)
 
@@ -326,7 +324,7 @@ class Search:
         """Fraction of the limit that a typical arm reaches (joints,)."""
         return np.asarray(np.median(found.prediction.shares, axis=0)[:GUARDED].max(axis=0))
 
-    def _refuse_velocity_limit(self, fast: NDArray[np.bool_], held: NDArray[np.bool_]) -> NoReturn:
+    def _refuse_velocity_limit(self, fast: Mask, held: Mask) -> NoReturn:
         """Raise ExperimentError because of the velocity limit. fast: joints that exceeded it. held: joints that did not
         move even at full torque.
         """
@@ -359,7 +357,7 @@ class Search:
         )
 
 
-def _names(config: Config, chosen: NDArray[np.bool_]) -> list[str]:
+def _names(config: Config, chosen: Mask) -> list[str]:
     return [joint.name for joint, is_chosen in zip(config.joints, chosen.tolist(), strict=True) if is_chosen]
 
 

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.dry_run.amplitude import Amplitude
 from hil.dry_run.ensemble import Ensemble
 from hil.dry_run.prediction import GUARDED, QUANTITIES, UNITS, peaks_of
 from hil.errors import Cause, DidNotMove, ExperimentError, NotSettled, SafetyStop
+from hil.estimator.arrays import Array
 from hil.experiment.run import run_experiment
 from hil.experiment.stream import Watch
 from hil.pilot.belief import MOVED_STEPS
@@ -21,8 +21,6 @@ from hil.results.parts import PlayedStep
 from hil.runs.recording import load_samples
 from hil.runs.run_folder import RunFolder
 from hil.setup.session.servo_session import Say
-
-Array = NDArray[np.float64]
 
 _AT_A_LIMIT = (Cause.POSITION, Cause.VELOCITY, Cause.OUT_OF_VOLTAGE)
 

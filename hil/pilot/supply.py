@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.estimator.arrays import Array
 from hil.experiment.checks.joint_faults import BELOW_VOLTAGE
 from hil.runs.recording import Phase
-
-Array = NDArray[np.float64]
 
 _DRIVEN = (Phase.RAMP_IN, Phase.WARM_UP, Phase.PERIODIC, Phase.RAMP_OUT)
 _LAST_S = 0.25

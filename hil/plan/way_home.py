@@ -5,15 +5,13 @@ backwards, which is known to be clear.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.clearance.space import Space
 from hil.config.schema import Config
+from hil.estimator.arrays import Array
 from hil.estimator.chain.excitation.fourier_path import Path
 from hil.plan.chain_plan import SETTLE_IN, PathSegment
 from hil.plan.plan import Plan
-
-Array = NDArray[np.float64]
 
 STATIONS = 16
 """Number of poses of the planned transition at which an arm may join it."""

@@ -11,12 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array
 from hil.recordings.table import Table
 from hil.recordings.units import split_head
-
-Values = NDArray[np.float64]
 
 WINDOW = 0.5  # s over which motion is averaged, so that noise and filters of the velocity hardly matter
 FEWEST_WINDOWS = 8
@@ -41,7 +39,7 @@ class Rate:
     late: float
 
 
-def rates(table: Table, time: Values, position: Values) -> tuple[Rate, ...]:
+def rates(table: Table, time: Array, position: Array) -> tuple[Rate, ...]:
     """Compare the velocity columns with `position` (joints, rows) [rad] at `time` (rows,) [s].
 
     Returns () unless there is one such column per joint, and each follows its joint.
@@ -106,7 +104,7 @@ def _columns(table: Table) -> list[str]:
     return named
 
 
-def _rate(column: str, time: Values, position: Values, velocity: Values) -> Rate | None:
+def _rate(column: str, time: Array, position: Array, velocity: Array) -> Rate | None:
     known = np.isfinite(time) & np.isfinite(position) & np.isfinite(velocity)
     time, position, velocity = time[known], position[known], velocity[known]
     if time.size < FEWEST_WINDOWS or np.any(np.diff(time) <= 0.0) or time[-1] - time[0] < FEWEST_WINDOWS * WINDOW:
@@ -130,7 +128,7 @@ def _rate(column: str, time: Values, position: Values, velocity: Values) -> Rate
     return Rate(column, factor, float(lags[best])) if alike[best] > 0.0 else None
 
 
-def _increase(at: Values, time: Values, values: Values) -> Values:
+def _increase(at: Array, time: Array, values: Array) -> Array:
     """Increase of `values` over a window around each time, averaged over shifts of up to half the window's length."""
     fine = np.linspace(-0.5 * WINDOW, 0.5 * WINDOW, 9)
     mean = sum(

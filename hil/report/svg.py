@@ -7,7 +7,8 @@ from html import escape
 
 import numpy as np
 
-from hil.report.chart import Array, Chart, Figure, Series, thin
+from hil.estimator.arrays import Array
+from hil.report.chart import Chart, Figure, Series, thin
 from hil.report.matrix_svg import draw_matrix
 from hil.report.scale import Scale, label, span
 

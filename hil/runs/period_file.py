@@ -10,9 +10,9 @@ from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.errors import RunFolderError
+from hil.estimator.arrays import Array
 from hil.estimator.data.relative_error import relative_error
 from hil.runs.file_size import check_archive
 
@@ -29,21 +29,21 @@ class PlayedPeriod:
     """
 
     rate: float
-    torque: NDArray[np.float64]
-    position: NDArray[np.float64]
-    predicted: NDArray[np.float64]
+    torque: Array
+    position: Array
+    predicted: Array
 
     @property
-    def error(self) -> NDArray[np.float64]:
+    def error(self) -> Array:
         """Measured minus predicted position (joints, samples) [rad]."""
         return np.asarray(self.position - self.predicted)
 
     @property
-    def relative_error(self) -> NDArray[np.float64]:
+    def relative_error(self) -> Array:
         """RMS prediction error, encoder noise included, relative to the RMS of the motion about its mean (joints,)."""
         return relative_error(self.position, self.predicted)
 
-    def error_beyond(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    def error_beyond(self, noise: Array) -> Array:
         """Like `relative_error`, but excluding the encoders' `noise` (joints,) [rad], which no model can predict."""
         return relative_error(self.position, self.predicted, noise)
 

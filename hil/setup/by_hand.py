@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.chain import base_up, described_arm
 from hil.config.joint import JointConfig
@@ -16,6 +15,7 @@ from hil.config.schema import Config
 from hil.description.motion import end_point, moves
 from hil.drivers.clock import Clock
 from hil.drivers.joint import Joint
+from hil.estimator.arrays import Array
 from hil.rest_pose_hint import within_limits
 
 MOVED = 0.15  # rad: a joint that has been moved by hand
@@ -24,7 +24,6 @@ STILL_S = 0.6
 POLL_S = 0.05
 PATIENCE_S = 60.0
 SEVERAL = 0.4  # of the largest motion: what another joint may move along with it
-Array = NDArray[np.float64]
 Read = Callable[[], tuple[float, ...]]
 ReadDrives = Callable[[Joint], tuple[float, ...]]
 

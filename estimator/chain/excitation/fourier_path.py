@@ -6,8 +6,8 @@ range. The criterion is evaluated for the worst joint and covers all unknowns of
 offsets. If a joint moves little, its gravity torque cannot be distinguished from an offset; a criterion on inertial
 parameters alone would miss this.
 
-This designer is for a box of angles and speeds that the user has chosen ([joint_path]); nothing else limits the path.
-To find the box itself, within limits of torque and clearance, use `path_design`.
+This designer is for a box of angles and speeds that the user has chosen ([joint_path]); `path_design` finds the box
+itself, within limits of torque and clearance.
 """
 
 from dataclasses import dataclass

@@ -1,13 +1,12 @@
 """Start of stage 2 for chains: from stage 1's result to a rough minimum with a soft observer.
 
-The observer starts stiff, so that the simulation can follow the motion with stage 1's parameters, and is softened as
-the fit improves.
+The observer starts stiff, so that stage 1's parameters suffice to follow the motion, and is softened as the fit
+improves.
 
 If joints often stick, stage 1's estimate of friction can be far off. So can the link parameters and torque scales,
 which are correlated with friction. Softening the observer while the shape of friction is fixed then leads the fit into
 a curved valley, where it stops short of another minimum. So if the soft observer does not explain the motion, a second
 fit starts from the prior's links, with the shape of friction free as soon as the stiffest observer follows the motion.
-The better of the two fits is continued.
 """
 
 import math

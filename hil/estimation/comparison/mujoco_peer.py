@@ -40,7 +40,7 @@ def import_mujoco() -> tuple[Any, Any]:
     return mujoco, sysid
 
 
-def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: float, gravity: float, seed: int) -> Peer:
+def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: float, gravity: float) -> Peer:
     """Fit with mujoco.sysid, starting from values drawn within 50 % of `centre` (base parameters by name [SI]).
 
     `length`: length of link 1 [m]. `gravity`: acceleration of gravity [m/s^2]. Raises MissingExtra if mujoco[sysid] is
@@ -50,7 +50,7 @@ def fit_with_mujoco(period: SettledPeriod, centre: dict[str, float], length: flo
     linear = fit_lines(period)
     arm = _Arm.of(centre, period.joints, length, gravity)
     spec = mujoco.MjSpec.from_string(_xml(arm, 1.0 / (STEPS * period.rate)))
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     parameters = sysid.ParameterDict()
     for name, value in arm.values.items():
         low, high = (-BOUNDS[1], BOUNDS[1]) if name.startswith("offset") else BOUNDS

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
+from hil.estimator.arrays import Array, Mask
 from hil.runs.recording import Phase
-
-Array = NDArray[np.float64]
 
 LARGE = 0.5
 """Goals above this fraction of the largest one count as large; smaller ones say little about clipping."""
@@ -67,7 +66,7 @@ def current_findings(config: Config, samples: NDArray[np.void]) -> CurrentFindin
     return _findings(config, samples, np.ones(len(samples), bool))
 
 
-def _findings(config: Config, samples: NDArray[np.void], judged: NDArray[np.bool_]) -> CurrentFindings:
+def _findings(config: Config, samples: NDArray[np.void], judged: Mask) -> CurrentFindings:
     """Like `current_findings`, but only for the judged samples; the others only help to measure the noise."""
     lower = "current_limit" if config.experiment.pilot else "peak_torque"
     warnings, names = [], []

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from hil.config.schema import Config
 from hil.drivers.servo_model import Mode
 from hil.estimator import linalg
-
-Array = NDArray[np.float64]
+from hil.estimator.arrays import Array, Mask
 
 FEWEST = 40
 """Minimum number of voltage readings."""
@@ -79,7 +78,7 @@ def supply_sag(config: Config, samples: NDArray[np.void]) -> Sag | None:
     return sag if sag.worst > SIGNIFICANT * std and sag.share > least else None
 
 
-def by_voltage(config: Config) -> NDArray[np.bool_]:
+def by_voltage(config: Config) -> Mask:
     """Whether each joint is driven by voltage (joints,)."""
     return np.array([joint.drive_mode is Mode.PWM for joint in config.joints])
 

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.config.schema import Config
+from hil.estimator.arrays import Array
 from hil.runs.recording import Phase
 from hil.runs.run_folder import RunFacts
-
-Array = NDArray[np.float64]
 
 LEAST_STEPS = 8.0  # encoder steps, smallest jump that is reported
 USUAL_QUANTILE = 0.995

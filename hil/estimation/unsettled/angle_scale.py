@@ -12,13 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array
 from hil.estimator.data.recording import Recording
 from hil.estimator.errors import EstimationError
 from hil.estimator.fit.multiple_shooting import ShootingEstimate, estimate_by_shooting
-
-Array = NDArray[np.float64]
 
 SPRING = "cable_stiffness_1"
 CERTAIN = 4.0  # standard errors of a spring that is worth a closer look

@@ -8,12 +8,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hil.estimator.arrays import Array, Mask
 from hil.estimator.data.recording import Recording
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 FAR_ABOVE = 10.0  # residual of a window, or of a stretch, relative to the usual one of its joint
 ABOVE_NOISE = 5.0  # the same, relative to the noise

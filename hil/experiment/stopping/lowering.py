@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.config.joint import JointConfig
 from hil.config.schema import Config
@@ -21,6 +20,7 @@ from hil.drivers.errors import BusOverheard
 from hil.drivers.servo_prior import servo_prior
 from hil.drivers.state import State
 from hil.errors import Cause, ExperimentError, SafetyStop
+from hil.estimator.arrays import Array
 from hil.experiment.chain_watch import ChainWatch
 from hil.experiment.guard import Guard
 from hil.experiment.stopping.pace import LONGEST_S
@@ -117,8 +117,8 @@ class Lowering:
         ]
         return ", ".join(found)
 
-    def _away(self, state: State) -> NDArray[np.float64]:
-        away: NDArray[np.float64] = np.array(state.position) - self._rest
+    def _away(self, state: State) -> Array:
+        away: Array = np.array(state.position) - self._rest
         return away
 
     def begin(
@@ -150,10 +150,10 @@ class Lowering:
         """Plan another path home from this sample; return its number of samples."""
         return self._set_out(state, self._believed(state), goal)
 
-    def _believed(self, state: State) -> NDArray[np.float64]:
+    def _believed(self, state: State) -> Array:
         return np.array(self._recent.until(state).believed(state))
 
-    def _set_out(self, state: State, velocity: NDArray[np.float64], goal: list[float]) -> int:
+    def _set_out(self, state: State, velocity: Array, goal: list[float]) -> int:
         """Plan a path home from this sample; return its number of samples."""
         position = np.array(state.position)
         self._path = self._way.path(position, velocity)
@@ -173,7 +173,7 @@ class Lowering:
             noise=self._noise,
         )
         self._guard.holding(goal)
-        self._excess = deque[tuple[float, NDArray[np.float64]]]()
+        self._excess = deque[tuple[float, Array]]()
         self._against = np.zeros_like(position)
         self._paths += 1
         self.needs_another_path = False
@@ -247,7 +247,7 @@ class Lowering:
         if runs.any():
             self._look_at_runaway(int(np.argmax(runs)), velocity, now)
 
-    def _look_at_runaway(self, joint: int, velocity: NDArray[np.float64], now: float) -> None:
+    def _look_at_runaway(self, joint: int, velocity: Array, now: float) -> None:
         """Test a joint that speeds up although its torque opposes the motion. Raises SafetyStop if there is no model,
         or if the joint is so fast that its motor no longer matters.
         """
