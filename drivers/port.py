@@ -195,8 +195,8 @@ class Port:
     def ask(self, data: bytes, count: int, expected: ReplyTime, start: float) -> bytes:
         """Write at `start` [s, on the port's clock], then read until the timeout, as the control cycle does.
 
-        Pending input is set aside first: otherwise a duplicated or late reply would be taken for the reply to this
-        request, and every later reply would be one cycle late.
+        Pending input is set aside first: otherwise a late reply would be taken for the reply to this request, and so
+        on.
         """
         if self.has_input():
             self.put_aside()
@@ -296,10 +296,7 @@ class NetworkPort(Port):
 
 
 class DescriptorPort(Port):
-    """A local device, read and written through its file descriptor.
-
-    pyserial opens and configures it as non-blocking, with VMIN = VTIME = 0.
-    """
+    """A local device, read and written through its file descriptor."""
 
     def __init__(self, url: str, baud: int, opened: Any) -> None:
         super().__init__(url, baud, opened)

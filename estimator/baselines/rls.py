@@ -29,8 +29,7 @@ def fit_recursively(
     to their residuals.
 
     `cutoff` [Hz], `coulomb_width` [rad/s] and `delay` [s] are as in
-    `hil.estimator.baselines.idim.fit_inverse_dynamics`. The weights come from a first pass over the data, an advantage
-    that an on-line estimator does not have.
+    `hil.estimator.baselines.idim.fit_inverse_dynamics`. The weights come from a first pass over the data.
     """
     rows = [_causal_rows(recording, cutoff, coulomb_width, delay) for recording in recordings]
     Y = np.concatenate([row[0] for row in rows], axis=1)

@@ -166,7 +166,7 @@ def doubtful_zeros(held: HeldZeros | None, systematic: float) -> tuple[tuple[int
 def largest_ratio(one: Array, other: Array) -> float:
     """Return the largest element-by-element ratio of two vectors of standard errors; infinite if no pair is finite.
 
-    The largest ratio is used, not the median, because an unmodelled effect may act on only one joint.
+    An unmodelled effect may act on only one joint.
     """
     known = np.isfinite(one) & np.isfinite(other)
     return float(np.max(one[known] / other[known])) if known.any() else np.inf

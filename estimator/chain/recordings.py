@@ -36,7 +36,7 @@ VELOCITY_SAMPLES = 9  # at the beginning, from which the initial velocity is tak
 class MotionPiece(SettledPeriod):
     """A recording resampled at equal intervals for the likelihood of settled periods; its motion need not be periodic.
 
-    The torque before the first sample is assumed to be that of the last sample; the initial state absorbs the error.
+    The torque before the first sample is assumed to be that of the last sample.
     """
 
     def __post_init__(self) -> None:

@@ -26,8 +26,8 @@ _sum: Callable[[Array], Any] = np.add.reduce  # np.sum takes three times as long
 def descend(function: Function, x: Array, steps: int) -> Array:
     """Minimise `function`, which returns value and gradient, in at most `steps` steps from `x`; return the last `x`.
 
-    Steps are rounded to a grid. Otherwise the last bit of a cosine, which depends on the processor, would make a
-    difference that grows from step to step, until another minimum is found.
+    Steps are rounded to a grid. Otherwise the last bit of a cosine, which depends on the processor, might lead to
+    another minimum.
     """
     value, gradient = function(x)
     pairs: Pairs = deque(maxlen=MEMORY)

@@ -52,9 +52,7 @@ class Design:
 
 
 def smoothed(physics: Physics) -> Physics:
-    """Return the arm with friction steps at least LEAST_WIDTH wide, which is faster to simulate and has nearly the same
-    optimal excitation.
-    """
+    """Return the arm with friction steps at least LEAST_WIDTH wide, which is faster to simulate."""
     vector = physics.vector.copy()
     for joint in (1, 2):
         index = CONSTANTS.index(f"coulomb_width_{joint}")

@@ -73,9 +73,8 @@ def correlation_time(residuals: Sequence[Array], options: CovarianceOptions = DE
 def structured_share(residual: Array) -> Array:
     """Return the fraction (joints,) of the power of each residual (joints, samples) that is not white.
 
-    White noise has the same power in every Fourier line; its level is estimated from the upper half of the lines, far
-    above the frequencies of the motion. The fraction is 0 if the residual does not differ significantly from white
-    noise.
+    The level of white noise is estimated from the upper half of the Fourier lines, far above the frequencies of the
+    motion. The fraction is 0 if the residual does not differ significantly from white noise.
     """
     samples = residual.shape[1]
     power = np.abs(np.fft.rfft(residual, axis=1)) ** 2 / samples**2
@@ -137,8 +136,7 @@ def robust_covariance(
 def is_unpredictable(at: Quadratic, samples: int) -> bool:
     """Return whether the motion is so sensitive that its derivatives are valid only for extremely small changes.
 
-    Coordinates are of order 1. If a change of 1e-6 alters a sample by ten times the noise, the simulation diverges; its
-    standard errors would be tiny and meaningless.
+    The standard errors would then be tiny and meaningless. Coordinates are of order 1.
     """
     return bool(np.max(np.diag(at.normal), initial=0.0) > (samples * SENSITIVE**2))
 

@@ -81,7 +81,7 @@ class Segmented:
         for white noise. The covariance is infinite for coordinates that can change, alone or together, without
         affecting the residual.
 
-        Scores at the minimum are smaller than at the true values, so no variance is less than for white residuals.
+        No variance is less than for white residuals.
 
         groups: recording of each segment (segments,). If the recordings differ more than their segments suggest,
         because a repeated motion repeats the model error, the whole covariance is increased accordingly.

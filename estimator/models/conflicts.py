@@ -126,8 +126,8 @@ def worst_first(found: Sequence[Conflict | None]) -> tuple[Conflict, ...]:
 def contradicted(found: Sequence[Conflict], explained: bool) -> str:
     """Return the best verdict that the contradictions allow: "no", "with care", or "" if they allow any verdict.
 
-    explained: whether the model explains the motion. If it does not, and a known value is far off, an effect missing
-    from the model has distorted that value, and presumably all others as well.
+    explained: whether the model explains the motion. If it does not, a missing effect has distorted the value, and
+    presumably all others as well.
     """
     of_file = [each for each in found if each.source == "file"]
     if of_file:

@@ -96,8 +96,7 @@ def look(rest: Any, angle: float, stands: float, torque: float, row: Any, theta:
 def keep(rest: Any, first: int, row: Any) -> None:
     """Store a joint's equation in columns from `first` on.
 
-    The elements are copied in a loop: a slice assignment, with its error message about shapes, would take numba 2 s
-    longer to compile.
+    The elements are copied in a loop: a slice assignment would take numba 2 s longer to compile.
     """
     for i in range(row.size):
         rest[first + i] = row[i]

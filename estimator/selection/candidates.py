@@ -196,8 +196,7 @@ def considered(period: SettledPeriod, estimate: Estimate) -> Array:
     """Return the estimate's covariance (parameters, parameters) [SI], including the effect of omitted terms that cannot
     be ruled out.
 
-    Each of their parameters is described by its prior and the information from the motion, as if it were fitted as
-    well. Since it is not, the change that fitting it would cause also counts as an error.
+    The change that fitting them, with their prior, would cause also counts as an error.
     """
     left_out = unruled(estimate.model)
     if not left_out:

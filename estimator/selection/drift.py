@@ -70,9 +70,8 @@ def drifting(period: SettledPeriod, estimate: Estimate, drift: Drift) -> Array:
     during `period`.
 
     The fit assumes constant friction. If friction changes at the rate of `drift`, other parameters absorb part of this
-    slow change of torque. This mainly concerns parameters whose torque also varies slowly, such as the gravity terms
-    of an arm on which gravity acts only weakly. The motion is assumed to follow the instantaneous friction, which holds
-    if transients decay within a small part of the period.
+    slow change of torque. The motion is assumed to follow the instantaneous friction, which holds if transients decay
+    within a small part of the period.
     """
     about = linearised(period, estimate, (), {})
     derivative = by_parameters(period, estimate)

@@ -51,8 +51,8 @@ def restarts(period: SettledPeriod, estimate: Estimate, options: SelectionOption
 def undisguised(estimate: Estimate) -> dict[str, float]:
     """Return changed parameters, by name, for joints whose Stribeck rise may really be a narrow Coulomb step.
 
-    A rise that fades within a wide step resembles a narrow step without a rise, and explains the motion almost equally
-    well. A fit started from one does not reach the other.
+    A rise that fades within a wide step resembles a narrow step without a rise, but a fit started from one does not
+    reach the other.
     """
     values: dict[str, float] = estimate.parameters
     changed: dict[str, float] = {}

@@ -49,11 +49,11 @@ def choose(
     First, Stribeck friction is fitted together with the encoders' zeros and the ratio of two torque constants, which
     are never known exactly. If that does not explain the motion, or if a score test finds a significant term in the
     residual (`hil.estimator.selection.candidates`), all other smooth terms are added at once: load, direction,
-    saturation, cables, encoder nonlinearity. Adding them one by one would be misleading, since each would absorb the
-    effects of the missing ones; together, with typical sizes as a prior, they can be separated. Then presliding
-    friction and torque ripple are tried, and finally insignificant terms are removed. A model that predicts `held_out`
-    worse than a simpler one is not chosen. If friction differs between the two recordings, it also changed within each;
-    this is corrected (`hil.estimator.selection.steadied`).
+    saturation, cables, encoder nonlinearity. One by one, each would absorb the effects of the missing ones; together,
+    with typical sizes as a prior, they can be separated. Then presliding friction and torque ripple are tried, and
+    finally insignificant terms are removed. A model that predicts `held_out` worse than a simpler one is not chosen. If
+    friction differs between the two recordings, it also changed within each; this is corrected
+    (`hil.estimator.selection.steadied`).
 
     Args:
         periods: settled periods of one arm to be fitted; the first is used to find missing terms.

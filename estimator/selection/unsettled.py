@@ -160,8 +160,7 @@ class _Search:
     def trial(self, near: ShootingEstimate, model: Model) -> SegmentTrial:
         """Fit `model`, starting from `near`, and return how well it predicts segments that were held out of the fit.
 
-        `near` was also fitted to the held-out segments, but it only determines which local minimum is found, not its
-        location.
+        `near` only determines which local minimum is found.
         """
         if model not in self._trials:
             began = time.perf_counter()

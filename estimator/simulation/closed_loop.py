@@ -66,8 +66,8 @@ class Response:
 class Stabilised:
     """A period in which `feedback` applied part of the torque.
 
-    In the simulation, the feedback acts on the simulated arm, as it did on the real one, so an arm that is unstable on
-    its own can be simulated. If model and arm agree, the torque equals the one actually commanded.
+    The feedback acts on the simulated arm, so an arm that is unstable on its own can be simulated. If model and arm
+    agree, the torque equals the one actually commanded.
     """
 
     feedback: Feedback

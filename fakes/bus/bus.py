@@ -3,8 +3,8 @@
 Bytes take wire time (ten bits each). A packet takes effect when its last byte arrives: the plant is advanced to that
 moment with the previous motor currents, then the addressed servos act. Replies start after the servo's return delay and
 reach the host `adapter_latency_us` later. When the host writes, everything up to the last packet of that write is
-computed, even if it lies ahead of the clock. Between two packets, only Bus Watchdogs, the servos' own loops and faults
-can act; the plant's advance is split at the times when they do.
+computed, even if it lies ahead of the clock. The plant's advance is split where Bus Watchdogs, the servos' own loops
+and faults act between two packets.
 
 When host and servo, or two servos with different IDs, transmit at once, the later packet and the rest of the earlier
 one are lost. Which servos act and reply is decided in `hil.fakes.bus.instructions`.
@@ -158,8 +158,7 @@ class FakeBus:
     def read(self, size: int, timeout_s: float) -> bytes:
         """Return up to `size` bytes, waiting on the clock for at most `timeout_s` (0: only what has already arrived).
 
-        New bytes only appear when the host writes, so an infinite wait (`math.inf`) ends when all bytes in transit have
-        arrived. The wait also ends when the cable is unplugged.
+        An infinite wait (`math.inf`) ends when all bytes in transit have arrived, or when the cable is unplugged.
         """
         now = self.clock.now()
         deadline = now + timeout_s
@@ -277,7 +276,6 @@ class FakeBus:
         self._ticks_wanted()
 
     def _ticks_wanted(self) -> None:
-        """Start or stop ticking, depending on whether supply, hand or servos need it."""
         if self._supply is None and not self._hand.busy and not any(servo.needs_ticks for servo in self._servos):
             self._next_tick = math.inf
         elif self._next_tick == math.inf:

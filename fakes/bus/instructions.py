@@ -181,7 +181,6 @@ class Instructions:
         return error | fault, data
 
     def _write(self, servo: EmulatedServo, addressed: int, address: int, data: bytes, now: float) -> None:
-        """Apply one servo's part of a group write."""
         if self._line.servos_refuse and self._line.fault_error(servo, now) & ~ALERT:
             return
         (servo.write if servo.id == addressed else servo.write_as_shadow)(address, data)
@@ -291,7 +290,6 @@ class Instructions:
         return len(pieces) == 1 and pieces[0][2] == answers[0][2]
 
     def _answering(self, servo_id: int, now: float) -> list[EmulatedServo]:
-        """Return the servos that answer a group read at this ID."""
         servos = self._by_id.get(servo_id, ())
         return [servo for servo in servos if servo.heard_at == now and servo.status_return_level]
 

@@ -119,7 +119,6 @@ class GroupReads:
         return told or None
 
     def _prepare(self, body: bytes, by_id: Mapping[int, Sequence[EmulatedServo]]) -> _Request:
-        """Store and return a request."""
         if len(self._prepared) >= MOST_PREPARED:
             self._prepared.clear()
         address, length = body[0] | body[1] << 8, body[2] | body[3] << 8

@@ -9,8 +9,7 @@ others. Velocity Limit of the XH430-W210 is that of the XD430-T210, whose contro
 manual; the oldest page of the XH430-W210 states 360.
 
 Resistance and back-EMF are computed from stall current and no-load speed at the nominal voltage. They are accurate to
-tens of percent, which is enough to make a position move look right. The XC330s' stall currents are uncertain: their
-sensor is in the supply line.
+tens of percent, which is enough to make a position move look right.
 """
 
 import math
@@ -204,7 +203,6 @@ def _xc330(motor: Motor, velocity: int, gains: Mapping[str, RegisterFacts]) -> M
 
 
 def _voltage_driven(motor: Motor, differs: Mapping[str, RegisterFacts]) -> ModelFacts:
-    """Describe a model without a current sensor."""
     return ModelFacts(motor, differs, current_unit_a=0.0, operating_modes=frozenset({1, 3, 4, 16}))
 
 

@@ -146,7 +146,6 @@ def _indirect_registers(blocks: Blocks) -> Iterator[Register]:
 
 
 def _unknown(name: str) -> EmulatedModel:
-    """Return a model for which only addresses and sizes are known."""
     addresses = load_control_table(name)
     torque = addresses.registers.get("Torque Enable")
     ram = torque.address if torque is not None else 64

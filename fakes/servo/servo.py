@@ -385,7 +385,6 @@ class EmulatedServo(Powered):
         self._hold_position()
 
     def _hold_position(self) -> None:
-        """Set Goal Position to the joint's present position."""
         ticks = self.present.ticks(self._angle())
         if self.model.operating_modes:
             self.memory.set("Goal Position", round(ticks))

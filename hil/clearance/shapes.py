@@ -1,8 +1,7 @@
 """Capsules that enclose each link: from the collision geometry in the arm's file, otherwise from the joint
 positions.
 
-A capsule is the set of points within its radius of a line segment. Spheres are represented exactly. A cylinder is
-enclosed by one capsule, a box by one capsule or a row of them. A mesh is replaced by its bounding box. A link whose
+A capsule is the set of points within its radius of a line segment. A mesh is replaced by its bounding box. A link whose
 geometry cannot be read gets a capsule from joint to joint with a guessed radius, and is listed in `Shapes.guessed`.
 """
 
@@ -85,7 +84,6 @@ def shapes_of(arm: ArmDescription) -> Shapes:
 
 
 def _doubt(name: str, unread: list[str], has_others: bool, instead: list[Capsule], is_last: bool) -> str:
-    """Say why the shape of a link is not known, and what replaces it."""
     why = "; ".join(unread) if unread else "it has no collision or visual geometry"
     if not instead:
         left = "Only its other shapes are checked" if has_others else "It has no shape"

@@ -107,8 +107,7 @@ class Space:
     def has_reserve(self, position: Array, reserve: float) -> bool:
         """Whether a motion (joints, samples) [rad] keeps `reserve` [m] more than the required distance.
 
-        For pairs that are near each other by design, half of their median distance is enough if that is less than
-        `reserve`.
+        For pairs near each other by design, half of their median distance is enough.
         """
         needed = self._needed(False)
         needed = np.minimum(needed + reserve, np.maximum(needed, 0.5 * self._built))

@@ -48,8 +48,7 @@ def doubted_inertias(arm: ArmDescription) -> tuple[str, ...]:
 def doubted_limits(config: "Config") -> Iterator[str]:
     """Yield one sentence per joint whose limits in the description make no sense or do not contain its path.
 
-    position_limit may exceed the described limits at either end by the margin that a path leaves free, since it only
-    serves to stop the arm and some arms rest on a mechanical stop.
+    position_limit may exceed the described limits at either end by the margin that a path leaves free.
     """
     arm = described_arm(config)
     wanted = config.joint_path

@@ -1,7 +1,5 @@
-"""The JSON Schema of the TOML file, generated from the models that check it. Editors use it for completion and checks.
-
-It describes single values and tables. Constraints between values (a rest pose within the position limits, one entry per
-joint) are checked only by `load_config`.
+"""The JSON Schema of the TOML file, generated from the models that check it. values (a rest pose within the position
+limits, one entry per joint) are checked only by `load_config`.
 """
 
 import json

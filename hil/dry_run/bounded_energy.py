@@ -1,8 +1,7 @@
 """Check whether an unpowered arm has too little energy to leave its position limits.
 
-Friction only dissipates energy, so an unpowered arm cannot reach a pose with more potential energy than its total
-energy. If every pose on the boundary of the permitted range has more, the arm stays inside, and its swing need not be
-simulated.
+An unpowered arm cannot reach a pose with more potential energy than its total energy. If every pose on the boundary of
+the permitted range has more, its swing need not be simulated.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Prior ensemble of spatial arms, before anything has been identified.
+"""Prior ensemble of spatial arms.
 
 Each link's mass, centre of mass and inertia are drawn around their described values; friction and rotor inertia are
 drawn around typical values of the servos. `[arm.prior] spread` is the relative standard deviation of the described

@@ -1,9 +1,8 @@
 """Simulate the experiment on an ensemble of arms, and compare the predicted peaks with each limit.
 
-Every arm of the ensemble receives exactly the goal currents of the plan, ramps included, for as many periods as it
-takes to settle. The goals are rounded to the servos' ticks; lag and stabiliser are simulated. Peaks are expressed as
-fractions of the distance from rest to the limit; if any of an arm's fractions reaches 1, the guard would have stopped
-that arm.
+Every arm receives the goal currents of the plan, ramps included and rounded to the servos' ticks, for as many periods
+as it takes to settle. If a peak reaches 1 as a fraction of the distance from rest to the limit, the guard would have
+stopped that arm.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """Infer which joints of a spatial arm lie on their own mechanical stops in the rest pose.
 
-In the rest pose an arm lies without torque. It is supported by a surface (floor, cradle, another link) or by the
-joints' own stops. Moving the arm can lift it off a surface; a stop holds its joint whatever the angles of the others.
+In the rest pose an arm is supported by a surface (floor, cradle, another link) or by the joints' own stops. Moving the
+arm can lift it off a surface; a stop holds its joint whatever the angles of the others.
 """
 
 from collections.abc import Sequence

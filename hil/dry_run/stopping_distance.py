@@ -7,8 +7,6 @@ planned   the run is stopped at any moment of the planned motion, because of a s
 passed    the motion differs from the plan (a blocked, reversed or unpowered joint, or an arm other than the one
           described), so the guard stops it at a limit: one joint at its position limit moves outwards at its velocity
           limit; the other is anywhere within its range
-
-As in a dry run, rigid links, friction, current lag, and servos that behave as documented are assumed.
 """
 
 import math

@@ -198,7 +198,6 @@ def dry_run_lines(config: Config, shown: Prediction, run: DryRun) -> list[str]:
 
 
 def _first_lines(config: Config, first: FirstRun, largest: Amplitude | None) -> list[str]:
-    """Describe what `hil identify` does with pilot = true: stabiliser, first torque, and what may stop it."""
     lines = []
     held = first.played.stabiliser
     if held is not None and config.stabiliser is None:
@@ -240,7 +239,6 @@ def _percent(chance: float) -> str:
 
 
 def _stops(config: Config, stopping: Stopping) -> list[str]:
-    """Say how far each joint goes beyond its position limits when the arm is stopped."""
     planned, passed = stopping.planned, stopping.passed
     stopped, silent = np.maximum(planned[Way.BRAKED], planned[Way.CUT]), planned[Way.SILENT]
     lines = []

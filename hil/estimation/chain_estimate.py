@@ -119,9 +119,8 @@ def estimate_chain_run(run: RunFolder, config: Config, facts: RunFacts) -> Settl
 def wanted_chain_model(config: Config, known: KnownChain) -> ChainModel:
     """The model requested by the configuration.
 
-    A link moved by several joints couples their torques, so inexact torque constants contradict each other. Their
-    ratios are therefore parameters if the configuration gives an uncertainty. Each joint has its own lag: servo models
-    differ, and neglecting half a millisecond biases the inertias of light joints by several percent.
+    Ratios of torque constants are parameters if the configuration gives an uncertainty. Each joint has its own lag:
+    servo models differ, and neglecting half a millisecond biases the inertias of light joints by several percent.
     """
     wanted = config.model
     scales = known.base.chain.joints > 1 and (wanted.torque_scale or known.prior.scale_precision is not None)
@@ -185,7 +184,6 @@ def _verdict(
     still: list[str],
     disturbances: tuple[str, ...] = (),
 ) -> Verdict:
-    """Decide, with reasons, whether the result can be trusted, and name the least well identified base parameter."""
     count = known.base.count
     certain = estimate.std[:count] / known.prior.std
     weakest = known.base.names[int(np.argmax(certain))]
@@ -291,7 +289,6 @@ def is_explained(estimate: ChainEstimate) -> bool:
 
 
 def _unexplained(config: Config, estimate: ChainEstimate) -> str:
-    """Describe the residual relative to the noise, and what it implies for the model."""
     over, joint = float(estimate.over_noise.max()), int(np.argmax(estimate.over_noise))
     noise = float(estimate.noise_steps[joint])
     measured = (

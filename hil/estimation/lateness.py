@@ -6,8 +6,7 @@ torque is replaced by the mean torque between its deadline and the next: the pre
 one afterwards. The remaining error is of second order: half the acceleration times lateness squared, a hundredth of an
 encoder step at 0.5 ms and 50 rad/s^2.
 
-Delays that the host cannot see are not corrected: those between the write call and the wire (the adapter's buffer), and
-those between the arrival of the request and the servo's own sampling.
+Delays that the host cannot see, in the adapter's buffer and before the servo's sampling, are not corrected.
 """
 
 import numpy as np

@@ -129,13 +129,11 @@ def _capitalised(sentence: str) -> str:
 
 
 def _ratios(joints: Sequence[str], extra: Mapping[str, Quantity]) -> list[tuple[str, str, Quantity]]:
-    """Joint, parameter and value of each ratio of the torque constants in a result."""
     names = [(joint, f"{RATIO}_{number}") for number, joint in enumerate(joints, 1)]
     return [(joint, name, extra[name]) for joint, name in names if name in extra]
 
 
 def _relative(first: str, ratios: Sequence[tuple[str, Quantity]], source: Source) -> str:
-    """State the ratios, beginning with a lower-case letter."""
     given = ", ".join(f"{joint} gives {ratio.value:.5g} +- {ratio.std:.1g}" for joint, ratio in ratios)
     one = len(ratios) == 1
     if source == "column":

@@ -2,9 +2,9 @@
 
 Each recorded motion is assimilated by an ensemble smoother with multiple data assimilation (Emerick and Reynolds,
 Computers and Geosciences 55 (2013) 3). Every arm of the ensemble is given the real arm's commands, and is then updated
-towards the measured motion by regressing parameters on motion over the ensemble. This needs no derivatives, no initial
-guess and no motion that separates all parameters: parameters that a motion does not determine keep the prior's spread.
-A joint that did not move is informative too: arms that would have moved are shifted towards more friction.
+towards the measured motion by regressing parameters on motion over the ensemble. Parameters that a motion does not
+determine keep the prior's spread. A joint that did not move is informative too: arms that would have moved are shifted
+towards more friction.
 """
 
 from dataclasses import dataclass, replace

@@ -107,8 +107,8 @@ class SafeShares:
         most: largest allowed share; if `shares` begin with a larger one, all of them are scaled down in proportion. On
         other paths, the share that gives the same amplitude is used instead.
 
-        If the safe share is small, other paths with more reserve are designed; of all safe ones, the most informative
-        is kept. If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.
+        If the safe share is small, other paths with more reserve are designed; the most informative safe one is kept.
+        If none is safe, paths from other seeds are tried. Raises NoSafeTorque if no share of any path is safe.
         """
         self._path = 0
         found, why = self._safe_of_these(config, shares, most)
@@ -265,7 +265,6 @@ class SafeShares:
         return paths.designer.worth(paths.designer.scaled(paths.identify, found.share))[0]
 
     def _unsafe_stop(self, config: Config, plan: Plan) -> str:
-        """Explain why a stop would not lower the arm safely; "" if it would."""
         if config.safety.stop == "cut":
             return ""
         self.simulated += STOPPED_SHARE * ARMS * simulated_seconds(plan)
@@ -290,7 +289,6 @@ def _up_to(most: float, shares: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _remedy(config: Config, foreseen: ChainPrediction, stiffness: Array) -> str:
-    """Suggest changes that may turn a path that was rejected as `unsafe` into a safe one."""
     if not foreseen.is_clear:
         helps = "A rest_pose farther from obstacles, or less restrictive [clearance] settings (floor, boxes, margin)"
         return f"{helps}, if the arm allows it, can help. {_better_known(config)}"

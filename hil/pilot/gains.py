@@ -4,8 +4,8 @@ so much friction that gravity cannot move a joint. Such a joint drifts, even fro
 The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction within a radian,
 and soft enough to leave most of the torque to the excitation.
 
-At a low sample rate, the delay of such a spring would drive the joint (`hil.plan.stabiliser`). Then the damper is made
-stronger, as far as the rate allows, and the spring softer, as far as gravity allows.
+At a low sample rate, the delay of such a spring would drive the joint (`hil.plan.stabiliser`). The damper is then made
+stronger and the spring softer, as far as rate and gravity allow.
 """
 
 from typing import NoReturn

@@ -207,7 +207,6 @@ class Search:
             self.player.say(" ".join(self._of_still(still)))
 
     def _of_still(self, still: Mask) -> Iterator[str]:
-        """Sentences about joints that have not moved."""
         if self.fast.any():
             yield (
                 f"{_and(_names(self.config, self.fast))} exceeded the velocity limit before moving by {MOVED_STEPS} "

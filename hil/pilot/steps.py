@@ -155,8 +155,7 @@ def tells_of_the_arm(error: ExperimentError) -> bool:
     """Whether the error is informative about the arm, so that another run may follow: limit exceeded, no motion, no
     steady motion, or a period that differs from the one before.
 
-    Errors caused by another program, or by goals that were altered before they reached the servos, are not informative:
-    a further run with less torque or speed would only hide their cause.
+    Errors caused by another program, or by goals that were altered in transit, are not informative.
     """
     if isinstance(error, SafetyStop):
         return not error.overruled and (error.cause in _AT_A_LIMIT or error.cause is Cause.UNLIKE_BEFORE)

@@ -1,8 +1,7 @@
 """The speed up to which the supply can drive the commanded currents, learned from a stop.
 
-Back-EMF rises with speed. If it leaves too little of the supply voltage, a motor carries less current than
-commanded, and the motion no longer determines the arm's parameters. Such a speed is a limit like velocity_limit, even
-if velocity_limit itself is higher.
+Back-EMF rises with speed. If it leaves too little of the supply voltage, a motor carries less current than commanded,
+and the motion no longer determines the arm's parameters.
 """
 
 import math

@@ -162,7 +162,6 @@ def _end_samples(config: Config) -> int:
 
 
 def _lines(config: Config) -> Sequence[Sequence[int]]:
-    """The harmonics of each joint, from the configured lines or band."""
     experiment = config.experiment
     if experiment.band is None:
         return experiment.lines or []

@@ -1,7 +1,6 @@
 """A software spring and damper for arms without a stable rest pose: horizontal or inverted.
 
-The estimator receives the torque that was actually commanded, including spring and damper; their contribution can be
-recomputed from the recording, because it depends only on the previous sample's position and velocity.
+The estimator receives the torque that was actually commanded, including spring and damper.
 """
 
 import numpy as np

@@ -1,7 +1,6 @@
 """Rejection of angles that no servo arm reaches: most often they are in degrees, although the file does not say so.
 
-An estimate from such angles takes minutes and is meaningless. Joints that rotate continuously are accepted, and so is
-everything if [columns] states the unit.
+Joints that rotate continuously are accepted, and so is everything if [columns] states the unit.
 """
 
 import math

@@ -1,8 +1,7 @@
 """Comparison of recorded velocities with the positions: a wrong time scale leaves no other trace.
 
-Parameters absorb a wrong time scale: if the recorded times are twice the true ones, the estimated inertia is four
-times too large. Only a second measurement that depends on time, such as a velocity column, shows it. Velocities are
-otherwise not used.
+Parameters absorb a wrong time scale: if the recorded times are twice the true ones, the estimated inertia is four times
+too large. Velocities are otherwise not used.
 """
 
 import math

@@ -66,7 +66,6 @@ def spatial_motion(
 
 
 def _frame_step(position: Array) -> int:
-    """Number of samples from one frame to the next."""
     return max(1, -(-int(position.shape[1]) // MOST_FRAMES))
 
 

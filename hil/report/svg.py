@@ -134,7 +134,6 @@ def _y_axis(chart: Chart, x: Scale, y: Scale, size: Size) -> str:
 
 
 def _legend(series: tuple[Series, ...], width: float) -> tuple[str, int]:
-    """The legend above the chart and its number of rows."""
     named = [one for one in series if one.name]
     across, row, parts = 58.0, 0, []
     for one in named:

@@ -1,7 +1,6 @@
 """Compare the arm with its description: each joint in turn is moved by hand, with torque off, and its angle is read.
 
-An identification cannot detect wrong IDs, directions, zeros or axes: it merely finds wrong parameters for a spatial
-arm. A person who moves the joints notices such errors at once.
+An identification of a spatial arm cannot detect wrong IDs, directions, zeros or axes.
 """
 
 from collections.abc import Callable, Iterator
@@ -55,8 +54,7 @@ class Moved:
 def pose_of(config: Config, angles: tuple[float, ...]) -> Pose:
     """Return the pose of the arm at these joint angles [rad].
 
-    An angle may be wrong by whole turns, since a servo does not count turns while it is off. They are removed if the
-    position limits reveal them.
+    Whole turns, which a servo does not count while it is off, are removed if the position limits reveal them.
     """
     limits = [joint.position_limit for joint in config.joints]
     angles = tuple(within_limits(*each) for each in zip(angles, limits, strict=True))
@@ -120,7 +118,6 @@ def judge(config: Config, asked_for: int, asked: str, change: Array, drives: Arr
 
 
 def _reversed(joint: JointConfig) -> list[int] | int:
-    """Return the entry `direction` with every sign reversed."""
     reverse = [-sign for sign in joint.directions]
     return reverse if len(reverse) > 1 else reverse[0]
 

@@ -79,10 +79,9 @@ class ChainCoordinates:
     def moved(self, x: Array, step: Array) -> Array:
         """Return the point reached by `step` from `x`; both arrays may end with other coordinates.
 
-        If a recording barely constrains the torque of some joints relative to that of the first, their torque scales
-        and all parameters of their links can change by a common factor. The scales are exponentials of their
-        coordinates. Unless the parameters change exponentially with them, a step does not follow this common change,
-        and only tiny steps reduce the sum of squares.
+        If a recording barely constrains the torque scales of some joints, these and all parameters of their links can
+        change by a common factor. Unless the parameters change exponentially like the scales, a step does not follow
+        this common change, and only tiny steps reduce the sum of squares.
         """
         y = x + step
         if self.torque_scales.size:

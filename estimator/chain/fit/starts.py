@@ -61,8 +61,7 @@ def first_problem(
 def initial_lag(delay: float, options: ChainOptions) -> float:
     """Return the initial guess of the lag [s]: the geometric mean of stage 1's delay and the typical lag.
 
-    Stage 1's delay is too long by several milliseconds, since it also compensates for the shape of friction near
-    standstill.
+    Stage 1's delay is too long by several milliseconds.
     """
     least = options.min_initial_lag
     return max(math.sqrt(max(delay, least) * SHAPES["lag"][0]), least)
@@ -77,8 +76,8 @@ def repeated(period: SettledPeriod) -> Array:
     """Return the weight of each sample (joints, samples), less than 1 for a sample that shares its neighbours' error.
 
     While a joint sticks, its encoder repeats one reading with one rounding error. Counted at every sample, that error
-    would make the simulated joint creep towards the reading, through friction that is smoothed near standstill.
-    Therefore any number of equal readings in a row counts as at most REPEATED readings.
+    would make the simulated joint creep towards the reading. Therefore any number of equal readings in a row counts as
+    at most REPEATED readings.
     """
     weight = np.ones_like(period.position)
     for row, position in zip(weight, period.position, strict=True):

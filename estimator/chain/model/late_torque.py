@@ -61,9 +61,8 @@ def lost_inertia(base: BaseParameters, parameters: Mapping[str, float]) -> dict[
 def limited(base: BaseParameters, parameters: Mapping[str, float], std: Array) -> tuple[str, ...]:
     """Return the names of the lagging back-EMFs that would cancel more inertia than the simulation allows.
 
-    The loss that is simulated is then smaller than the parameters imply, which biases the estimated inertias. A
-    back-EMF is named only if its loss exceeds the standard error of a base parameter. std: standard errors of the base
-    parameters; those of other parameters may follow.
+    This biases the estimated inertias. A back-EMF is named only if its loss exceeds the standard error of a base
+    parameter. std: standard errors of the base parameters; those of other parameters may follow.
     """
     generating = _generating(base.chain.joints, parameters)
     most, parts = _most_lost(base, parameters, generating)

@@ -1,16 +1,15 @@
 """Test whether one joint's friction changed between two runs, using the full covariance of its parameters.
 
-Coulomb friction, its rise at low speed and the speed at which it falls are known far better in combination than
-individually: a change of one of them by 10 % may be less than its own standard error and still be obvious. Let d be the
-difference of the joint's friction parameters between the runs, and S the sum of their covariances in both. Two kinds of
-test are made.
+Friction parameters are known far better in combination than individually: a change of one of them by 10 % may be less
+than its own standard error and still be obvious. Let d be the difference of the joint's friction parameters between the
+runs, and S the sum of their covariances in both. Two kinds of test are made.
 
 one term alone    Did only term i change? The most powerful test is z_i = (S^-1 d)_i / sqrt((S^-1)_ii), and
                   (S^-1 d)_i / (S^-1)_ii is the change that this implies (generalised least squares).
 several at once   Is d anything but noise? d' S^-1 d has a chi-square distribution.
 
-The covariances are marginal ones: changes of inertia, gravity or another joint do not affect the tests. Friction itself
-varies slightly from run to run. The covariance of a single run does not include this, so `REPEATABILITY` is added to S.
+Friction itself varies slightly from run to run. The covariance of a single run does not include this, so
+`REPEATABILITY` is added to S.
 """
 
 import math

@@ -4,8 +4,7 @@ The arm is a MuJoCo model with one or two hinges. The unknowns are the first mom
 armature of joint 2, and each joint's damping, friction loss and constant torque, all scaled by expected values. The
 method gets every advantage: an initial guess within 50 % of the expected values (from farther away, it does not
 converge), the length of link 1, the initial state from the period's Fourier lines, the delay found by hil's stage 1,
-mujoco.sysid's own optimiser with rollouts on all cores, and the smallest number of integration steps per sample (two)
-that does not change its answer.
+and mujoco.sysid's own optimiser with rollouts on all cores.
 """
 
 import importlib
@@ -131,7 +130,6 @@ class _Arm:
 
 
 def _sequences(mujoco: Any, sysid: Any, spec: Any, period: SettledPeriod, linear: LinearEstimate) -> Any:
-    """The commands and positions of the period as MuJoCo time series."""
     model = spec.compile()
     steps = STEPS * period.samples
     at = np.arange(steps) * model.opt.timestep

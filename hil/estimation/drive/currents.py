@@ -1,8 +1,7 @@
 """Currents that differ from the commanded ones: they were clipped, or this program's goals did not cause them.
 
 A clipped current is smaller than a large goal, follows a small one, and never opposes it. Any other deviation has
-another cause: goals were altered in transit or by another program, or the reported current is wrong. The torque that
-drove the arm is then not the one that the estimate is based on.
+another cause: goals were altered in transit or by another program, or the reported current is wrong.
 """
 
 from dataclasses import dataclass

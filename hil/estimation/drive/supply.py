@@ -1,9 +1,9 @@
 """Supply sag under load: its detection from the servos' Present Input Voltage, and its effect on the torque.
 
-A motor at velocity v draws a supply current with terms in u^2 and u v if it is driven with voltage u, or in i^2
-and i v if it is driven with current i. The resistance of the supply turns this current into a voltage drop. The
-register is read only a few times a second, in steps of 0.1 V. A regression of its readings on these products over the
-whole recording nevertheless gives the drop at every sample.
+A motor at velocity v draws a supply current with terms in u^2 and u v if it is driven with voltage u, or in i^2 and i v
+if it is driven with current i. The resistance of the supply turns this current into a voltage drop. The register is
+read only a few times a second, in steps of 0.1 V; a regression of its readings on these products gives the drop at
+every sample.
 
 A voltage-driven joint receives its duty cycle times the supply voltage at that moment: its torque sags with it. A
 current-driven joint is not affected as long as its servo can still drive the current.

@@ -1,7 +1,6 @@
 """Location and kind of the parts of a recording that the fitted model does not explain although it explains the rest.
 
 A reading that freezes, a missing torque, single wrong samples or a joint that hits a stop can spoil an estimate.
-The residual alone would suggest wrong units or a missing term.
 """
 
 from collections.abc import Iterator, Sequence
@@ -234,6 +233,5 @@ def _from_to(time: Array, part: slice) -> str:
 
 
 def _at(times: Array) -> str:
-    """Text that lists the times, or only the first ones."""
     shown = ", ".join(f"{each:.3f}" for each in times[:SHOWN])
     return f"at {shown} s" if len(times) <= SHOWN else f"the first at {shown} s"

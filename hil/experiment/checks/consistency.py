@@ -1,7 +1,6 @@
 """Check on every sample that a joint's position and velocity agree.
 
-A frozen encoder still answers, and a velocity that stays at zero is within every limit. But the integral of the
-velocity must equal the change in position. The difference,
+The integral of the velocity must equal the change in position. The difference,
 
     apart = position - integral of velocity,
 
@@ -25,8 +24,7 @@ compared with the encoder noise so far: `STEPS` jumps within `STEPS_S` count as 
 
 If a healthy servo reports exactly the same velocity for some time, the joint really moved at that velocity, except
 perhaps during the last `LAG_S`. The distance covered before that must therefore equal velocity times time; otherwise,
-the reported velocity is frozen. This detects a velocity that freezes near its peak sooner than the memories do, in
-which a lag could explain the difference.
+the reported velocity is frozen.
 
 Lag and scale error are properties of a servo and do not change. A lag that changes is a fault
 (`hil.experiment.velocity.lag`). Once the motion has shown them, up to twice the estimated values are accepted, plus

@@ -2,9 +2,8 @@
 
 The feed-forward torque of the assumed model is combined with the stabiliser's spring and damper, which track the path
 to the rest pose; if a joint stays off the path, an additional torque towards the path grows. Lowering is monitored like
-the experiment. It is aborted and torque is cut if a servo loses its torque, if a current does not follow its goal, if a
-joint leaves the path, or if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on velocities
-that agree with the positions.
+the experiment; torque is also cut if a motor turns against its goals (`hil.plan.obedience`). The damper acts only on
+velocities that agree with the positions.
 
 Replies may be missing for a moment, even at the beginning: joints that are not heard get only the feed-forward torque.
 """
@@ -133,8 +132,7 @@ class Lowering:
         lowering takes.
 
         goal: latest goals [A or V]. recent: the latest exchanges. watch: the check against the model, which has seen
-        the motion so far. Without it, a motor that turns against its goal is detected only when its joint runs away.
-        noise: noise of each joint's current readings [A or V], if known.
+        the motion so far. noise: noise of each joint's current readings [A or V], if known.
         """
         self._recent, self._watch, self._noise = recent, watch, noise
         self._obedience = Obedience(len(state.position))

@@ -53,7 +53,6 @@ def _levels(data: RunData) -> tuple[Table, ...]:
 
 
 def _excited(data: RunData) -> list[list[int]]:
-    """Excited harmonics of each joint."""
     entry = next(entry for entry in data.record.excitation if entry.role == IDENTIFY)
     return [list(lines) for lines in entry.lines]
 
