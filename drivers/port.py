@@ -56,7 +56,7 @@ _ALWAYS = 1 << 62
 
 _EARLY_BITS = 9.0
 """Assumed number of bits per transmitted byte. A reply counts as early if it arrives before the request can have been
-transmitted with this many bits per byte. The true number is ten; the difference allows for inaccurate baud rates.
+transmitted with this many bits per byte. The true number is ten.
 """
 
 _BAUD_TOLERANCE = 0.03

@@ -30,7 +30,6 @@ OVERRUN_S = 1e-3
 
 TOO_SLOW_S = 5e-3
 """If simulating the arm takes this much longer than the simulated time twice in a row, the excess is not simulated [s].
-After a single stall of the computer, the arm catches up instead.
 """
 
 LONGEST_SLEEP_S = 0.05

@@ -1,7 +1,7 @@
 """An identified spatial arm as a model; see `hil.arm_model`. Needs numpy only.
 
 Newton-Euler equations in which the base parameters replace the links' own inertial parameters, and all eliminated
-parameters are zero. The dynamics stay the same, but a mass of zero says nothing about the real link.
+parameters are zero.
 """
 
 from dataclasses import dataclass

@@ -43,7 +43,7 @@ OTHER_UNITS: dict[str, tuple[tuple[_Unit, ...], ...]] = {
     FRACTION: ((("percent", 1e-2), ("per mille", 1e-3)),),
 }
 """Units that people use for a quantity, as multiples of its unit. In each group, only the first unit that makes sense
-is proposed; the groups are different kinds of unit (for torque, newton metres and kilogram-force centimetres).
+is proposed.
 """
 
 _LEAST = {"m/s^2": 1.5, "m": 1e-2, "samples per second": 1.0}

@@ -111,8 +111,8 @@ class Term:
     fastest: float | None = None
     """Upper bound of a term that is a speed, as a multiple of the joint's highest speed; None for no bound.
 
-    A term that hardly changes over the speeds of the motion is equivalent to another term: a Stribeck rise that never
-    falls is Coulomb friction, and a Coulomb step that is never completed is viscous friction.
+    A Stribeck rise that never falls is Coulomb friction, and a Coulomb step that is never completed is viscous
+    friction.
     """
     max_step: float | None = None
     """Maximum change of the term's coordinate (for positive terms, a logarithm) per iteration; None for the fit's

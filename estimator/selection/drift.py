@@ -2,8 +2,8 @@
 
 A fit of one period, or of the mean of several, is valid for the middle of their time span. Other periods then show
 whether friction was larger or smaller: the difference in motion is nearly linear in one factor per joint, for viscous
-and dry friction, and in the period's initial state. The difference may also be due to a constant torque that acts in
-only one of the periods; the cause that explains more is reported.
+and dry friction, and in the period's initial state. A constant torque in only one of the periods is the alternative
+cause.
 """
 
 from collections.abc import Sequence

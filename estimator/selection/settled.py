@@ -1,9 +1,9 @@
 """Friction model selection: models are fitted from simple to rich and judged on a held-out motion.
 
-A richer model always has a smaller residual on the motion to which it was fitted. Its open-loop prediction of another
-motion improves only if its terms are real, or by chance. Therefore it must also reduce the residual by more than
-meaningless terms would. Without another motion, the Bayesian information criterion is used (Schwarz, Annals of
-Statistics 6 (1978) 461), with the number of samples reduced according to the residual's correlation.
+A richer model's open-loop prediction of another motion improves only if its terms are real, or by chance. Therefore it
+must also reduce the residual by more than meaningless terms would. Without another motion, the Bayesian information
+criterion is used (Schwarz, Annals of Statistics 6 (1978) 461), with the number of samples reduced according to the
+residual's correlation.
 """
 
 from collections.abc import Collection, Mapping, Sequence

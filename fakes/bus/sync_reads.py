@@ -1,8 +1,7 @@
 """Precomputed group reads of the control cycle.
 
 They read Present Current, Velocity and Position of several servos, or registers without measurements, such as goals.
-They return the same bytes as the general path in `hil.fakes.bus.instructions` in half the time; a fake bus spends most
-of its time here.
+They return the same bytes as the general path in `hil.fakes.bus.instructions` in half the time.
 """
 
 import functools

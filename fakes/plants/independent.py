@@ -9,8 +9,7 @@
     links = [{ length = 0.1, mass = 0.05, centre = 0.05, inertia = 1e-4 }]
     drives = [{ mass = 0.02, rotor_inertia = 8e-8, gear_ratio = 288.4, torque_constant = 0.35, viscous = 0.01 }]
 
-Each joint is described as an arm with one joint. This suffices for programs that communicate with servos and move an
-arm, but not for those that depend on coupling between joints.
+Each joint is described as an arm with one joint.
 """
 
 from collections.abc import Sequence

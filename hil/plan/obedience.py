@@ -49,9 +49,7 @@ motor may have become reversed right before that test.
 """
 
 PAUSE_S, PUSHED_PAUSE_S = 0.01, 0.25
-"""Time between two tests of a joint, and the time after a test that showed a push [s]. A push may end, and noise may
-look like one, so the joint is tested again.
-"""
+"""Time between two tests of a joint, and the time after a test that showed a push [s]."""
 
 
 class Residual(NamedTuple):

@@ -19,8 +19,7 @@ PULL_PER_S, PULL_SHARE = 2.0, 0.25
 """Growth rate of an additional torque towards the path, relative to the spring's torque [1/s], and the largest value of
 that torque, relative to the joint's largest torque.
 
-At a low sampling rate the spring must be soft to be stable. On its own, it is then too weak to overcome the friction of
-a light joint, which would stop tenths of a radian from the rest pose.
+At a low sampling rate the spring alone is too weak to overcome the friction of a light joint.
 """
 
 LOOKED_AT = 25  # poses of a straight line that are checked

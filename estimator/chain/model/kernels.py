@@ -11,8 +11,7 @@ over the mass, it is
 so that twelve numbers per body replace its 36. The regressor is that of Atkeson, An and Hollerbach, International
 Journal of Robotics Research 5 (1986) 101, in link frames.
 
-Every formula is linear in the links' inertial parameters, so a vector of base parameters, with all others zero, may be
-used instead of the parameters of real links.
+Every formula is linear in the inertial parameters, so base parameters, with all others zero, may replace them.
 """
 
 import math

@@ -3,8 +3,7 @@
 The back-EMF passes through the same lag as the voltage, so that a joint moves like one whose rotor is lighter by the
 product of back-EMF and lag; see `hil.estimator.simulation.back_emf`. The fraction `back_emf` of viscous friction is due
 to back-EMF. The lag of a winding makes a joint lighter by at most half of its inertia, where the poles of the
-equivalent motor coincide. Far from the minimum of a fit, parameters may imply a greater loss, which is then limited to
-this value.
+equivalent motor coincide. A greater loss, far from the minimum of a fit, is limited to this value.
 """
 
 from collections.abc import Mapping, Sequence

@@ -3,8 +3,8 @@
 Every common parameter is tested on its own: z = difference / sqrt(std_a^2 + std_b^2). The friction of each joint is
 also tested as a whole (hil.estimation.changes.friction_change). Holm's step-down correction keeps the probability of
 any false alarm in the whole table at `FALSE_ALARMS` (S. Holm, Scandinavian Journal of Statistics 6 (1979) 65). A change
-must also be larger than the fraction `least_share` of the parameter's magnitude: standard errors cover noise only, and
-two runs of an arm with some unmodelled friction differ by slightly more than these.
+must also be larger than the fraction `least_share` of the parameter's magnitude, since standard errors cover noise
+only.
 """
 
 import math

@@ -12,9 +12,7 @@ first, to the timeout used during the experiment.
 """
 
 LONGEST_S = 0.022
-"""Reply timeout after some replies have been late [s]: longer than an adapter's latency timer of 16 ms. If
-replies are lost instead of late, it is better to ask again soon.
-"""
+"""Reply timeout after some replies have been late [s]: longer than an adapter's latency timer of 16 ms."""
 
 LAST_S = 0.075
 """Time after the latest reply at which waiting always ends [s]: torque must be off 25 ms later."""
