@@ -38,7 +38,6 @@ class FixedRate:
         self.missed = 0
 
     def wait(self) -> Tick:
-        """Wait for the next deadline and return it."""
         if self._start is None:
             self._start = self._clock.now() + self._interval
         deadline = self._start + self._index * self._interval

@@ -51,7 +51,6 @@ class Turns:
         return self._slow
 
     def read_status_next(self) -> None:
-        """Make the status due in the next cycle."""
         if self._status_every < NEVER:
             self._until_status = min(self._until_status, 1)
 

@@ -1,8 +1,8 @@
 """Detection of wrong columns in a chain's recording: reversed signs, torques that contradict each other, wrong times.
 
 As for planar arms (`hil.estimator.baselines.signs`), the torque residual of filtered inverse dynamics with a column
-changed is compared with that of the columns as given. Signs and factors of torques only change how the normal equations
-of the joints are added up, so all combinations can be tried; reversed angles and other times need a new regressor.
+changed is compared with that of the columns as given. Signs and factors of torques only change how the joints' normal
+equations are added up, so all combinations can be tried.
 """
 
 from collections.abc import Iterator, Sequence

@@ -89,12 +89,10 @@ class SettledPeriod:
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
         return int(self.position.shape[0])
 
     @property
     def samples(self) -> int:
-        """Number of samples in the period."""
         return int(self.position.shape[1])
 
     @property

@@ -60,7 +60,6 @@ class Altered:
 
     @property
     def segments(self) -> int:
-        """Number of segments."""
         return len(self.problem.segments)
 
     def measured(self, number: int) -> Array:

@@ -61,7 +61,6 @@ class Hypothesis:
 
     @property
     def unknowns(self) -> int:
-        """Number of unknowns."""
         return len(self.joints) if self.kind == "scale" else len(self.directions)
 
 

@@ -49,12 +49,10 @@ class Multisine:
 
     @property
     def joints(self) -> int:
-        """Number of joints."""
         return len(self.lines)
 
     @property
     def samples(self) -> int:
-        """Number of samples in the period."""
         return int(self.torque.shape[1])
 
     @property

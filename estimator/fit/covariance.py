@@ -180,9 +180,8 @@ def _measured(
 def _inverse(information: Array) -> Array:
     """Return the inverse of a matrix with diagonal elements of at most 1.
 
-    Coordinates that only matter together, such as constant friction and a term that varies only beyond the speeds of
-    the motion, leave an eigenvalue that is zero except for rounding. A pseudoinverse would treat their unknown
-    difference as known exactly.
+    Coordinates that only matter together leave an eigenvalue that is zero except for rounding. A pseudoinverse would
+    treat their unknown difference as known exactly.
     """
     size, directions = linalg.eigh(information)
     inverse: Array = (directions / np.maximum(size, LEAST_INFORMATION)) @ directions.T

@@ -156,9 +156,9 @@ class Search:
     def _refine(self, starts: Sequence[Start], wide: Array) -> Refined:
         """Refine the best of `starts`, and variants with different friction near standstill, using fine steps.
 
-        A fit that explains the motion may still have the wrong friction there, with a slightly larger sum of squares.
-        The tracking fit determines that friction well, and fits do not get from a narrow step to a wide one, so the
-        friction of the tracking fit and that of `wide` (coordinates) are both tried.
+        A fit that explains the motion may still have the wrong friction there. The tracking fit determines it well, and
+        fits do not get from a narrow step to a wide one, so the friction of the tracking fit and that of `wide`
+        (coordinates) are both tried.
         """
         options = self.options
         ftol = options.ftol_coarse if self.coarse else options.ftol_start

@@ -47,7 +47,6 @@ class Objective:
 
     @property
     def count(self) -> int:
-        """Number of parameters."""
         return len(self.coordinates.names)
 
     def physics(self, x: Array) -> Physics:

@@ -315,9 +315,8 @@ def _tempered(
     """Return the minimum with priors reweighted by the data's actual information; `minimum` if nothing changes.
 
     The sum of squares treats the errors of all samples as independent. A model error repeats at every reversal, so the
-    data constrain a parameter far less than this implies, as the parameter's standard error shows. The fit would
-    override any prior and yield, for example, a torque constant of half the smallest plausible value. Therefore each
-    prior's precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
+    data constrain a parameter far less than this implies, and the fit would override any prior. Therefore each prior's
+    precision is multiplied by the factor by which the data's variance exceeds that of independent errors.
     """
     count, prior = objective.count, objective.prior
     if objective.lever is None and not prior.precision.any():

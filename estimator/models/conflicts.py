@@ -1,7 +1,7 @@
 """Values that contradict prior knowledge by being many standard deviations from configured or typical values.
 
-If the model lacks an effect, such as gear backlash, other parameters of the fit imitate it. The true values of some are
-known beforehand; a large deviation then reveals the imitation, which standard errors do not.
+If the model lacks an effect, such as gear backlash, other parameters imitate it. A large deviation from a value known
+beforehand reveals this; standard errors do not.
 """
 
 from collections.abc import Mapping, Sequence

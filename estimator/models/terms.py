@@ -382,7 +382,6 @@ def constants() -> tuple[str, ...]:
 
 
 def units_of(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the units of parameters."""
     return tuple(term_of(name).unit for name in names)
 
 

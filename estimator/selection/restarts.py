@@ -1,8 +1,7 @@
 """Other initial guesses for an estimate that may be at a local minimum.
 
 The likelihood has several minima if a term acts in a narrow range: the width of the Coulomb step, the stiffness of
-bristles (if they are too stiff to bend, the data do not reveal their stiffness), and the periods of torque ripple and
-cogging.
+bristles, and the periods of torque ripple and cogging.
 """
 
 from collections.abc import Iterator, Mapping

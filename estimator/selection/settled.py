@@ -240,9 +240,8 @@ class Selection:
     def _with_wave(self, best: Trial, plain: Trial | None = None) -> Trial:
         """Add ripple or cogging, whichever explains more, if the score test finds it.
 
-        The score test needs the model that explains the most, `best`. A fit that starts from it may end far from the
-        truth, because cables, saturation and load have so far imitated the wave together. Therefore the wave is first
-        added to `plain`, which has few terms that could imitate it, and then the other terms are added.
+        The score test needs the model that explains the most, `best`. In that model, other terms imitate the wave.
+        Therefore the wave is first added to `plain`, which has few such terms, and then the other terms are added.
         """
         assert best.estimate is not None
         absent = [wave for wave in WAVES if wave not in best.model.options]

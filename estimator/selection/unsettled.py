@@ -142,7 +142,6 @@ class _Search:
         of: slice = ALL,
         options: ShootingOptions = FINE,
     ) -> ShootingEstimate | None:
-        """Return an estimate; None if the fit does not converge."""
         try:
             return estimate_by_shooting(
                 self._recordings,

@@ -2,8 +2,7 @@
 
 The equations, including the torque scale, and the default integration step are those of `hil.estimator.simulation.arm`.
 A command is computed once per sample from the state at the previous sample, as on the real bus, then limited and held;
-the motor follows it with a first-order lag. A pure delay of the drive is added to that lag; to first order, the two are
-equivalent.
+the motor follows it with a first-order lag. A pure delay of the drive is added to that lag.
 """
 
 import math

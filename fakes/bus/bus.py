@@ -336,10 +336,6 @@ class FakeBus:
                 servo.connected = True
 
     def send(self, replies: Sequence[Reply], now: float) -> None:
-        """Put replies on the wire.
-
-        Each starts after its delay from the end of the previous one; the first delay counts from `now`.
-        """
         wire, faults = self._wire, self.faults
         if faults.on_replies:
             for servo_id, delay_s, data in replies:
@@ -357,7 +353,6 @@ class FakeBus:
             wire.put(joined, now)
 
     def measure(self, servo: EmulatedServo, address: int, length: int) -> None:
-        """Update the registers in this address range with the state of the servo's joint."""
         end_address = address + length
         if (address < PRESENT_END and end_address > PRESENT_START) or servo.memory.is_indirect(address, length):
             index = self._index[servo]
@@ -365,7 +360,6 @@ class FakeBus:
             servo.present.measure(address, end_address, self._now, position[index], velocity[index], current[index])
 
     def joints(self) -> States:
-        """Return position [rad], velocity [rad/s] and motor current [A] of the joints, one value per servo."""
         if self._one_each:
             plant = self.plant
             return plant.position, plant.velocity, plant.current
@@ -377,7 +371,6 @@ class FakeBus:
 
     @property
     def servos_refuse(self) -> bool:
-        """Whether an active fault makes the servos refuse commands."""
         return bool(self.faults.on_answers)
 
     def fault_error(self, servo: EmulatedServo, now: float) -> int:

@@ -152,7 +152,6 @@ class Instructions:
         self._line.send(self._overlaid(answers), now)
 
     def _overlaid(self, answers: list[Reply]) -> list[Reply]:
-        """Return the transmissions on the line when servos with the same ID answer."""
         if len(answers) < 2:
             return answers
         baud, end, pieces = self._line.baud, 0, []

@@ -29,9 +29,7 @@ _pack_crc = Struct("<H").pack
 class JointStates(Protocol):
     """Source of the joints' states."""
 
-    def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Return position [rad], velocity [rad/s] and motor current [A] of the joints, one value per servo."""
-        ...
+    def joints(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]: ...
 
 
 class _Part(NamedTuple):

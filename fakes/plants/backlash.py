@@ -63,7 +63,6 @@ class GearedArm:
         self._rotors[joint].motor.jammed = jammed
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._rotors[joint].motor.held_at = velocity
 
     def advance(self, until: float, current: Sequence[float]) -> None:

@@ -51,11 +51,9 @@ class Independent:
         return [joint.current[0] for joint in self._joints]
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Block a joint, or release it."""
         self._joints[joint].jam(0, jammed)
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._joints[joint].hold(0, velocity)
 
     def advance(self, until: float, current: Sequence[float]) -> None:

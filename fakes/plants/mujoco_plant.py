@@ -55,11 +55,9 @@ class MujocoPlant:
         return [float(current) for current in self._current]
 
     def jam(self, joint: int, jammed: bool) -> None:
-        """Block a joint, or release it."""
         self._jammed[joint] = jammed
 
     def hold(self, joint: int, velocity: float | None) -> None:
-        """Grip a joint and move it at `velocity` [rad/s], or release it (None)."""
         self._held_at[joint] = velocity
 
     def advance(self, until: float, current: Sequence[float]) -> None:

@@ -5,8 +5,7 @@ Addresses, sizes and signs come from `hil.drivers.control_table`; area, access, 
 tables leave out, are added here from the e-Manual (pages x/<model>). The address of the 330 series' indirect data
 depends on the firmware: see `ModelFacts.indirect_of_firmware`.
 
-A model outside the X series follows its table in the SDK: its registers hold what is written to them, within their
-size, and its motor does not move.
+A model outside the X series follows its table in the SDK; its motor does not move.
 """
 
 from collections.abc import Iterator, Mapping

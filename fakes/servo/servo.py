@@ -205,7 +205,6 @@ class EmulatedServo(Powered):
     # Queries for tests
 
     def value(self, name: str) -> int:
-        """Return the register's current content; raises KeyError if the model has no such register."""
         return self.memory.value(name)
 
     @property

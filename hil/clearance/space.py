@@ -175,7 +175,6 @@ class Space:
         return self._arrays[0]
 
     def names_of(self, pair: int) -> tuple[str, str]:
-        """Names of the two members of a pair."""
         link = self._arrays[0]
         first, second = self._pairs[pair]
         return self.shapes.names[link[first]], self._partner(int(second))

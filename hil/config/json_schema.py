@@ -1,5 +1,6 @@
-"""The JSON Schema of the TOML file, generated from the models that check it. values (a rest pose within the position
-limits, one entry per joint) are checked only by `load_config`.
+"""The JSON Schema of the TOML file, generated from the models that check it.
+
+Constraints between values are checked only by `load_config`.
 """
 
 import json

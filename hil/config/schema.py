@@ -304,7 +304,6 @@ class Config(Table):
 
     @property
     def bus(self) -> BusConfig:
-        """The configuration of the bus driver."""
         return BusConfig(
             self.url,
             self.port.baud,

@@ -12,7 +12,7 @@ def kept_bytes(path: Path) -> bytes:
     """Return the bytes to store as the copy of a URDF or MJCF file. Raises OSError, ArmFileError.
 
     A URDF is kept as it is. MuJoCo cannot read an MJCF whose meshes, textures or included files are missing: such a
-    file is kept with everything included, its inertias written out, and shapes that need another file left out.
+    file is kept self-contained, without shapes that need another file.
     """
     if not is_mjcf(path) or not (text := _self_contained(path)):
         return path.read_bytes()

@@ -23,9 +23,7 @@ class AmplitudeOptions:
     search_arms: int = 32
     """Number of arms simulated during the search; the result is checked on all arms."""
     prior_share: float = 0.9
-    """Fraction of the limits that may be used before any identification: a wide prior has longer tails than the
-    simulated arms show.
-    """
+    """Fraction of the limits that may be used before any identification."""
     max_rounds: int = 12
     """Maximum number of search iterations, and of subsequent torque reductions."""
     max_polishing_rounds: int = 4
@@ -46,9 +44,7 @@ class AmplitudeOptions:
     """
     min_exponent: float = 0.4
     least_change: float = 0.005
-    """The search stops if the torque would change by less than this fraction: another iteration would not be worth its
-    simulations.
-    """
+    """The search stops if the torque would change by less than this fraction."""
     polishing_ratio: float = 1.06
     """Factor by which each of the final increases raises a joint's torque."""
     worst_arms: int = 4

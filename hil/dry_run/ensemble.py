@@ -18,10 +18,7 @@ from hil.plan.chain_model import torque_constant_stds
 from hil.results.result import Result
 
 MODEL_SPREAD = 0.005
-"""Relative standard deviation added to every identified parameter for model error, which the covariance omits.
-
-It is multiplied by the ratio of the simulated range of motion to the range used for identification.
-"""
+"""Relative standard deviation added to every identified parameter for model error, which the covariance omits."""
 
 _LEAST_SHARE = 0.05  # smallest allowed fraction of a positive parameter's nominal value
 _LEAST_WIDTH = 0.01  # rad/s, width of the Coulomb step: narrower steps change little and take longer to simulate
@@ -46,11 +43,9 @@ class Ensemble:
         return len(self.physics)
 
     def first(self, count: int) -> "Ensemble":
-        """The first `count` arms as an ensemble."""
         return Ensemble(self.physics[:count], self.torque_scale[:count], self.source)
 
     def only(self, arms: NDArray[np.intp]) -> "Ensemble":
-        """The arms with these indices as an ensemble."""
         return Ensemble(tuple(self.physics[arm] for arm in arms), self.torque_scale[arms], self.source)
 
 

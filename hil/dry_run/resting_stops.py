@@ -29,10 +29,10 @@ def resting_stops(config: Config, arms: ChainArms, planned: Sequence[Array] = ()
     """Side on which each joint lies on its stop (joints,): -1 at its smallest angle, 1 at its largest, 0 if on neither.
 
     A joint is assumed to lie on its stop if its rest pose is near the end of its range, nothing else touches the part
-    of the arm that it moves, and gravity does not pull it away from there. If the description lacks a support, the
-    joint is taken to lie on its stop until a recording shows it beyond its rest pose, or a planned path takes it there,
-    within its configured limits. planned: positions of these paths, each (joints, samples) [rad]. passed: whether each
-    joint has been below and above its rest pose, as returned by `passed_rest` (2, joints). Raises ArmFileError.
+    of the arm that it moves, and gravity does not pull it away from there. This assumption ends when a recording shows
+    the joint beyond its rest pose, or a planned path takes it there, within its configured limits. planned: positions
+    of these paths, each (joints, samples) [rad]. passed: whether each joint has been below and above its rest pose, as
+    returned by `passed_rest` (2, joints). Raises ArmFileError.
     """
     rest = np.array(config.arm.rest_pose)
     low, high = _ends(config, rest)

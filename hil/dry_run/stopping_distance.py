@@ -44,10 +44,7 @@ overshoot.
 _EVENLY = 16
 _IMMOVABLE = 1e3  # kg m^2
 _JUDGED_AFTER_S = (0.05, 0.2, 0.5)
-"""Times after torque is cut at which a simulation ends if the arm has too little energy to leave its limits [s].
-
-The first is many time constants of the current's lag, so that the motor no longer adds energy.
-"""
+"""Times after torque is cut at which a simulation ends if the arm has too little energy to leave its limits [s]."""
 _REACTION = 2
 """Samples until the stop takes effect: the sample that shows the fault, and the one in progress."""
 

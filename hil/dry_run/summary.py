@@ -111,7 +111,6 @@ def _ways_json(ways: dict[Way, Array]) -> dict[str, list[float]]:
 
 
 def print_dry_run(config: Config, run: DryRun, console: Console) -> None:
-    """Print the table and the verdict."""
     print_fitting(console, _table(config, run.shown, run))
     for line in (*run.servos, *dry_run_lines(config, run.shown, run)):
         say(console, line)

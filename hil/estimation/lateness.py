@@ -1,10 +1,9 @@
 """Correction of a settled period for the computer's lateness.
 
-Every goal leaves slightly after its deadline, and the positions read with it are equally late, whereas the estimator
-assumes that both happen at the deadline. Therefore each angle is shifted by velocity times lateness, and each held
-torque is replaced by the mean torque between its deadline and the next: the previous goal acts until the write, the new
-one afterwards. The remaining error is of second order: half the acceleration times lateness squared, a hundredth of an
-encoder step at 0.5 ms and 50 rad/s^2.
+The estimator assumes that goals and positions are exchanged at the deadline; in fact both are slightly late. Therefore
+each angle is shifted by velocity times lateness, and each held torque is replaced by the mean torque between its
+deadline and the next: the previous goal acts until the write, the new one afterwards. The remaining error is of second
+order: half the acceleration times lateness squared, a hundredth of an encoder step at 0.5 ms and 50 rad/s^2.
 
 Delays that the host cannot see, in the adapter's buffer and before the servo's sampling, are not corrected.
 """

@@ -83,7 +83,6 @@ class StopRequest:
 
     @property
     def count(self) -> int:
-        """Number of signals received."""
         return self._count
 
     def _note(self, number: int, _frame: FrameType | None) -> None:

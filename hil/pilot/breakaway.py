@@ -1,10 +1,9 @@
 """Breakaway of joints that friction holds: torque rises from run to run, and a run ends soon after a joint moves.
 
 Just above a joint's static friction, motion grows quickly: on many of the plausible arms even a few percent more torque
-makes a joint exceed a limit. If every run had to be safe over its whole duration, the torque could therefore hardly be
-raised. Instead, the guard is given narrow limits for such joints, and the torque is raised by a constant ratio from run
-to run, up to the current limit. As soon as the joint moves and so reveals its friction, the arm is braked and the run
-ends.
+makes a joint exceed a limit. Therefore the guard is given narrow limits for such joints, and the torque is raised by a
+constant ratio from run to run, up to the current limit. As soon as the joint moves and so reveals its friction, the arm
+is braked and the run ends.
 """
 
 import numpy as np

@@ -139,8 +139,7 @@ class ChainBelief:
     def _arms(self, linear: Array) -> ChainArms:
         """Arms with these parameters, in units of the commanded torque.
 
-        A linear update may make a light joint implausibly light. Such arms are moved towards the mean, and discarded if
-        that does not help.
+        Arms with an implausibly light joint are moved towards the mean, and discarded if that does not help.
         """
         base, drive = self.arms.base, self.arms.drive.copy()
         n = drive.shape[2]
@@ -222,7 +221,6 @@ def _rows(arms: ChainArms, config: Config, samples: NDArray[np.void]) -> tuple[A
 
 
 def _filled(position: Array) -> Array:
-    """Fill missing samples by linear interpolation."""
     filled = np.array(position, dtype=np.float64)
     at = np.arange(len(filled))
     for column in filled.T:

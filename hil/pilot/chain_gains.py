@@ -46,7 +46,6 @@ class ChainGains:
         )
 
     def at(self, rate: float) -> StabiliserConfig:
-        """Return the gains for a rate [Hz]."""
         return StabiliserConfig(stiffness=_rounded(self.stiffness_at(rate)), damping=_rounded(self._damping_at(rate)))
 
     def stiffness_at(self, rate: float) -> Array:

@@ -51,9 +51,7 @@ def _full(search: Search, config: Config, found: Amplitude) -> Played:
     """Play the full run; repeat it with less torque if it exceeded a limit, and with other waves if it did not settle.
 
     Friction may stop an arm in a different place in every period, however long it moves, so each repetition tolerates a
-    larger difference. The fit does not need equal periods, and the verdict says how well they are predicted. A period
-    that differs from the one before also counts as not settled; if this keeps happening, something is wrong with the
-    arm.
+    larger difference. The fit does not need equal periods, and the verdict says how well they are predicted.
     """
     run, say, options = search.run, search.player.say, search.options
     number = unlike = 0

@@ -276,9 +276,6 @@ class Search:
     def _roomiest(self, config: Config, found: Amplitude) -> Amplitude:
         """Return `found` or, if it leaves much of the range unused, the best amplitude with other waves if that uses
         more.
-
-        Slightly more torque may tip some of the arms over; with other waves, this happens at larger amplitudes or
-        towards the other side.
         """
         options = self.options
         limited = (found.peak_torque >= options.at_limit * most_torque(config)).all() or self.cap is not None

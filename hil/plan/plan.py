@@ -81,7 +81,6 @@ class Plan:
     """Largest number of samples for lowering a spatial arm after a stop."""
 
     def first_segment(self) -> "Plan":
-        """The plan with only its first multisine."""
         return replace(self, segments=self.segments[:1])
 
     @property
@@ -94,7 +93,6 @@ class Plan:
 
     @property
     def warm_up_samples(self) -> int:
-        """Number of samples of the warm-up."""
         return self.warm_up_periods * len(self.segments[0].period_current)
 
     @property

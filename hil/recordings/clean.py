@@ -30,7 +30,6 @@ class Rows:
     notes: tuple[str, ...] = ()
 
     def kept(self, chosen: Mask | NDArray[np.int64] | slice, *notes: str) -> "Rows":
-        """Select rows and append notes."""
         chosen_rows = self.time[chosen], self.torque[:, chosen], self.position[:, chosen]
         return Rows(*chosen_rows, (*self.notes, *notes))
 

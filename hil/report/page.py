@@ -74,7 +74,6 @@ def write_page(page: str, path: Path) -> None:
 
 
 def make_page(data: RunData) -> str:
-    """The whole HTML document."""
     return render(Path(data.record.config).stem, data.record.started, sections(data))
 
 

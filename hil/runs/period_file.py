@@ -1,7 +1,7 @@
 """period.npz: each multisine's settled period as measured and as predicted, for figures and other tools.
 
 Arrays are named ROLE_torque, ROLE_position, ROLE_predicted, ROLE_rate. ROLE is "identify" for the fitted multisine, and
-"held_out" for the one that was not fitted: it is predicted from the state one period earlier, or from rest.
+"held_out" for the one predicted from the state one period earlier, or from rest.
 """
 
 from collections.abc import Mapping

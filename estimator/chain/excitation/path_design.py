@@ -5,8 +5,8 @@ Ostermeier, Evolutionary Computation 9 (2001) 159, with a single step size) over
 series of `hil.estimator.chain.excitation.fourier_path`. Every variation is scaled to the limits of position and speed
 and then shrunk until `allowed` accepts it.
 
-Friction, too, is treated as unknown, and its model as no more accurate than that of the links. If it were known, slow,
-creeping motion would seem to identify a light joint, whose torque is mostly friction.
+Friction, too, is treated as unknown. If it were known, slow, creeping motion would seem to identify a light joint,
+whose torque is mostly friction.
 
 This designer is for the pilot experiment, where only limits are known: it also chooses the centre and width of the
 motion. For a given box, use `fourier_path.design_path`.

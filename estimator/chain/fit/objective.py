@@ -83,7 +83,6 @@ class ChainProblem:
 
     @property
     def count(self) -> int:
-        """Number of parameters."""
         return len(self.coordinates.names)
 
     def parameters(self, x: Array) -> dict[str, float]:

@@ -3,10 +3,9 @@
 The observer starts stiff, so that stage 1's parameters suffice to follow the motion, and is softened as the fit
 improves.
 
-If joints often stick, stage 1's estimate of friction can be far off. So can the link parameters and torque scales,
-which are correlated with friction. Softening the observer while the shape of friction is fixed then leads the fit into
-a curved valley, where it stops short of another minimum. So if the soft observer does not explain the motion, a second
-fit starts from the prior's links, with the shape of friction free as soon as the stiffest observer follows the motion.
+If joints often stick, stage 1's estimate of friction can be far off. Softening the observer while the shape of friction
+is fixed then leads the fit into a curved valley. So if the soft observer does not explain the motion, a second fit
+starts from the prior's links, with the shape of friction free as soon as the stiffest observer follows the motion.
 """
 
 import math

@@ -69,18 +69,15 @@ class BaseParameters:
 
     @property
     def count(self) -> int:
-        """Number of base parameters."""
         return int(self.columns.size)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the base parameters."""
         every = parameter_names(self.chain.joints)
         return tuple(every[column] for column in self.columns)
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Unit of each base parameter."""
         return tuple(map(unit_of, self.names))
 
     @cached_property

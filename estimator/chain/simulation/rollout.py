@@ -44,11 +44,9 @@ class ChainArms:
 
     @property
     def size(self) -> int:
-        """Number of arms."""
         return len(self.rigid)
 
     def first(self, count: int) -> "ChainArms":
-        """Return the first `count` arms."""
         return ChainArms(self.base, self.rigid[:count], self.drive[:count])
 
     def and_more(self, others: "ChainArms") -> "ChainArms":
@@ -58,7 +56,6 @@ class ChainArms:
         )
 
     def chosen(self, arms: Any) -> "ChainArms":
-        """Return the arms with these indices."""
         return ChainArms(self.base, self.rigid[arms], self.drive[arms])
 
     @property

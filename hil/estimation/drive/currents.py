@@ -100,8 +100,7 @@ def _noise(goal: Array, measured: Array) -> float:
     """Standard deviation of a current reading, from the recording itself: its scatter at constant goals or, if larger,
     its deviation from the goals or the second difference of that, whichever is smaller.
 
-    Differences are smaller if the deviation is smooth, plain values if goals are often altered. The current may lag
-    the goal by a few samples: the lag that leaves the smallest deviation is used.
+    The current may lag the goal by a few samples: the lag that leaves the smallest deviation is used.
     """
     count = len(goal) - _RECENT
     if count < _RECENT:

@@ -103,14 +103,11 @@ samples per period, the fastest that is used, needs 0.27.
 
 ROUGH_TIMES = 2.0
 """Allowance of the slow memory for a velocity that jumps between samples, as when gear teeth change sides: a multiple
-of the root sum of squares of `CURVED` times the difference between successive changes, times the interval. A jump
-anywhere within an interval causes an RMS error of 0.29 times the jump times the interval, and counts twice.
+of the root sum of squares of `CURVED` times the difference between successive changes, times the interval.
 """
 
 CURVED_AT_FIRST = 0.3
-"""Allowance for the first interval, as a fraction of the motion. Around the peak of a wave with four samples per
-period, two successive samples may have the same velocity, and there is no earlier change to compare with.
-"""
+"""Allowance for the first interval, as a fraction of the motion."""
 
 
 _FADING = np.dtype(

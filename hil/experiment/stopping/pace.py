@@ -1,7 +1,7 @@
 """Choose how often to command an arm that is being lowered, and how long to wait for replies, adapting to late ones.
 
-Servos hold their latest goal, so an arm can be lowered with fewer exchanges than the experiment needs. If replies come
-too late for one exchange per sample, only every second or third sample is exchanged from then on, until the end.
+Servos hold their latest goal. If replies come too late for one exchange per sample, only every second or third sample
+is exchanged from then on, until the end.
 """
 
 from math import ceil

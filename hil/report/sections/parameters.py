@@ -18,7 +18,6 @@ _MOST_DECIMALS = 9
 
 
 def parameters(data: RunData) -> Section:
-    """Return this section of the report."""
     truth = truth_of(data.result, data.config)
     return parameters_of(data.result, truth.values, truth.note)
 

@@ -13,7 +13,6 @@ _BINS = 60
 
 
 def timing(data: RunData) -> Section:
-    """Return this section of the report."""
     samples = data.samples
     deadline: Array = samples["deadline"]
     written: Array = samples["time_before_write"]
