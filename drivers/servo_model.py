@@ -90,8 +90,8 @@ class NoLoad(NamedTuple):
 class Published(NamedTuple):
     """A published torque constant: the median, lowest and highest of the figures.
 
-    It is uncertain even where the figures agree: the stall torque is a servo's peak torque, friction included, and an
-    individual servo's can differ by tens of percent. If it matters, measure the constant with a known weight.
+    It is uncertain even where the figures agree: an individual servo's stall torque can differ by tens of percent. If
+    it matters, measure the constant with a known weight.
     """
 
     value: float

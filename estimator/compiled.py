@@ -38,7 +38,7 @@ def only_version(dispatcher: Any) -> Any:
     """Return the machine code of a compiled function that has been called with arguments of one set of types.
 
     Calling it skips the lookup of the argument types, 0.1 us per array. Use it only where these types never change.
-    Without a compiler (NUMBA_DISABLE_JIT), and if there are several versions, the function is returned unchanged.
+    Without a compiler (NUMBA_DISABLE_JIT) or with several versions, the function is returned unchanged.
     """
     versions = list(getattr(dispatcher, "overloads", {}).values())
     return versions[0].entry_point if len(versions) == 1 else dispatcher

@@ -2,8 +2,7 @@
 
 Position passes through a causal low-pass filter and is differenced; the regressor is evaluated and filtered again. The
 torque passes through the same filter twice, so that both have the same lag. Every sample then corrects the parameters
-once: Ljung, System Identification (1999), section 11.2, with a forgetting factor of 1, which is optimal for an arm that
-does not change.
+once: Ljung, System Identification (1999), section 11.2, with a forgetting factor of 1.
 """
 
 from collections.abc import Sequence

@@ -217,8 +217,7 @@ class ColumnCheck:
     def contradictory_torques(self) -> tuple[float, ...] | None:
         """Return factors (joints,) of the torques, relative to joint 1, that explain the recordings better.
 
-        The links' prior is weak and friction absorbs much of an error, so a small gain is evidence; the likelihood can
-        decide then.
+        The links' prior is weak and friction absorbs much of an error, so a small gain is evidence.
         """
         normal, given = self._given
         factors, best = np.ones(self.model.joints), given

@@ -12,9 +12,8 @@ Widrow and I. Kollar, Quantization Noise, 2008). The drift is the difference at 
 changing friction. Solving for s gives the error variance of one reading, s^2 + 1/12. It is an upper bound, since other
 differences between the passes increase it.
 
-This applies to noise that is white before rounding. Noise that a servo has filtered is stronger at low frequencies.
-This excess over the noise at high frequencies is measured from the same difference, except at frequencies that may
-contain drift (`coloured_noise`).
+This applies to noise that is white before rounding. The excess of filtered noise at low frequencies is measured from
+the same difference (`coloured_noise`).
 """
 
 from collections.abc import Sequence

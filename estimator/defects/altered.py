@@ -167,7 +167,6 @@ class Altered:
         return self._parts[part]
 
     def samples(self, number: int) -> int:
-        """Number of measured angles of a segment."""
         return int(np.isfinite(self.problem.segments[number].position).sum())
 
 

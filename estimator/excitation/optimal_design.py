@@ -1,10 +1,9 @@
 """Optimal excitation: amplitudes and phases that minimise the largest relative standard error, within limits.
 
-The standard errors are those of the likelihood (`hil.estimator.fit.stage2`) on one settled period: the inverse
-information of the positions, with unknown initial state. The search is a (1+1) evolution strategy with step-size
-control by Rechenberg's success rule: first over the shape of the amplitude spectra and the extent of each joint's
-motion, then over the phases as well. Source of the criterion: Pronzato and Pazman, "Design of experiments in nonlinear
-models", 2013, chapter 5 (E and minimax criteria).
+The standard errors are those of the likelihood (`hil.estimator.fit.stage2`) on one settled period. The search is a
+(1+1) evolution strategy with step-size control by Rechenberg's success rule: first over the shape of the amplitude
+spectra and the extent of each joint's motion, then over the phases as well. Source of the criterion: Pronzato and
+Pazman, "Design of experiments in nonlinear models", 2013, chapter 5 (E and minimax criteria).
 """
 
 from concurrent.futures import ThreadPoolExecutor

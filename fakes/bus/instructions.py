@@ -1,6 +1,6 @@
 """Which servos act on an instruction packet, which reply, and in which order.
 
-"Conformance" in docs/fake-bus.md lists the choices made where the manual is silent. In a group read, each servo waits
+For choices made where the manual is silent, see "Conformance" in docs/fake-bus.md. In a group read, each servo waits
 for the complete status of the one listed before it (source: ROBOTIS in DynamixelSDK issue 364).
 """
 

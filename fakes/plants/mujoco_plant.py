@@ -5,7 +5,7 @@
     plant_options = { model = "arm.xml", joints = ["shoulder", "elbow"], torque_constant = [1.8, 1.8] }
 
 Friction, armature and limits are those of the model's joints; its actuators are not used. The motor torque, current
-times torque constant, is applied directly to the joint. Joint angles are those of the model.
+times torque constant, is applied directly to the joint.
 """
 
 from collections.abc import Sequence

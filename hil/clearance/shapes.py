@@ -267,8 +267,8 @@ def _of_box(centre: Array, size: Array) -> list[tuple[Array, float]]:
 def _from_joints(arm: ArmDescription, link: int, fixed: list[Array]) -> list[Capsule]:
     """A capsule from the link's joint to the next one.
 
-    The last link's capsule ends at the farthest frame fixed to it, or at twice the distance of its centre of mass if
-    that is farther.
+    The last link's capsule ends at the farthest frame fixed to it or, if farther, at twice the distance of its centre
+    of mass.
     """
     if link < len(arm.joints):
         end = arm.joints[link].translation

@@ -1,7 +1,7 @@
 """Simulated stops of a spatial arm, which is lowered if its servos still accept commands, and falls if they do not.
 
-Stops begin at times spread over the planned path, on arms of the ensemble. For each stop, the path home and the
-unpowered fall up to the first collision are simulated.
+Stops begin at times spread over the planned path. For each, the path home and the unpowered fall up to the first
+collision are simulated.
 """
 
 from collections.abc import Callable

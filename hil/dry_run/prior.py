@@ -1,7 +1,7 @@
 """Prior knowledge of an arm before identification: masses, lengths and friction, each with its spread.
 
-`[arm.prior]` gives what the user knows. The rest is estimated from link lengths by the rules of thumb below and from the
-servo models (hil.drivers.servo_prior).
+`[arm.prior]` gives what the user knows. The rest is estimated from link lengths by the rules of thumb below, and from
+the servo models (hil.drivers.servo_prior).
 """
 
 from dataclasses import dataclass

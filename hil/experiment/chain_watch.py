@@ -31,7 +31,9 @@ WIDENED = 1.5
 
 LYING_RAD = 0.08
 _FRICTIONS = 8.0
-"""Lower bound on the torque from which alarm thresholds are derived, in multiples of the mean dry friction."""
+"""Lower bound on the torque from which alarm thresholds are derived, in multiples of the mean dry friction. It keeps
+friction of up to twice the mean from raising an alarm.
+"""
 _RELATIVE_STD = 0.05
 _STILL_RAD_S = 0.06
 WINDOW_S = 0.3

@@ -97,7 +97,6 @@ def scene_schema() -> dict[str, Any]:
 
 
 def _cylinder(rod: Rod) -> dict[str, Any]:
-    """The rod as a cylinder along the z axis of its own frame."""
     along = rod.ends[1] - rod.ends[0]
     length = float(np.linalg.norm(along))
     turn, _ = Rotation.align_vectors(along[None] / length, np.array([[0.0, 0.0, 1.0]]))

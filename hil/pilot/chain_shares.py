@@ -187,7 +187,6 @@ class SafeShares:
         return times
 
     def _safe_of_these(self, config: Config, shares: tuple[float, ...], most: float) -> tuple[Found | None, str]:
-        """Find a safe share for the paths of one seed, or explain why there is none."""
         most = min(most, self.cap) if self.cap < 1.0 else most
         found, why, shortage = self._largest(config, _up_to(most, shares))
         reserve = self.paths.reserve

@@ -1,5 +1,5 @@
 """Gains of a software spring and damper for an arm that does not return to its rest pose: horizontal, upright, or with
-so much friction that gravity cannot move a joint. Such a joint drifts, even from one period to the next.
+so much friction that gravity cannot move a joint.
 
 The spring is stiff enough to outweigh gravity in nearly every plausible arm and to overcome friction within a radian,
 and soft enough to leave most of the torque to the excitation.

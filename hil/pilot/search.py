@@ -177,7 +177,6 @@ class Search:
 
     @property
     def _farther(self) -> float:
-        """Largest ratio of the allowed to the observed range of motion among the joints."""
         allowed = np.ptp(np.array([joint.position_limit for joint in self.config.joints]), axis=1)
         swings = [each for each in (self.swing, self.earlier_swing) if each is not None]
         swing = np.max(swings, axis=0) if swings else np.zeros(len(allowed))

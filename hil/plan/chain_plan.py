@@ -188,7 +188,6 @@ def _designed(known: KnownChain, config: Config, role: str, seed: int) -> Path:
 
 
 def _check_torque(config: Config, thought: ChainTorque, path: Path) -> None:
-    """Check that the path leaves the motors headroom for errors in the description."""
     peaks, limits = np.abs(thought.of(path)).max(axis=1), torque_limits(config)
     for joint, peak, most in zip(config.joints, peaks.tolist(), limits.tolist(), strict=True):
         if peak > TORQUE_SHARE * most:

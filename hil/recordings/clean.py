@@ -143,7 +143,6 @@ def _rows(chosen: Mask) -> str:
 
 
 def _apart(rows: Rows) -> list[Rows]:
-    """Split the rows at long gaps into separate recordings."""
     step = np.diff(rows.time)
     usual = float(np.median(step)) if step.size else 0.0
     if usual > MOST_GAP:

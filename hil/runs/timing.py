@@ -65,7 +65,6 @@ def lost_samples(samples: NDArray[np.void], names: Sequence[str]) -> str:
 
 
 def _sent(samples: NDArray[np.void]) -> NDArray[np.void]:
-    """The samples whose deadline was not missed."""
     sent: NDArray[np.void] = samples[_round_trip(samples) > 0.0]
     return sent
 

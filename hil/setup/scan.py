@@ -104,7 +104,6 @@ def _set_to(port: Port, servos: Sequence[Found]) -> int:
 
 
 def _with_more(behind_s: float, watch: Watch) -> Watch:
-    """Wrap the callback so that the remaining time includes the other baud rates."""
     return lambda asking: watch(asking._replace(left_s=asking.left_s + behind_s))
 
 

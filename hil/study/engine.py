@@ -72,7 +72,6 @@ def workers(engine: EngineTable, scheduler: str | None, count: int | None) -> It
 
 
 def _silence() -> None:
-    """Keep Dask's own log off the terminal: the caller reports what went wrong."""
     silent = ("distributed", "tornado", "asyncio")
     for name in [each for each in logging.root.manager.loggerDict if each.split(".")[0] in silent]:
         logging.getLogger(name).setLevel(logging.CRITICAL)

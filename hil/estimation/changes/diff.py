@@ -1,10 +1,9 @@
 """Comparison of two identifications of one arm: which parameters changed significantly.
 
-Every common parameter is tested on its own: z = difference / sqrt(std_a^2 + std_b^2). The friction of each joint is
-also tested as a whole (hil.estimation.changes.friction_change). Holm's step-down correction keeps the probability of
-any false alarm in the whole table at `FALSE_ALARMS` (S. Holm, Scandinavian Journal of Statistics 6 (1979) 65). A change
-must also be larger than the fraction `least_share` of the parameter's magnitude, since standard errors cover noise
-only.
+Every common parameter is tested on its own, and the friction of each joint also as a whole
+(hil.estimation.changes.friction_change). Holm's step-down correction keeps the probability of any false alarm in the
+whole table at `FALSE_ALARMS` (S. Holm, Scandinavian Journal of Statistics 6 (1979) 65). A change must also be larger
+than the fraction `least_share` of the parameter's magnitude, since standard errors cover noise only.
 """
 
 import math
@@ -198,7 +197,6 @@ def _z(before: ArmModel, after: ArmModel, name: str) -> float:
 
 
 def _deviation(value: tuple[float, float], stds: tuple[float, float]) -> float:
-    """Difference of two values in units of their combined standard error."""
     difference = value[1] - value[0]
     std = math.hypot(*stds)
     if not math.isfinite(std):

@@ -55,7 +55,6 @@ def jump_disturbances(config: Config, facts: RunFacts, samples: NDArray[np.void]
 
 
 def _jumps(config: Config, facts: RunFacts, samples: NDArray[np.void]) -> list[list[tuple[float, float]]]:
-    """Jumps of each joint, as in `position_jumps`, with times from the first sample."""
     begin = float(samples["deadline"][0]) if len(samples) else 0.0
     return [
         position_jumps(

@@ -1,7 +1,6 @@
 """Jumps of a recorded position that no smooth motion explains, for recordings without a velocity.
 
-Around each interval between samples, a cubic with a step is fitted to the positions and compared with those elsewhere in
-the recording.
+Around each interval between samples, a cubic with a step is fitted to the positions, and compared with those elsewhere.
 """
 
 from collections.abc import Sequence

@@ -27,7 +27,7 @@ _STILL_RAD = 0.02
 def rest_shift_warnings(config: Config, samples: NDArray[np.void], result: SettledResult) -> list[str]:
     """One sentence per joint whose rest angle changed by more than friction usually explains.
 
-    Nothing is reported if the verdict trusts the model, if the arm is horizontal, or if a stabiliser holds it.
+    Nothing is reported if the verdict trusts the model, or if the arm is horizontal or held by a stabiliser.
     """
     trusted = result.verdict is not None and result.verdict.trust == "yes"
     if trusted or config.arm.gravity == 0.0 or config.stabiliser is not None or config.is_chain:

@@ -1,6 +1,6 @@
 """Location and kind of the parts of a recording that the fitted model does not explain although it explains the rest.
 
-A reading that freezes, a missing torque, single wrong samples or a joint that hits a stop can spoil an estimate.
+These are frozen readings, missing torques, single wrong samples, and stops.
 """
 
 from collections.abc import Iterator, Sequence

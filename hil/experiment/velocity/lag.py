@@ -5,8 +5,8 @@ mean in the short memory; a scale error is the slope over the distance covered. 
 together with a constant.
 
 Neither error changes during a run. The lag in the last `BLOCKS` blocks of `BLOCK_S` is therefore compared with that in
-all earlier blocks: the difference must not exceed what is explained by their uncertainties and by a filter, whose lag
-depends on the frequency of the motion.
+all earlier blocks, with a tolerance for their uncertainties and for a filter, whose lag depends on the frequency of the
+motion.
 """
 
 from typing import Any

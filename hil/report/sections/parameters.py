@@ -72,7 +72,6 @@ def _interval(value: float, std: float) -> tuple[str, str]:
 
 
 def _as_precise(value: float, std: float) -> str:
-    """Format a value with the decimals shown for a quantity with this standard deviation."""
     decimals = _decimals(std)
     return number(value) if decimals is None else f"{value:.{decimals}f}".replace("-", "\u2212")
 
